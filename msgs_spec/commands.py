@@ -1,0 +1,58 @@
+"""Normalised actions of the benchmark and commands in ROS units, and what makes a command valid."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msgs_spec.robots import RobotSpec
+
+
+def command_limits(robot: RobotSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower and upper limits of the command, (action_size,) each, in command units."""
+    return (
+        np.array([part.lower for part in robot.command]),
+        np.array([part.upper for part in robot.command]),
+    )
+
+
+def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
+    """Maps actions in [-1, 1] to commands, clipping what lies outside.
+
+    Fetch: the action itself; its floating type is kept, because Gymnasium-Robotics scales it in that type. Hand:
+    absolute joint positions through the middle and half width of each control range (`hand_env.py`).
+
+    Args:
+        robot: The robot.
+        action: (..., action_size), normalised.
+
+    Returns:
+        (..., action_size) in command units.
+    """
+    clipped = np.clip(np.asarray(action), -1.0, 1.0)
+    if robot.has_gripper_command:
+        return clipped
+    lower, upper = command_limits(robot)
+    return np.clip((upper + lower) / 2.0 + clipped * ((upper - lower) / 2.0), lower, upper)
+
+
+def action_from_command(robot: RobotSpec, command: ArrayLike) -> NDArray[np.float64]:
+    """Maps commands (..., action_size) to the normalised actions that give them, clipped to [-1, 1]."""
+    values = np.asarray(command, dtype=np.float64)
+    if not robot.has_gripper_command:
+        lower, upper = command_limits(robot)
+        values = (values - (upper + lower) / 2.0) / ((upper - lower) / 2.0)
+    return np.clip(values, -1.0, 1.0)
+
+
+def resting_command(robot: RobotSpec) -> NDArray[np.float64]:
+    """The command of the zero action: the gripper stays, the hand takes the middle of each range."""
+    return np.asarray(command_from_action(robot, np.zeros(robot.action_size)), dtype=np.float64)
+
+
+def clip_command(robot: RobotSpec, command: ArrayLike) -> NDArray[np.float64]:
+    """Commands (..., action_size) within the limits of the robot."""
+    lower, upper = command_limits(robot)
+    return np.clip(np.asarray(command, dtype=np.float64), lower, upper)

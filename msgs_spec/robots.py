@@ -1,0 +1,127 @@
+"""The two robots: joints in order, the normalised action, and the command in ROS units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+# Metres a gripper action of 1 moves the mocap target per tick (Plappert et al. 2018, section 1.1; Gymnasium-Robotics
+# `fetch_env.py`).
+GRIPPER_STEP = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class CommandPart:
+    """One number of the command vector.
+
+    Attributes:
+        name: What it moves: an axis, or the joint the actuator drives.
+        lower: Smallest value that is applied; smaller ones are clipped.
+        upper: Largest value that is applied; larger ones are clipped.
+        unit: SI unit, or 'x 0.05 m' for the dimensionless Fetch axes.
+    """
+
+    name: str
+    lower: float
+    upper: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSpec:
+    """A robot as the network sees it.
+
+    Attributes:
+        name: `fetch` or `shadow_hand`.
+        joints: Scalar joints in the order of `joint_states` (MJCF names).
+        joint_units: 'm' or 'rad' for each joint.
+        command: The parts of the command vector, in order. The normalised action has the same length and order.
+        has_gripper_command: True where commands are the four dimensionless gripper values, False where they are
+            absolute joint positions.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    joint_units: tuple[str, ...]
+    command: tuple[CommandPart, ...]
+    has_gripper_command: bool
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action and of the command vector: 4 or 20."""
+        return len(self.command)
+
+
+_FETCH_JOINTS = (
+    'robot0:slide0',
+    'robot0:slide1',
+    'robot0:slide2',
+    'robot0:torso_lift_joint',
+    'robot0:head_pan_joint',
+    'robot0:head_tilt_joint',
+    'robot0:shoulder_pan_joint',
+    'robot0:shoulder_lift_joint',
+    'robot0:upperarm_roll_joint',
+    'robot0:elbow_flex_joint',
+    'robot0:forearm_roll_joint',
+    'robot0:wrist_flex_joint',
+    'robot0:wrist_roll_joint',
+    'robot0:r_gripper_finger_joint',
+    'robot0:l_gripper_finger_joint',
+)
+_FETCH_SLIDING = ('slide0', 'slide1', 'slide2', 'torso_lift_joint', 'r_gripper_finger_joint', 'l_gripper_finger_joint')
+
+FETCH = RobotSpec(
+    name='fetch',
+    joints=_FETCH_JOINTS,
+    joint_units=tuple('m' if name.split(':')[1] in _FETCH_SLIDING else 'rad' for name in _FETCH_JOINTS),
+    command=(
+        CommandPart('x', -1.0, 1.0, 'x 0.05 m'),
+        CommandPart('y', -1.0, 1.0, 'x 0.05 m'),
+        CommandPart('z', -1.0, 1.0, 'x 0.05 m'),
+        CommandPart('gripper', -1.0, 1.0, '-1 closes, 1 opens'),
+    ),
+    has_gripper_command=True,
+)
+
+# Control ranges of the actuators in `hand/shared.xml`, radians; a test holds them equal to the compiled model.
+_HAND_COMMAND_RANGES = (
+    ('robot0:WRJ1', -0.489, 0.14),
+    ('robot0:WRJ0', -0.698, 0.489),
+    ('robot0:FFJ3', -0.349, 0.349),
+    ('robot0:FFJ2', 0.0, 1.571),
+    ('robot0:FFJ1', 0.0, 1.571),
+    ('robot0:MFJ3', -0.349, 0.349),
+    ('robot0:MFJ2', 0.0, 1.571),
+    ('robot0:MFJ1', 0.0, 1.571),
+    ('robot0:RFJ3', -0.349, 0.349),
+    ('robot0:RFJ2', 0.0, 1.571),
+    ('robot0:RFJ1', 0.0, 1.571),
+    ('robot0:LFJ4', 0.0, 0.785),
+    ('robot0:LFJ3', -0.349, 0.349),
+    ('robot0:LFJ2', 0.0, 1.571),
+    ('robot0:LFJ1', 0.0, 1.571),
+    ('robot0:THJ4', -1.047, 1.047),
+    ('robot0:THJ3', 0.0, 1.222),
+    ('robot0:THJ2', -0.209, 0.209),
+    ('robot0:THJ1', -0.524, 0.524),
+    ('robot0:THJ0', -1.571, 0.0),
+)
+
+_HAND_JOINTS = tuple(
+    f'robot0:{name}'
+    for name in (
+        'WRJ1 WRJ0 FFJ3 FFJ2 FFJ1 FFJ0 MFJ3 MFJ2 MFJ1 MFJ0 RFJ3 RFJ2 RFJ1 RFJ0 '
+        'LFJ4 LFJ3 LFJ2 LFJ1 LFJ0 THJ4 THJ3 THJ2 THJ1 THJ0'
+    ).split()
+)
+
+SHADOW_HAND = RobotSpec(
+    name='shadow_hand',
+    joints=_HAND_JOINTS,
+    joint_units=('rad',) * len(_HAND_JOINTS),
+    command=tuple(CommandPart(name, lower, upper, 'rad') for name, lower, upper in _HAND_COMMAND_RANGES),
+    has_gripper_command=False,
+)
+
+# Order of the fingertips in `achieved_goal`, `desired_goal` and `fingertip_poses` (MJCF sites `robot0:S_<name>`).
+FINGERTIPS = ('fftip', 'mftip', 'rftip', 'lftip', 'thtip')

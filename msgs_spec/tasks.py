@@ -1,0 +1,210 @@
+"""The thirteen tasks of Plappert et al. 2018 as data: goals, observation layout, episode length, thresholds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from msgs_spec.robots import FETCH, FINGERTIPS, SHADOW_HAND, RobotSpec
+
+# One physics substep, seconds, and the paper's 20 substeps per action (25 Hz).
+PHYSICS_TIMESTEP = 0.002
+DEFAULT_CONTROL_HZ = 25.0
+
+
+class GoalKind(Enum):
+    """What a goal vector means.
+
+    POINT: position of the gripper or object, 3 values, metres, world.
+    FINGERTIPS: five fingertip positions, 15 values, metres, world.
+    POSE: object position and quaternion wxyz, 7 values, metres, world.
+    """
+
+    POINT = 3
+    FINGERTIPS = 15
+    POSE = 7
+
+    @property
+    def size(self) -> int:
+        """Length of the goal vector."""
+        return self.value
+
+
+@dataclass(frozen=True, slots=True)
+class VectorPart:
+    """A named run of numbers in the observation vector.
+
+    Attributes:
+        name: What the numbers are.
+        size: How many.
+        unit: Their unit, in the order given.
+    """
+
+    name: str
+    size: int
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSpec:
+    """One task as policies and tools see it.
+
+    Attributes:
+        name: `FetchReach`, ... as in the paper.
+        robot: The robot that does it.
+        goal: What its goals are.
+        observation: Parts of the observation vector, in order.
+        episode_ticks: Steps per episode.
+        object_name: `object0` (Fetch), `object` (hand), or None where there is none.
+        distance_threshold: Success within this distance, metres.
+        rotation_threshold: Success within this rotation, radians; None where rotation does not count.
+        reference_id: The environment of Gymnasium-Robotics 1.4.2 that this task equals.
+    """
+
+    name: str
+    robot: RobotSpec
+    goal: GoalKind
+    observation: tuple[VectorPart, ...]
+    episode_ticks: int
+    object_name: str | None
+    distance_threshold: float
+    rotation_threshold: float | None
+    reference_id: str
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation vector."""
+        return sum(part.size for part in self.observation)
+
+    @property
+    def has_object(self) -> bool:
+        """Whether there is an object beside the robot."""
+        return self.object_name is not None
+
+
+_GRIPPER_STATE = VectorPart('gripper_state', 2, 'm (right, left finger)')
+_GRIPPER_VELOCITY = VectorPart('gripper_velocity', 2, 'm per tick')
+_FETCH_REACH_OBSERVATION = (
+    VectorPart('end_effector_position', 3, 'm'),
+    _GRIPPER_STATE,
+    VectorPart('end_effector_velocity', 3, 'm per tick'),
+    _GRIPPER_VELOCITY,
+)
+_FETCH_OBJECT_OBSERVATION = (
+    VectorPart('end_effector_position', 3, 'm'),
+    VectorPart('object_position', 3, 'm'),
+    VectorPart('object_relative_position', 3, 'm'),
+    _GRIPPER_STATE,
+    VectorPart('object_rotation', 3, 'rad (Euler xyz)'),
+    VectorPart('object_relative_velocity', 3, 'm per tick'),
+    VectorPart('object_angular_velocity', 3, 'rad per tick'),
+    VectorPart('end_effector_velocity', 3, 'm per tick'),
+    _GRIPPER_VELOCITY,
+)
+_HAND_JOINT_PARTS = (
+    VectorPart('joint_position', len(SHADOW_HAND.joints), 'rad'),
+    VectorPart('joint_velocity', len(SHADOW_HAND.joints), 'rad/s'),
+)
+_HAND_REACH_OBSERVATION = (*_HAND_JOINT_PARTS, VectorPart('fingertip_positions', 3 * len(FINGERTIPS), 'm'))
+_HAND_OBJECT_OBSERVATION = (
+    *_HAND_JOINT_PARTS,
+    VectorPart('object_velocity', 6, 'm/s (world), rad/s (object frame)'),
+    VectorPart('object_pose', 7, 'm, quaternion wxyz'),
+)
+
+
+def _fetch(name: str, has_object: bool = True) -> TaskSpec:
+    return TaskSpec(
+        name=name,
+        robot=FETCH,
+        goal=GoalKind.POINT,
+        observation=_FETCH_OBJECT_OBSERVATION if has_object else _FETCH_REACH_OBSERVATION,
+        episode_ticks=50,
+        object_name='object0' if has_object else None,
+        distance_threshold=0.05,
+        rotation_threshold=None,
+        reference_id=f'{name}-v4',
+    )
+
+
+def _hand_manipulate(name: str, distance_threshold: float = 0.01) -> TaskSpec:
+    return TaskSpec(
+        name=name,
+        robot=SHADOW_HAND,
+        goal=GoalKind.POSE,
+        observation=_HAND_OBJECT_OBSERVATION,
+        episode_ticks=100,
+        object_name='object',
+        distance_threshold=distance_threshold,
+        rotation_threshold=0.1,
+        reference_id=f'{name}-v1',
+    )
+
+
+_HAND_REACH = TaskSpec(
+    name='HandReach',
+    robot=SHADOW_HAND,
+    goal=GoalKind.FINGERTIPS,
+    observation=_HAND_REACH_OBSERVATION,
+    episode_ticks=50,
+    object_name=None,
+    distance_threshold=0.01,
+    rotation_threshold=None,
+    reference_id='HandReach-v3',
+)
+
+TASKS: dict[str, TaskSpec] = {
+    spec.name: spec
+    for spec in (
+        _fetch('FetchReach', has_object=False),
+        _fetch('FetchPush'),
+        _fetch('FetchSlide'),
+        _fetch('FetchPickAndPlace'),
+        _HAND_REACH,
+        _hand_manipulate('HandManipulateBlockRotateZ'),
+        _hand_manipulate('HandManipulateBlockRotateParallel'),
+        _hand_manipulate('HandManipulateBlockRotateXYZ'),
+        _hand_manipulate('HandManipulateBlockFull'),
+        _hand_manipulate('HandManipulateEggRotate'),
+        _hand_manipulate('HandManipulateEggFull'),
+        _hand_manipulate('HandManipulatePenRotate', distance_threshold=0.05),
+        _hand_manipulate('HandManipulatePenFull', distance_threshold=0.05),
+    )
+}
+
+
+def task_spec(name: str) -> TaskSpec:
+    """Returns the task called `name`.
+
+    Raises:
+        ValueError: If there is none; the message lists all of them.
+    """
+    try:
+        return TASKS[name]
+    except (KeyError, TypeError):
+        raise ValueError(f'unknown task {name!r}; allowed: {", ".join(TASKS)}') from None
+
+
+def substeps_per_tick(control_hz: float, timestep: float = PHYSICS_TIMESTEP) -> int:
+    """Returns the whole number of physics substeps in one control period.
+
+    Args:
+        control_hz: Action frequency in Hz, between 12.5 and 500.
+        timestep: Physics substep in seconds.
+
+    Raises:
+        ValueError: If the period is not a whole number of substeps; the message names the nearest valid rates.
+    """
+    smallest, largest = 1, 40
+    period = 1.0 / (control_hz * timestep) if control_hz > 0 else float('inf')
+    substeps = round(period) if period < 1e9 else 10**9
+    if smallest <= substeps <= largest and abs(period - substeps) < 1e-6:
+        return substeps
+    lower = min(max(int(period) if period < 1e9 else largest, smallest), largest)
+    upper = min(lower + 1, largest)
+    rates = sorted({1.0 / (n * timestep) for n in (lower, upper)})
+    nearest = ' and '.join(f'{rate:.9g}' for rate in rates)
+    raise ValueError(
+        f'control_hz {control_hz:g} is not a whole number of {timestep * 1e3:g} ms substeps; allowed: 500/n Hz for '
+        f'n = {smallest} ... {largest} (12.5 ... 500), nearest: {nearest}'
+    )
