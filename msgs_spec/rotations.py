@@ -30,7 +30,7 @@ def xyzw_to_wxyz(quaternion: ArrayLike) -> Array:
 def _parts(array: ArrayLike) -> list[Any]:
     """The components along the last axis, each a contiguous array."""
     values = np.moveaxis(np.asarray(array, dtype=np.float64), -1, 0)
-    return [np.ascontiguousarray(part) for part in values]
+    return [np.array(part, order='C') for part in values]
 
 
 def quaternion_multiply(first: ArrayLike, second: ArrayLike) -> Array:

@@ -1,0 +1,1 @@
+"""The robots: thirteen tasks on MuJoCo, from one batched simulation, and the ROS node around it."""

@@ -1,0 +1,136 @@
+"""Goal distances, success rules and rewards: pure functions of goals, recomputable for any batch shape.
+
+Hindsight replay swaps goals after the fact, so nothing here may depend on the simulation. Sums run in a fixed
+order, so a batch gives the same bits as one call per row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler, rotation_angle
+from msgs_spec.tasks import GoalKind, TaskSpec
+
+RewardType = Literal['sparse', 'dense']
+SuccessRule = Literal['gymnasium', 'paper']
+REWARD_TYPES: tuple[str, ...] = get_args(RewardType)
+SUCCESS_RULES: tuple[str, ...] = get_args(SuccessRule)
+
+Array = NDArray[np.float64]
+
+
+def _norm(difference: Array) -> Array:
+    """Euclidean norm over the last axis, summed in a fixed order whatever the memory layout."""
+    parts = np.ascontiguousarray(np.moveaxis(difference, -1, 0))
+    total = np.zeros(parts.shape[1:])
+    for part in parts:
+        total = total + part * part
+    return np.asarray(np.sqrt(total))
+
+
+@dataclass(frozen=True, slots=True)
+class GoalMetric:
+    """How far a goal is, when it counts as reached, and what that is worth.
+
+    Attributes:
+        spec: The task.
+        uses_position: Whether the position of a pose goal counts (False for the Rotate tasks).
+        ignores_z_rotation: Whether the rotation about the object's own z axis does not count (pen).
+        success_rule: `gymnasium` follows the released code (HandReach: norm over all 15
+            coordinates; rotations: raw quaternions, so q and -q are 2 pi apart). `paper` follows
+            the text of Plappert et al. 2018 (mean fingertip distance; rotation difference).
+        reward_type: `sparse` is -1 or 0; `dense` is the negative distance.
+    """
+
+    spec: TaskSpec
+    uses_position: bool = True
+    ignores_z_rotation: bool = False
+    success_rule: SuccessRule = 'gymnasium'
+    reward_type: RewardType = 'sparse'
+
+    def __post_init__(self) -> None:
+        _require_choice('success_rule', self.success_rule, SUCCESS_RULES)
+        _require_choice('reward_type', self.reward_type, REWARD_TYPES)
+
+    def distances(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> tuple[Array, Array]:
+        """Distance in metres and rotation in radians between goals (..., goal size).
+
+        A part that does not count for the task is zero.
+
+        Raises:
+            ValueError: If the goals are not of the task's size or differ in shape.
+        """
+        achieved, desired = self._checked(achieved_goal), self._checked(desired_goal)
+        if achieved.shape != desired.shape:
+            raise ValueError(
+                f'achieved_goal {achieved.shape} and desired_goal {desired.shape} differ in shape'
+            )
+        if self.spec.goal is GoalKind.POSE:
+            return self._position_distance(achieved, desired), self._rotation(achieved, desired)
+        if self.spec.goal is GoalKind.FINGERTIPS and self.success_rule == 'paper':
+            fingertips = (achieved - desired).reshape(*achieved.shape[:-1], -1, 3)
+            per_fingertip = np.moveaxis(_norm(fingertips), -1, 0)
+            return np.asarray(sum(per_fingertip) / len(per_fingertip)), np.zeros(achieved.shape[:-1])
+        return _norm(achieved - desired), np.zeros(achieved.shape[:-1])
+
+    def success(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> NDArray[np.bool_]:
+        """Whether goals (..., goal size) are reached: a boolean array (...)."""
+        distance, rotation = self.distances(achieved_goal, desired_goal)
+        reached = distance < self.spec.distance_threshold
+        if self.spec.rotation_threshold is not None:
+            reached = reached & (rotation < self.spec.rotation_threshold)
+        return np.asarray(reached)
+
+    def reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Array:
+        """Reward of goals (..., goal size): an array (...).
+
+        Sparse: 0 where the goal is reached, -1 elsewhere. Dense: minus the distance in metres; for
+        poses minus (10 x metres + radians), as in Gymnasium-Robotics `manipulate.py`.
+
+        Args:
+            achieved_goal: Achieved goals.
+            desired_goal: Desired goals.
+            info: Unused; part of Gymnasium's signature.
+        """
+        del info
+        distance, rotation = self.distances(achieved_goal, desired_goal)
+        if self.reward_type == 'dense':
+            return -(10.0 * distance + rotation) if self.spec.goal is GoalKind.POSE else -distance
+        if self.spec.rotation_threshold is None:
+            return -(distance > self.spec.distance_threshold).astype(np.float64)
+        reached = distance < self.spec.distance_threshold
+        return (reached & (rotation < self.spec.rotation_threshold)).astype(np.float64) - 1.0
+
+    def _checked(self, goal: ArrayLike) -> Array:
+        values = np.ascontiguousarray(goal, dtype=np.float64)
+        size = self.spec.goal.size
+        if values.ndim == 0 or values.shape[-1] != size:
+            raise ValueError(
+                f'a goal of {self.spec.name} has {size} values on its last axis, not shape '
+                f'{values.shape}'
+            )
+        return values
+
+    def _position_distance(self, achieved: Array, desired: Array) -> Array:
+        if not self.uses_position:
+            return np.zeros(achieved.shape[:-1])
+        return _norm(achieved[..., :3] - desired[..., :3])
+
+    def _rotation(self, achieved: Array, desired: Array) -> Array:
+        quaternion = achieved[..., 3:]
+        if self.ignores_z_rotation:
+            euler = quaternion_to_euler(quaternion)
+            euler[..., 2] = quaternion_to_euler(desired[..., 3:])[..., 2]
+            quaternion = euler_to_quaternion(euler)
+        return rotation_angle(
+            quaternion, desired[..., 3:], antipodal=self.success_rule == 'paper'
+        )
+
+
+def _require_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise ValueError(f'{name} {value!r} is not known; allowed: {", ".join(allowed)}')
