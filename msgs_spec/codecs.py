@@ -1,0 +1,210 @@
+"""Float64 vectors <-> message objects, topic by topic.
+
+Every topic but `/clock` and `episode_status` carries one float64 vector whose order is the topic's
+`layout`, quaternions wxyz. `build_message` makes the message, `decode` reads it back, also from the
+messages of rclpy, whose fields have the same names. Stamps are nanoseconds of simulated time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msgs_spec.rotations import wxyz_to_xyzw, xyzw_to_wxyz
+from msgs_spec.schemas import message_class
+from msgs_spec.topics import TopicSpec
+
+Array = NDArray[np.float64]
+
+_NANOSECONDS = 10**9
+_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def message_stamp(message: Any) -> int:
+    """Returns the stamp of a message with a header, or of a Clock, in nanoseconds."""
+    stamp = message.header.stamp if hasattr(message, 'header') else message.clock
+    return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
+
+
+def build_message(topic: TopicSpec, stamp: int, values: ArrayLike) -> Any:
+    """Returns the message that carries a vector, as an instance of `schemas.message_class`.
+
+    Args:
+        topic: Any topic but `episode_status`.
+        stamp: Nanoseconds; ignored where the type has no stamp.
+        values: (topic.size,) in the order of the layout.
+
+    Raises:
+        ValueError: If there are too many or too few values.
+    """
+    vector = checked_size(topic, values)
+    fields = _CODECS[topic.type_name][0](topic, vector)
+    return _stamped(topic, stamp, fields)
+
+
+def decode(topic: TopicSpec, message: Any) -> Array:
+    """Returns the vector (topic.size,) that a message of rclpy or of `schemas` carries.
+
+    Joints are found by name in any order; joints that a JointState lacks are NaN.
+
+    Raises:
+        ValueError: If the message has another number of values than the topic.
+    """
+    return checked_size(topic, _CODECS[topic.type_name][1](topic, message))
+
+
+def build_status(topic: TopicSpec, stamp: int, name: str, values: Mapping[str, str]) -> Any:
+    """Returns a DiagnosticArray of one status, level OK, that holds key/value pairs."""
+    pair = message_class('diagnostic_msgs/msg/KeyValue')
+    status = message_class('diagnostic_msgs/msg/DiagnosticStatus')(
+        level=0,
+        name=name,
+        message='',
+        hardware_id='',
+        values=[pair(key=key, value=value) for key, value in values.items()],
+    )
+    return _stamped(topic, stamp, {'status': [status]})
+
+
+def decode_status(message: Any) -> dict[str, str]:
+    """Returns the key/value pairs of a DiagnosticArray; of equal keys the last counts."""
+    return {pair.key: pair.value for status in message.status for pair in status.values}
+
+
+def checked_size(topic: TopicSpec, values: ArrayLike) -> Array:
+    """Returns `values` as float64, or raises ValueError if they do not fit the topic."""
+    vector = np.asarray(values, dtype=np.float64)
+    if vector.shape != (topic.size,):
+        raise ValueError(f'{topic.name}: shape {vector.shape} given; allowed: ({topic.size},)')
+    return vector
+
+
+def _stamped(topic: TopicSpec, stamp: int, fields: dict[str, Any]) -> Any:
+    seconds, nanoseconds = divmod(stamp, _NANOSECONDS)
+    time = message_class('builtin_interfaces/msg/Time')(sec=seconds, nanosec=nanoseconds)
+    message = message_class(topic.type_name)
+    if 'header' in message.__dataclass_fields__:
+        fields['header'] = message_class('std_msgs/msg/Header')(stamp=time, frame_id=topic.frame)
+    elif 'clock' in message.__dataclass_fields__:
+        fields['clock'] = time
+    return message(**fields)
+
+
+def _geometry(name: str, **fields: Any) -> Any:
+    return message_class(f'geometry_msgs/msg/{name}')(**fields)
+
+
+def _xyz(name: str, values: Array) -> Any:
+    x, y, z = values.tolist()
+    return _geometry(name, x=x, y=y, z=z)
+
+
+def _quaternion(wxyz: Array) -> Any:
+    x, y, z, w = wxyz_to_xyzw(wxyz).tolist()
+    return _geometry('Quaternion', x=x, y=y, z=z, w=w)
+
+
+def _pose(position: Array, wxyz: Array) -> Any:
+    return _geometry('Pose', position=_xyz('Point', position), orientation=_quaternion(wxyz))
+
+
+def _twist(values: Array) -> Any:
+    linear, angular = _xyz('Vector3', values[:3]), _xyz('Vector3', values[3:])
+    return _geometry('Twist', linear=linear, angular=angular)
+
+
+def _read_xyz(*parts: Any) -> list[float]:
+    return [value for part in parts for value in (part.x, part.y, part.z)]
+
+
+def _read_pose(position: Any, orientation: Any) -> Array:
+    xyzw = [orientation.x, orientation.y, orientation.z, orientation.w]
+    return np.concatenate([_read_xyz(position), xyzw_to_wxyz(xyzw)])
+
+
+def _build_joint_state(topic: TopicSpec, values: Array) -> dict[str, Any]:
+    parts = {part: np.zeros(0) for part in ('position', 'velocity', 'effort')}
+    rows = values.reshape(len(topic.layout), len(topic.names))
+    parts.update((part.name, row) for part, row in zip(topic.layout, rows, strict=True))
+    return {'name': list(topic.names), **parts}
+
+
+def _read_joint_state(topic: TopicSpec, message: Any) -> Array:
+    arrays = [np.asarray(getattr(message, part.name), dtype=np.float64) for part in topic.layout]
+    if tuple(message.name) == topic.names and all(len(a) == len(topic.names) for a in arrays):
+        return np.concatenate(arrays)
+    return np.concatenate([_by_name(topic, message.name, array) for array in arrays])
+
+
+def _by_name(topic: TopicSpec, names: Sequence[str], values: Array) -> Array:
+    if len(values) not in (0, len(names)):
+        raise ValueError(f'{topic.name}: {len(values)} values given for {len(names)} names')
+    found = dict(zip(names, values.tolist(), strict=False))
+    return np.array([found.get(name, np.nan) for name in topic.names])
+
+
+def _build_free_joint(topic: TopicSpec, values: Array) -> dict[str, Any]:
+    translation, rotation = _xyz('Vector3', values[:3]), _quaternion(values[3:7])
+    transform = _geometry('Transform', translation=translation, rotation=rotation)
+    return {
+        'joint_names': list(topic.names),
+        'transforms': [transform],
+        'twist': [_twist(values[7:])],
+        'wrench': [],
+    }
+
+
+def _read_free_joint(topic: TopicSpec, message: Any) -> Array:
+    if tuple(message.joint_names) != topic.names:
+        raise ValueError(f'{topic.name}: joints {message.joint_names}; allowed: {topic.names}')
+    (transform,), (twist,) = message.transforms, message.twist
+    pose = _read_pose(transform.translation, transform.rotation)
+    return np.concatenate([pose, _read_xyz(twist.linear, twist.angular)])
+
+
+def _build_multi_array(topic: TopicSpec, values: Array) -> dict[str, Any]:
+    label = ','.join(part.name for part in topic.layout)
+    dimension = message_class('std_msgs/msg/MultiArrayDimension')
+    layout = message_class('std_msgs/msg/MultiArrayLayout')
+    dim = [dimension(label=label, size=len(values), stride=len(values))]
+    return {'layout': layout(dim=dim, data_offset=0), 'data': values}
+
+
+_Builder = Callable[[TopicSpec, Array], dict[str, Any]]
+_Reader = Callable[[TopicSpec, Any], ArrayLike]
+_CODECS: dict[str, tuple[_Builder, _Reader]] = {
+    'rosgraph_msgs/msg/Clock': (lambda _, values: {}, lambda _, message: []),
+    'sensor_msgs/msg/JointState': (_build_joint_state, _read_joint_state),
+    'sensor_msgs/msg/MultiDOFJointState': (_build_free_joint, _read_free_joint),
+    'geometry_msgs/msg/PointStamped': (
+        lambda _, values: {'point': _xyz('Point', values)},
+        lambda _, message: _read_xyz(message.point),
+    ),
+    'geometry_msgs/msg/PoseStamped': (
+        lambda _, values: {'pose': _pose(values[:3], values[3:])},
+        lambda _, message: _read_pose(message.pose.position, message.pose.orientation),
+    ),
+    'geometry_msgs/msg/PoseArray': (
+        lambda _, values: {'poses': [_pose(xyz, _IDENTITY) for xyz in values.reshape(-1, 3)]},
+        lambda _, message: _read_xyz(*(pose.position for pose in message.poses)),
+    ),
+    'geometry_msgs/msg/TwistStamped': (
+        lambda _, values: {'twist': _twist(values)},
+        lambda _, message: _read_xyz(message.twist.linear, message.twist.angular),
+    ),
+    'std_msgs/msg/Float64': (
+        lambda _, values: {'data': float(values[0])},
+        lambda _, message: [message.data],
+    ),
+    'std_msgs/msg/Bool': (
+        lambda _, values: {'data': bool(values[0])},
+        lambda _, message: [message.data],
+    ),
+    'std_msgs/msg/Float64MultiArray': (
+        _build_multi_array,
+        lambda _, message: np.array(message.data, dtype=np.float64),
+    ),
+}

@@ -1,0 +1,68 @@
+"""Quality of service of topics as data, for rclpy and for rosbag2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from rclpy.qos import QoSProfile
+
+
+@dataclass(frozen=True, slots=True)
+class QosSpec:
+    """What a publisher offers; history is always keep_last.
+
+    Attributes:
+        depth: Messages kept.
+        reliability: Whether lost messages are sent again.
+        durability: `transient_local` topics are latched: late subscribers get the last messages.
+    """
+
+    depth: int
+    reliability: Literal['reliable', 'best_effort']
+    durability: Literal['volatile', 'transient_local']
+
+
+# All offers are reliable: a best-effort publisher silently starves reliable subscribers, while a
+# reliable one serves both kinds.
+STATE = QosSpec(depth=10, reliability='reliable', durability='volatile')
+LATCHED = QosSpec(depth=1, reliability='reliable', durability='transient_local')
+COMMAND = QosSpec(depth=1, reliability='reliable', durability='volatile')
+CLOCK = QosSpec(depth=1, reliability='reliable', durability='volatile')
+
+
+def rclpy_profile(spec: QosSpec) -> QoSProfile:
+    """Returns the profile for rclpy's `create_publisher` and `create_subscription`."""
+    from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+
+    return QoSProfile(
+        history=QoSHistoryPolicy.KEEP_LAST,
+        depth=spec.depth,
+        reliability=QoSReliabilityPolicy.get_from_short_key(spec.reliability),
+        durability=QoSDurabilityPolicy.get_from_short_key(spec.durability),
+    )
+
+
+def rosbag2_yaml(spec: QosSpec) -> str:
+    """Returns the `offered_qos_profiles` of rosbag2 metadata version 9: a list of one profile.
+
+    Unset durations are written as rmw's infinity.
+    """
+    return f"""\
+- history: keep_last
+  depth: {spec.depth}
+  reliability: {spec.reliability}
+  durability: {spec.durability}
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: automatic
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false
+"""

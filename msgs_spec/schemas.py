@@ -1,0 +1,67 @@
+"""Message definitions by type name: schema text, type hash, CDR bytes.
+
+The definitions are those of ROS 2 Jazzy as the `rosbags` package carries them, so logs can be written
+and read without a ROS installation. Types are named as ROS names them: `sensor_msgs/msg/JointState`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+
+@cache
+def _store() -> Typestore:
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def message_class(type_name: str) -> Any:
+    """Returns the dataclass that stands for messages of a type outside of rclpy.
+
+    Raises:
+        ValueError: If the type is not part of ROS 2 Jazzy.
+    """
+    try:
+        return _store().types[type_name]
+    except KeyError:
+        raise ValueError(
+            f'unknown message type {type_name!r}; allowed: types of ROS 2 Jazzy, '
+            'such as sensor_msgs/msg/JointState'
+        ) from None
+
+
+@cache
+def schema_text(type_name: str) -> str:
+    """Returns the `ros2msg` text of a type and of all types it is made of, as MCAP wants it."""
+    message_class(type_name)
+    return _store().generate_msgdef(type_name, ros_version=2)[0]
+
+
+@cache
+def type_hash(type_name: str) -> str:
+    """Returns the type hash of REP 2016, `RIHS01_` and 64 hexadecimal digits."""
+    message_class(type_name)
+    return _store().hash_rihs01(type_name)
+
+
+def serialize(type_name: str, message: object) -> bytes:
+    """Returns the CDR bytes (little endian, with encapsulation header) of a message.
+
+    Args:
+        type_name: Type of the message.
+        message: An instance of `message_class(type_name)`.
+    """
+    return bytes(_store().serialize_cdr(message, type_name, little_endian=True))
+
+
+def deserialize(type_name: str, data: bytes) -> Any:
+    """Returns the message in `data` as an instance of `message_class(type_name)`.
+
+    Raises:
+        rosbags.interfaces.SerdeError: If the bytes are not such a message.
+    """
+    message_class(type_name)
+    return _store().deserialize_cdr(data, type_name)

@@ -1,0 +1,209 @@
+"""Everything the simulation says at one stamp, and the messages that say it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_spec.cdr import TopicEncoder
+from msgs_spec.codecs import build_status
+from msgs_spec.schemas import serialize
+from msgs_spec.tasks import TaskSpec
+from msgs_spec.topics import TopicSpec, topics
+
+Array = NDArray[np.float64]
+Phase = Literal['reset', 'running', 'finished']
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeStatus:
+    """What `episode_status` says.
+
+    Attributes:
+        task: Name of the task.
+        episode: Index of the episode since the node started, from 0.
+        seed: Seed of the episode.
+        tick: Steps of the episode so far; 0 is the state after the reset.
+        phase: `reset` at tick 0, `finished` at the last tick, `running` between.
+        control_hz: Ticks per second of simulated time; observations depend on it.
+        reward_type: `sparse` or `dense`.
+        success_rule: `gymnasium` or `paper`.
+        episode_return: Sum of rewards so far.
+        is_success: Whether the goal is reached now.
+    """
+
+    task: str
+    episode: int
+    seed: int
+    tick: int
+    phase: Phase
+    control_hz: float
+    reward_type: str
+    success_rule: str
+    episode_return: float
+    is_success: bool
+
+    def to_values(self) -> dict[str, str]:
+        """Returns the key/value pairs of the message."""
+        return {key: str(value) for key, value in dataclasses.asdict(self).items()}
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, str]) -> EpisodeStatus:
+        """Reads the key/value pairs of a message; other keys than the attributes are ignored.
+
+        Raises:
+            ValueError: If a pair is missing or cannot be read.
+        """
+        missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
+        if missing:
+            raise ValueError(f'episode_status without {", ".join(missing)}')
+        phases: dict[str, Phase] = {'reset': 'reset', 'running': 'running', 'finished': 'finished'}
+        flags = {'True': True, 'False': False}
+        try:
+            return cls(
+                task=values['task'],
+                episode=int(values['episode']),
+                seed=int(values['seed']),
+                tick=int(values['tick']),
+                phase=phases[values['phase']],
+                control_hz=float(values['control_hz']),
+                reward_type=values['reward_type'],
+                success_rule=values['success_rule'],
+                episode_return=float(values['episode_return']),
+                is_success=flags[values['is_success']],
+            )
+        except (KeyError, ValueError) as error:
+            raise ValueError(f'episode_status with unreadable value: {error}') from None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tick:
+    """State of the simulation at one stamp, SI units, world frame, quaternions wxyz.
+
+    What a task does not have is None. `reward` and `applied_command` are None at tick 0 of an
+    episode, where no command has been applied yet.
+
+    Attributes:
+        stamp_ns: Simulated time, nanoseconds.
+        joint_position: (joints,), order of the robot's joints.
+        joint_velocity: (joints,).
+        joint_effort: (joints,), N m or N.
+        end_effector_position: (3,), Fetch.
+        end_effector_quaternion: (4,), Fetch.
+        end_effector_linear_velocity: (3,), Fetch.
+        end_effector_angular_velocity: (3,), Fetch.
+        fingertip_positions: (15,), hand.
+        object_position: (3,).
+        object_quaternion: (4,).
+        object_linear_velocity: (3,).
+        object_angular_velocity: (3,), world axes.
+        object_qpos: (7,), free joint as MuJoCo holds it, hand manipulation.
+        object_qvel: (6,), likewise: linear in the world, angular in the object frame.
+        desired_goal: (goal,).
+        achieved_goal: (goal,).
+        reward: Reward of the step that led here.
+        is_success: Whether the goal is reached now.
+        applied_command: (action,), command units, after clipping.
+        status: Of the episode.
+    """
+
+    stamp_ns: int
+    joint_position: Array
+    joint_velocity: Array
+    joint_effort: Array
+    end_effector_position: Array | None = None
+    end_effector_quaternion: Array | None = None
+    end_effector_linear_velocity: Array | None = None
+    end_effector_angular_velocity: Array | None = None
+    fingertip_positions: Array | None = None
+    object_position: Array | None = None
+    object_quaternion: Array | None = None
+    object_linear_velocity: Array | None = None
+    object_angular_velocity: Array | None = None
+    object_qpos: Array | None = None
+    object_qvel: Array | None = None
+    desired_goal: Array
+    achieved_goal: Array
+    reward: float | None
+    is_success: bool
+    applied_command: Array | None
+    status: EpisodeStatus
+
+
+def _join(*parts: Array | None) -> Array:
+    """The given parts in one vector; what is missing shows in its size."""
+    return np.concatenate([np.zeros(0), *(part for part in parts if part is not None)])
+
+
+# The vector of each topic; None leaves the topic out of this tick.
+_VECTORS: dict[str, Callable[[Tick], Array | list[float] | None]] = {
+    '/clock': lambda tick: [],
+    'joint_states': lambda tick: _join(
+        tick.joint_position, tick.joint_velocity, tick.joint_effort
+    ),
+    'end_effector_pose': lambda tick: _join(
+        tick.end_effector_position, tick.end_effector_quaternion
+    ),
+    'end_effector_twist': lambda tick: _join(
+        tick.end_effector_linear_velocity, tick.end_effector_angular_velocity
+    ),
+    'fingertip_poses': lambda tick: _join(tick.fingertip_positions),
+    'object_pose': lambda tick: _join(tick.object_position, tick.object_quaternion),
+    'object_twist': lambda tick: _join(tick.object_linear_velocity, tick.object_angular_velocity),
+    'object_joint': lambda tick: _join(tick.object_qpos, tick.object_qvel),
+    'desired_goal': lambda tick: tick.desired_goal,
+    'achieved_goal': lambda tick: tick.achieved_goal,
+    'reward': lambda tick: None if tick.reward is None else [tick.reward],
+    'is_success': lambda tick: [tick.is_success],
+    'applied_command': lambda tick: tick.applied_command,
+}
+
+
+class TickEncoder:
+    """Turns ticks of one task into messages.
+
+    Args:
+        task: The task.
+    """
+
+    def __init__(self, task: TaskSpec) -> None:
+        published = [spec for spec in topics(task) if spec.direction == 'published']
+        self._status = next(spec for spec in published if spec.name == 'episode_status')
+        self._encoders = [
+            (spec, TopicEncoder(spec), _VECTORS[spec.name])
+            for spec in published
+            if spec is not self._status
+        ]
+
+    def encode(self, tick: Tick, latched: bool = False) -> list[tuple[TopicSpec, bytes]]:
+        """Returns the messages of a tick with their CDR bytes, in the order of `topics`.
+
+        `desired_goal` is latched for late subscribers and yet part of every tick: a policy that joins
+        topics by stamp must never meet the state of a new episode with the goal of the one before.
+
+        Args:
+            tick: The tick.
+            latched: Whether to send `episode_status` too: at the reset, when the episode is finished,
+                and whenever it changes between.
+
+        Raises:
+            ValueError: If a vector is missing or has a wrong size.
+        """
+        messages = []
+        for spec, encoder, vector in self._encoders:
+            values = vector(tick)
+            if values is not None:
+                messages.append((spec, encoder.encode(tick.stamp_ns, values)))
+        if latched:
+            messages.append((self._status, self._encode_status(tick)))
+        return messages
+
+    def _encode_status(self, tick: Tick) -> bytes:
+        values = tick.status.to_values()
+        message = build_status(self._status, tick.stamp_ns, 'episode', values)
+        return serialize(self._status.type_name, message)

@@ -1,0 +1,227 @@
+"""Every topic of every task as data: name, type, quality of service, units, frame, order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+from msgs_spec import qos
+from msgs_spec.qos import QosSpec
+from msgs_spec.robots import FINGERTIPS
+from msgs_spec.tasks import GoalKind, TaskSpec, VectorPart
+
+WORLD = 'world'
+
+_POSITION = VectorPart('position', 3, 'm')
+_QUATERNION = VectorPart('orientation', 4, 'quaternion wxyz')
+_POSE = (_POSITION, _QUATERNION)
+_TWIST = (VectorPart('linear', 3, 'm/s'), VectorPart('angular', 3, 'rad/s'))
+_FREE_JOINT = (
+    *_POSE,
+    VectorPart('linear', 3, 'm/s'),
+    VectorPart('angular, object frame', 3, 'rad/s'),
+)
+_FINGERTIPS = tuple(VectorPart(name, 3, 'm') for name in FINGERTIPS)
+
+_GOAL_TYPES = {
+    GoalKind.POINT: ('geometry_msgs/msg/PointStamped', (_POSITION,)),
+    GoalKind.FINGERTIPS: ('geometry_msgs/msg/PoseArray', _FINGERTIPS),
+    GoalKind.POSE: ('geometry_msgs/msg/PoseStamped', _POSE),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSpec:
+    """One topic.
+
+    Attributes:
+        name: Relative to the node's namespace, except `/clock`.
+        type_name: ROS name of the message type.
+        qos: What the publisher offers, or what the subscriber asks for.
+        frame: `header.frame_id`, empty where a frame has no meaning.
+        layout: Parts of the float64 vector that `codecs` makes of the message, in order.
+            Quaternions are wxyz there and xyzw in the message.
+        names: Joint names inside of the message, in order.
+        direction: As `sim_node` sees it.
+        description: What the topic says.
+    """
+
+    name: str
+    type_name: str
+    qos: QosSpec
+    frame: str
+    layout: tuple[VectorPart, ...]
+    names: tuple[str, ...]
+    direction: Literal['published', 'subscribed']
+    description: str
+
+    @property
+    def size(self) -> int:
+        """Length of the float64 vector."""
+        return sum(part.size for part in self.layout)
+
+    @property
+    def unit(self) -> str:
+        """Units of the parts, in order, each once."""
+        return ', '.join(dict.fromkeys(part.unit for part in self.layout if part.unit))
+
+
+def _published(
+    name: str,
+    type_name: str,
+    description: str,
+    layout: tuple[VectorPart, ...] = (),
+    *,
+    frame: str = '',
+    names: tuple[str, ...] = (),
+    offer: QosSpec = qos.STATE,
+) -> TopicSpec:
+    return TopicSpec(name, type_name, offer, frame, layout, names, 'published', description)
+
+
+def _subscribed(
+    name: str,
+    type_name: str,
+    description: str,
+    layout: tuple[VectorPart, ...],
+    *,
+    frame: str = '',
+    names: tuple[str, ...] = (),
+) -> TopicSpec:
+    return TopicSpec(name, type_name, qos.COMMAND, frame, layout, names, 'subscribed', description)
+
+
+def _command_layout(task: TaskSpec) -> tuple[VectorPart, ...]:
+    return tuple(VectorPart(part.name, 1, part.unit) for part in task.robot.command)
+
+
+def _joint_topic(task: TaskSpec) -> TopicSpec:
+    joints = task.robot.joints
+    units = ('rad', 'rad/s', 'N m')
+    if 'm' in task.robot.joint_units:
+        units = ('rad or m', 'rad/s or m/s', 'N m or N')
+    return _published(
+        'joint_states',
+        'sensor_msgs/msg/JointState',
+        'All scalar joints of the robot.',
+        (
+            VectorPart('position', len(joints), units[0]),
+            VectorPart('velocity', len(joints), units[1]),
+            VectorPart('effort', len(joints), units[2]),
+        ),
+        names=joints,
+    )
+
+
+def _body_topics(task: TaskSpec) -> list[TopicSpec]:
+    """End effector or fingertips, then the object."""
+    pose, twist = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/TwistStamped'
+    if task.robot.has_gripper_command:
+        specs = [
+            _published('end_effector_pose', pose, 'Gripper site.', _POSE, frame=WORLD),
+            _published('end_effector_twist', twist, 'Gripper site.', _TWIST, frame=WORLD),
+        ]
+    else:
+        text = 'Fingertip positions; orientations are identity.'
+        array = 'geometry_msgs/msg/PoseArray'
+        specs = [_published('fingertip_poses', array, text, _FINGERTIPS, frame=WORLD)]
+    if task.has_object:
+        specs += [
+            _published('object_pose', pose, 'Object.', _POSE, frame=WORLD),
+            _published('object_twist', twist, 'Object, in world axes.', _TWIST, frame=WORLD),
+        ]
+    if task.goal is GoalKind.POSE:
+        joint = f'{task.object_name}:joint'
+        text = 'Free joint of the object as MuJoCo holds it: angular velocity in the object frame.'
+        dof = 'sensor_msgs/msg/MultiDOFJointState'
+        specs.append(
+            _published('object_joint', dof, text, _FREE_JOINT, frame=WORLD, names=(joint,))
+        )
+    return specs
+
+
+def _goal_topics(task: TaskSpec) -> list[TopicSpec]:
+    type_name, layout = _GOAL_TYPES[task.goal]
+    desired, achieved = 'Goal of the episode.', 'The same quantity as it is now.'
+    return [
+        _published('desired_goal', type_name, desired, layout, frame=WORLD, offer=qos.LATCHED),
+        _published('achieved_goal', type_name, achieved, layout, frame=WORLD),
+    ]
+
+
+def _result_topics(task: TaskSpec) -> list[TopicSpec]:
+    number, array = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
+    return [
+        _published('reward', number, 'Reward of the tick.', (VectorPart('reward', 1, ''),)),
+        _published(
+            'is_success',
+            'std_msgs/msg/Bool',
+            'Whether the goal is reached now.',
+            (VectorPart('is_success', 1, ''),),
+        ),
+        _published(
+            'applied_command',
+            array,
+            'The command this tick applied, after clipping.',
+            _command_layout(task),
+        ),
+        _published(
+            'episode_status',
+            'diagnostic_msgs/msg/DiagnosticArray',
+            'Task, episode, seed, tick, phase and settings as key/value pairs.',
+            offer=qos.LATCHED,
+        ),
+    ]
+
+
+def _command_topics(task: TaskSpec) -> list[TopicSpec]:
+    array = 'std_msgs/msg/Float64MultiArray'
+    layout = _command_layout(task)
+    specs = [_subscribed('commands', array, 'Command, all values in order.', layout)]
+    if not task.robot.has_gripper_command:
+        names = tuple(part.name for part in task.robot.command)
+        specs.append(
+            _subscribed(
+                'joint_commands',
+                'sensor_msgs/msg/JointState',
+                'Joint positions by name, any order and subset; the rest holds.',
+                (VectorPart('position', len(names), 'rad'),),
+                names=names,
+            )
+        )
+    type_name, goal_layout = _GOAL_TYPES[task.goal]
+    text = 'Replaces the goal of the running episode.'
+    return [*specs, _subscribed('set_goal', type_name, text, goal_layout, frame=WORLD)]
+
+
+@cache
+def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
+    """Returns all topics of a task.
+
+    The order is part of the contract: published topics come first, as a tick publishes and logs
+    them, then the subscribed ones.
+    """
+    clock = _published(
+        '/clock', 'rosgraph_msgs/msg/Clock', 'Simulated time, once per tick.', offer=qos.CLOCK
+    )
+    return (
+        clock,
+        _joint_topic(task),
+        *_body_topics(task),
+        *_goal_topics(task),
+        *_result_topics(task),
+        *_command_topics(task),
+    )
+
+
+def topic(task: TaskSpec, name: str) -> TopicSpec:
+    """Returns the topic of a task by name.
+
+    Raises:
+        ValueError: If the task has no such topic; the message lists those it has.
+    """
+    found = {spec.name: spec for spec in topics(task)}
+    if name not in found:
+        raise ValueError(f'{task.name} has no topic {name!r}; allowed: {", ".join(found)}')
+    return found[name]
