@@ -1,0 +1,65 @@
+# `make demo` and `make test` create the environment they need; see CONTRIBUTING.md.
+
+VENV ?= .venv
+TASK ?= FetchReach
+EPISODES ?= 5
+
+PACKAGES := msgs_spec fetch_hand_sim policy_node
+PYTHON_FILES := $(PACKAGES) test tools setup.py
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.complete
+
+# The environment holds a ROS of its own: a sourced one, or one that a parent process loaded, must
+# not leak in.
+unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+.PHONY: help env demo test lint format twin bench-sim bench-her clean distclean
+
+help:
+	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
+	@echo 'make test       lint, types and all tests'
+	@echo 'make lint       ruff and mypy only'
+	@echo 'make format     let ruff rewrite the code'
+	@echo 'make twin       the long comparison with Gymnasium-Robotics, 20 seeds per task'
+	@echo 'make bench-sim  simulation speed against its peers'
+	@echo 'make bench-her  training speed against Stable-Baselines3'
+	@echo 'make env        only create $(VENV)'
+	@echo 'make clean      remove build products; distclean removes $(VENV) too'
+
+env: $(STAMP)
+	@:
+
+$(STAMP): setup.py setup.cfg constraints.txt tools/make_environment.sh
+	@tools/make_environment.sh $(VENV)
+	@touch $@
+
+demo: env
+	@$(BIN)/python -m fetch_hand_sim.demo --task $(TASK) --episodes $(EPISODES)
+
+test: lint
+	$(BIN)/python -m pytest
+
+lint: env
+	$(BIN)/ruff check $(PYTHON_FILES)
+	$(BIN)/ruff format --check $(PYTHON_FILES)
+	$(BIN)/mypy
+
+format: env
+	$(BIN)/ruff format $(PYTHON_FILES)
+	$(BIN)/ruff check --fix $(PYTHON_FILES)
+
+twin: env
+	$(BIN)/python -m pytest --twin-seeds 20 --timeout 0 test/test_twin.py
+
+bench-sim: env
+	$(BIN)/python -m fetch_hand_sim.benchmark
+
+bench-her: env
+	$(BIN)/python -m policy_node.training.benchmark_stable_baselines3
+
+clean:
+	rm -rf build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	find $(PYTHON_FILES) -name __pycache__ -prune -exec rm -rf {} +
+
+distclean: clean
+	rm -rf $(VENV)

@@ -1,0 +1,67 @@
+"""Builds the ROS package `fetch_hand_sim`, with colcon or with pip alone."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'fetch_hand_sim'
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    description='The Fetch and Shadow hand tasks of Plappert et al. 2018 as ROS 2 nodes on MuJoCo',
+    license='Apache-2.0',
+    python_requires='>=3.11',
+    packages=find_packages(
+        include=[
+            f'{name}{suffix}'
+            for name in ('msgs_spec', 'fetch_hand_sim', 'policy_node')
+            for suffix in ('', '.*')
+        ]
+    ),
+    package_data={'policy_node': ['actors/*']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}/launch', glob('launch/*.launch.xml')),
+        (f'share/{PACKAGE}/config', glob('config/*.yaml')),
+    ],
+    zip_safe=True,
+    # Without rclpy and the messages: in a ROS workspace pip must not replace those of ROS.
+    install_requires=[
+        'gymnasium>=1.0',
+        'gymnasium-robotics~=1.4.2',
+        'mcap>=1.2',
+        'mujoco~=4.0',
+        'numpy>=1.26',
+        'rich>=13',
+        'rosbags>=0.10',
+        'safetensors>=0.4',
+        'torch>=2.6',
+    ],
+    extras_require={
+        # ROS 2 Jazzy itself, for a machine without it.
+        'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
+        'train': ['matplotlib', 'tensorboard'],
+        'dev': [
+            'colcon-core',
+            'colcon-python-setup-py',
+            'colcon-ros',
+            'mcap-ros2-support',
+            'mypy',
+            'pytest',
+            'pytest-timeout',
+            'ruff',
+            'setuptools',
+            'stable-baselines3',
+        ],
+    },
+    entry_points={
+        'console_scripts': [
+            'sim_node = fetch_hand_sim.sim_node:main',
+            'policy_node = policy_node.node:main',
+            'train_her = policy_node.training.train_her:main',
+            'evaluate_policy = policy_node.training.evaluate_policy:main',
+        ],
+    },
+)
