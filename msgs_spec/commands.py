@@ -21,8 +21,9 @@ def command_limits(robot: RobotSpec) -> tuple[NDArray[np.float64], NDArray[np.fl
 def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
     """Maps actions in [-1, 1] to commands, clipping what lies outside.
 
-    Fetch: the action itself; its floating type is kept, because Gymnasium-Robotics scales it in that type. Hand:
-    absolute joint positions through the middle and half width of each control range (`hand_env.py`).
+    Fetch: the action itself; its floating type is kept, because Gymnasium-Robotics scales it in
+    that type. Hand: absolute joint positions through the middle and half width of each control
+    range (`hand_env.py`).
 
     Args:
         robot: The robot.
@@ -35,11 +36,12 @@ def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
     if robot.has_gripper_command:
         return clipped
     lower, upper = command_limits(robot)
-    return np.clip((upper + lower) / 2.0 + clipped * ((upper - lower) / 2.0), lower, upper)
+    command = (upper + lower) / 2.0 + clipped * ((upper - lower) / 2.0)
+    return np.asarray(np.clip(command, lower, upper))
 
 
 def action_from_command(robot: RobotSpec, command: ArrayLike) -> NDArray[np.float64]:
-    """Maps commands (..., action_size) to the normalised actions that give them, clipped to [-1, 1]."""
+    """Maps commands (..., action_size) to the actions in [-1, 1] that give them, clipped."""
     values = np.asarray(command, dtype=np.float64)
     if not robot.has_gripper_command:
         lower, upper = command_limits(robot)
@@ -48,7 +50,7 @@ def action_from_command(robot: RobotSpec, command: ArrayLike) -> NDArray[np.floa
 
 
 def resting_command(robot: RobotSpec) -> NDArray[np.float64]:
-    """The command of the zero action: the gripper stays, the hand takes the middle of each range."""
+    """The command of the zero action: the gripper stays, each hand joint goes mid-range."""
     return np.asarray(command_from_action(robot, np.zeros(robot.action_size)), dtype=np.float64)
 
 

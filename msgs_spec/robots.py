@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# Metres a gripper action of 1 moves the mocap target per tick (Plappert et al. 2018, section 1.1; Gymnasium-Robotics
-# `fetch_env.py`).
+# Metres a gripper action of 1 moves the mocap target per tick (Plappert et al. 2018, section 1.1;
+# Gymnasium-Robotics `fetch_env.py`).
 GRIPPER_STEP = 0.05
 
 
@@ -34,9 +34,10 @@ class RobotSpec:
         name: `fetch` or `shadow_hand`.
         joints: Scalar joints in the order of `joint_states` (MJCF names).
         joint_units: 'm' or 'rad' for each joint.
-        command: The parts of the command vector, in order. The normalised action has the same length and order.
-        has_gripper_command: True where commands are the four dimensionless gripper values, False where they are
-            absolute joint positions.
+        command: The parts of the command vector, in order. The normalised action has the same length
+            and order.
+        has_gripper_command: True where commands are the four dimensionless gripper values, False
+            where they are absolute joint positions.
     """
 
     name: str
@@ -68,12 +69,21 @@ _FETCH_JOINTS = (
     'robot0:r_gripper_finger_joint',
     'robot0:l_gripper_finger_joint',
 )
-_FETCH_SLIDING = ('slide0', 'slide1', 'slide2', 'torso_lift_joint', 'r_gripper_finger_joint', 'l_gripper_finger_joint')
+_FETCH_SLIDING = (
+    'slide0',
+    'slide1',
+    'slide2',
+    'torso_lift_joint',
+    'r_gripper_finger_joint',
+    'l_gripper_finger_joint',
+)
 
 FETCH = RobotSpec(
     name='fetch',
     joints=_FETCH_JOINTS,
-    joint_units=tuple('m' if name.split(':')[1] in _FETCH_SLIDING else 'rad' for name in _FETCH_JOINTS),
+    joint_units=tuple(
+        'm' if name.split(':')[1] in _FETCH_SLIDING else 'rad' for name in _FETCH_JOINTS
+    ),
     command=(
         CommandPart('x', -1.0, 1.0, 'x 0.05 m'),
         CommandPart('y', -1.0, 1.0, 'x 0.05 m'),
@@ -83,7 +93,8 @@ FETCH = RobotSpec(
     has_gripper_command=True,
 )
 
-# Control ranges of the actuators in `hand/shared.xml`, radians; a test holds them equal to the compiled model.
+# Control ranges of the actuators in `hand/shared.xml`, radians; a test holds them equal to the
+# compiled model.
 _HAND_COMMAND_RANGES = (
     ('robot0:WRJ1', -0.489, 0.14),
     ('robot0:WRJ0', -0.698, 0.489),
@@ -119,9 +130,12 @@ SHADOW_HAND = RobotSpec(
     name='shadow_hand',
     joints=_HAND_JOINTS,
     joint_units=('rad',) * len(_HAND_JOINTS),
-    command=tuple(CommandPart(name, lower, upper, 'rad') for name, lower, upper in _HAND_COMMAND_RANGES),
+    command=tuple(
+        CommandPart(name, lower, upper, 'rad') for name, lower, upper in _HAND_COMMAND_RANGES
+    ),
     has_gripper_command=False,
 )
 
-# Order of the fingertips in `achieved_goal`, `desired_goal` and `fingertip_poses` (MJCF sites `robot0:S_<name>`).
+# Order of the fingertips in `achieved_goal`, `desired_goal` and `fingertip_poses` (MJCF sites
+# `robot0:S_<name>`).
 FINGERTIPS = ('fftip', 'mftip', 'rftip', 'lftip', 'thtip')

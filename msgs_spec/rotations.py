@@ -1,8 +1,9 @@
-"""Quaternions, matrices and Euler angles for arrays of any batch shape; the one place of wxyz and xyzw.
+"""Quaternions, matrices and Euler angles of any batch shape; the one place of wxyz and xyzw.
 
-MuJoCo writes quaternions wxyz, ROS messages xyzw. Everything in this project is wxyz except inside a message.
-All functions work on fresh contiguous arrays and element by element, so a batch gives the same bits as one call
-per row. Euler angles are Gymnasium-Robotics' relative xyz convention (`gymnasium_robotics.utils.rotations`).
+MuJoCo writes quaternions wxyz, ROS messages xyzw. Everything in this project is wxyz except inside a
+message. All functions work on fresh contiguous arrays and element by element, so a batch gives the
+same bits as one call per row. Euler angles are Gymnasium-Robotics' relative xyz convention
+(`gymnasium_robotics.utils.rotations`).
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ def quaternion_multiply(first: ArrayLike, second: ArrayLike) -> Array:
 
 def quaternion_conjugate(quaternion: ArrayLike) -> Array:
     """Inverse of unit quaternions wxyz, (..., 4)."""
-    return np.asarray(quaternion, dtype=np.float64) * np.array([1.0, -1.0, -1.0, -1.0])
+    values = np.asarray(quaternion, dtype=np.float64)
+    return np.asarray(values * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
@@ -59,11 +61,11 @@ def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
     direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     half = np.asarray(angle, dtype=np.float64)[..., None] / 2.0
     quaternion = np.concatenate([np.cos(half), np.sin(half) * direction], axis=-1)
-    return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    return np.asarray(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True))
 
 
 def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of unit quaternions wxyz, with MuJoCo's operations (`mju_quat2Mat`)."""
+    """Rotation matrices (..., 3, 3) of unit quaternions wxyz, computed as `mju_quat2Mat` does."""
     w, x, y, z = _parts(quaternion)
     ww, wx, wy, wz = w * w, w * x, w * y, w * z
     xx, xy, xz = x * x, x * y, x * z
@@ -109,7 +111,9 @@ def euler_to_quaternion(euler: ArrayLike) -> Array:
     si, sj, sk = np.sin(ai), np.sin(aj), np.sin(ak)
     ci, cj, ck = np.cos(ai), np.cos(aj), np.cos(ak)
     cc, cs, sc, ss = ci * ck, ci * sk, si * ck, si * sk
-    return np.stack([cj * cc + sj * ss, cj * cs - sj * sc, -(cj * ss + sj * cc), cj * sc - sj * cs], axis=-1)
+    return np.stack(
+        [cj * cc + sj * ss, cj * cs - sj * sc, -(cj * ss + sj * cc), cj * sc - sj * cs], axis=-1
+    )
 
 
 def quaternion_to_euler(quaternion: ArrayLike) -> Array:
@@ -137,8 +141,8 @@ def rotation_angle(first: ArrayLike, second: ArrayLike, antipodal: bool) -> Arra
     Args:
         first: Quaternions.
         second: Quaternions.
-        antipodal: True measures the rotation, in [0, pi]: q and -q are the same. False compares the raw
-            quaternions as Gymnasium-Robotics does, in [0, 2 pi]: q and -q are 2 pi apart.
+        antipodal: True measures the rotation, in [0, pi]: q and -q are the same. False compares the
+            raw quaternions as Gymnasium-Robotics does, in [0, 2 pi]: q and -q are 2 pi apart.
     """
     real = _parts(quaternion_multiply(first, quaternion_conjugate(second)))[0]
     return np.asarray(2.0 * np.arccos(np.clip(np.abs(real) if antipodal else real, -1.0, 1.0)))

@@ -1,7 +1,8 @@
 """Message definitions by type name: schema text, type hash, CDR bytes.
 
-The definitions are those of ROS 2 Jazzy as the `rosbags` package carries them, so logs can be written
-and read without a ROS installation. Types are named as ROS names them: `sensor_msgs/msg/JointState`.
+The definitions are those of ROS 2 Jazzy as the `rosbags` package carries them, so logs can be
+written and read without a ROS installation. Types are named as ROS names them:
+`sensor_msgs/msg/JointState`.
 """
 
 from __future__ import annotations

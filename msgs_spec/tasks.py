@@ -1,4 +1,4 @@
-"""The thirteen tasks of Plappert et al. 2018 as data: goals, observation layout, episode length, thresholds."""
+"""The thirteen tasks of Plappert et al. 2018 as data: goals, observations, lengths, thresholds."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class TaskSpec:
         episode_ticks: Steps per episode.
         object_name: `object0` (Fetch), `object` (hand), or None where there is none.
         distance_threshold: Success within this distance, metres.
-        rotation_threshold: Success within this rotation, radians; None where rotation does not count.
+        rotation_threshold: Success within this rotation, radians; None where there is no rotation.
         reference_id: The environment of Gymnasium-Robotics 1.4.2 that this task equals.
     """
 
@@ -105,7 +105,10 @@ _HAND_JOINT_PARTS = (
     VectorPart('joint_position', len(SHADOW_HAND.joints), 'rad'),
     VectorPart('joint_velocity', len(SHADOW_HAND.joints), 'rad/s'),
 )
-_HAND_REACH_OBSERVATION = (*_HAND_JOINT_PARTS, VectorPart('fingertip_positions', 3 * len(FINGERTIPS), 'm'))
+_HAND_REACH_OBSERVATION = (
+    *_HAND_JOINT_PARTS,
+    VectorPart('fingertip_positions', 3 * len(FINGERTIPS), 'm'),
+)
 _HAND_OBJECT_OBSERVATION = (
     *_HAND_JOINT_PARTS,
     VectorPart('object_velocity', 6, 'm/s (world), rad/s (object frame)'),
@@ -193,7 +196,8 @@ def substeps_per_tick(control_hz: float, timestep: float = PHYSICS_TIMESTEP) -> 
         timestep: Physics substep in seconds.
 
     Raises:
-        ValueError: If the period is not a whole number of substeps; the message names the nearest valid rates.
+        ValueError: If the period is not a whole number of substeps; the message names the nearest
+            valid rates.
     """
     smallest, largest = 1, 40
     period = 1.0 / (control_hz * timestep) if control_hz > 0 else float('inf')
@@ -205,6 +209,6 @@ def substeps_per_tick(control_hz: float, timestep: float = PHYSICS_TIMESTEP) -> 
     rates = sorted({1.0 / (n * timestep) for n in (lower, upper)})
     nearest = ' and '.join(f'{rate:.9g}' for rate in rates)
     raise ValueError(
-        f'control_hz {control_hz:g} is not a whole number of {timestep * 1e3:g} ms substeps; allowed: 500/n Hz for '
-        f'n = {smallest} ... {largest} (12.5 ... 500), nearest: {nearest}'
+        f'control_hz {control_hz:g} is not a whole number of {timestep * 1e3:g} ms substeps; '
+        f'allowed: 500/n Hz for n = {smallest} ... {largest} (12.5 ... 500), nearest: {nearest}'
     )

@@ -143,9 +143,7 @@ def _join(*parts: Array | None) -> Array:
 # The vector of each topic; None leaves the topic out of this tick.
 _VECTORS: dict[str, Callable[[Tick], Array | list[float] | None]] = {
     '/clock': lambda tick: [],
-    'joint_states': lambda tick: _join(
-        tick.joint_position, tick.joint_velocity, tick.joint_effort
-    ),
+    'joint_states': lambda tick: _join(tick.joint_position, tick.joint_velocity, tick.joint_effort),
     'end_effector_pose': lambda tick: _join(
         tick.end_effector_position, tick.end_effector_quaternion
     ),
@@ -183,13 +181,13 @@ class TickEncoder:
     def encode(self, tick: Tick, latched: bool = False) -> list[tuple[TopicSpec, bytes]]:
         """Returns the messages of a tick with their CDR bytes, in the order of `topics`.
 
-        `desired_goal` is latched for late subscribers and yet part of every tick: a policy that joins
-        topics by stamp must never meet the state of a new episode with the goal of the one before.
+        `desired_goal` is latched for late subscribers and yet part of every tick: a policy that
+        joins topics by stamp must never meet the state of a new episode with the goal of the last.
 
         Args:
             tick: The tick.
-            latched: Whether to send `episode_status` too: at the reset, when the episode is finished,
-                and whenever it changes between.
+            latched: Whether to send `episode_status` too: at the reset, when the episode is
+                finished, and when it changes between.
 
         Raises:
             ValueError: If a vector is missing or has a wrong size.
