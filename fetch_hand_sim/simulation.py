@@ -198,6 +198,10 @@ class Simulation:
             wanted[flipped, 3:] *= -1.0
         self._goals[selected] = wanted
 
+    def resting_commands(self) -> Array:
+        """Commands (N, action size) that let the robots stay as they are."""
+        return self._task.resting_commands()
+
     def readings(self) -> Readings:
         """What the sensors say now, for the network."""
         return self._task.readings()

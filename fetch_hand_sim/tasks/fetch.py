@@ -191,6 +191,10 @@ class FetchTask(Task):
         self._mocap_pos[:, 0] = self._gripper_xpos + offset
         self._mocap_quat[:, 0] = self._gripper_xquat + _GRIPPER_ROTATION
 
+    def resting_commands(self) -> Array:
+        """Returns zeros: the gripper stays where it is, the fingers too."""
+        return np.zeros((self.batch.nsim, self.spec.robot.action_size))
+
     def _finger_controls(self, fingers: NDArray[np.floating] | float) -> Array:
         """Position actuators take targets relative to the present finger positions."""
         model = self.model

@@ -40,6 +40,10 @@ class HandTask(Task):
         """Sets the position actuators to absolute joint angles, radians."""
         self._ctrl[:] = commands
 
+    def resting_commands(self) -> Array:
+        """Returns the joint angles that the actuators hold now."""
+        return self._ctrl.copy()
+
     def _fingertips(self) -> Array:
         """Fingertip positions, (N, 15), metres."""
         return self._site_xpos[:, self._fingertip_sites].reshape(self.batch.nsim, -1)

@@ -97,6 +97,10 @@ class Task(ABC):
         """Writes commands (N, action size), in command units and within limits, to the physics."""
 
     @abstractmethod
+    def resting_commands(self) -> Array:
+        """Returns the commands (N, action size) that change nothing about what the robots hold."""
+
+    @abstractmethod
     def observe(self) -> tuple[Array, Array]:
         """Returns the observations (N, observation size) and achieved goals (N, goal size)."""
 
