@@ -18,7 +18,7 @@ from msgs_spec.codecs import build_message, checked_size
 from msgs_spec.schemas import serialize
 from msgs_spec.topics import TopicSpec
 
-# Alignment counts from the end of the encapsulation header. The stamp, if there is one, comes first.
+# Alignment counts from the end of the encapsulation header. A stamp, if there is one, comes first.
 _BODY = 4
 _STAMP = struct.Struct('<iI')
 _FLOAT = struct.Struct('<d')

@@ -32,7 +32,7 @@ def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
     Returns:
         (..., action_size) in command units.
     """
-    clipped = np.clip(np.asarray(action), -1.0, 1.0)
+    clipped = np.asarray(np.clip(np.asarray(action), -1.0, 1.0))
     if robot.has_gripper_command:
         return clipped
     lower, upper = command_limits(robot)

@@ -34,8 +34,8 @@ class RobotSpec:
         name: `fetch` or `shadow_hand`.
         joints: Scalar joints in the order of `joint_states` (MJCF names).
         joint_units: 'm' or 'rad' for each joint.
-        command: The parts of the command vector, in order. The normalised action has the same length
-            and order.
+        command: The parts of the command vector, in order. The normalised action has the same
+            length and order.
         has_gripper_command: True where commands are the four dimensionless gripper values, False
             where they are absolute joint positions.
     """

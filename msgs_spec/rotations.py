@@ -1,8 +1,8 @@
 """Quaternions, matrices and Euler angles of any batch shape; the one place of wxyz and xyzw.
 
-MuJoCo writes quaternions wxyz, ROS messages xyzw. Everything in this project is wxyz except inside a
-message. All functions work on fresh contiguous arrays and element by element, so a batch gives the
-same bits as one call per row. Euler angles are Gymnasium-Robotics' relative xyz convention
+MuJoCo writes quaternions wxyz, ROS messages xyzw. Everything in this project is wxyz except inside
+a message. All functions work on fresh contiguous arrays and element by element, so a batch gives
+the same bits as one call per row. Euler angles are Gymnasium-Robotics' relative xyz convention
 (`gymnasium_robotics.utils.rotations`).
 """
 
@@ -65,15 +65,18 @@ def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
 
 
 def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of unit quaternions wxyz, computed as `mju_quat2Mat` does."""
+    """Rotation matrices (..., 3, 3) of unit quaternions wxyz.
+
+    The order of the sums is that of MuJoCo 4 (`mju_quat2Mat`), whose bits it gives.
+    """
     w, x, y, z = _parts(quaternion)
     ww, wx, wy, wz = w * w, w * x, w * y, w * z
     xx, xy, xz = x * x, x * y, x * z
     yy, yz, zz = y * y, y * z, z * z
     rows = [
-        [ww + xx - yy - zz, 2 * (xy - wz), 2 * (xz + wy)],
-        [2 * (xy + wz), ww - xx + yy - zz, 2 * (yz - wx)],
-        [2 * (xz - wy), 2 * (yz + wx), ww - xx - yy + zz],
+        [(ww - yy) + (xx - zz), 2 * (xy - wz), 2 * (xz + wy)],
+        [2 * (xy + wz), (ww + yy) - (xx + zz), 2 * (yz - wx)],
+        [2 * (xz - wy), 2 * (yz + wx), (ww - yy) - (xx - zz)],
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
