@@ -1,0 +1,1 @@
+"""DDPG with hindsight experience replay on the batched simulation, and its evaluation."""

@@ -1,0 +1,91 @@
+"""Replay of whole episodes, because hindsight needs what came later in the same one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Episodes:
+    """Episodes of equal length T.
+
+    Attributes:
+        observation: (episodes, T + 1, observation_size).
+        achieved_goal: (episodes, T + 1, goal_size).
+        desired_goal: (episodes, goal_size); a goal lasts an episode.
+        action: (episodes, T, action_size).
+    """
+
+    observation: Array
+    achieved_goal: Array
+    desired_goal: Array
+    action: Array
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    @property
+    def ticks(self) -> int:
+        """Steps per episode."""
+        return self.action.shape[1]
+
+    def select(self, rows: NDArray[np.bool_]) -> Episodes:
+        """Returns the episodes whose row is True."""
+        return Episodes(
+            self.observation[rows],
+            self.achieved_goal[rows],
+            self.desired_goal[rows],
+            self.action[rows],
+        )
+
+
+class EpisodeReplay:
+    """Ring of the latest episodes in arrays allocated once."""
+
+    def __init__(
+        self, capacity: int, ticks: int, observation_size: int, goal_size: int, action_size: int
+    ) -> None:
+        """Allocates room for `capacity` episodes; the memory is touched as episodes arrive."""
+        if capacity < 1:
+            raise ValueError(f'replay capacity {capacity} episodes; allowed: 1 or more')
+        self._ring = Episodes(
+            observation=np.zeros((capacity, ticks + 1, observation_size), np.float32),
+            achieved_goal=np.zeros((capacity, ticks + 1, goal_size), np.float32),
+            desired_goal=np.zeros((capacity, goal_size), np.float32),
+            action=np.zeros((capacity, ticks, action_size), np.float32),
+        )
+        self.capacity = capacity
+        self._size = 0
+        self._next = 0
+
+    def __len__(self) -> int:
+        """Number of episodes held."""
+        return self._size
+
+    @property
+    def episodes(self) -> Episodes:
+        """Views of the episodes held, in no particular order."""
+        ring, size = self._ring, self._size
+        return Episodes(
+            ring.observation[:size],
+            ring.achieved_goal[:size],
+            ring.desired_goal[:size],
+            ring.action[:size],
+        )
+
+    def add(self, episodes: Episodes) -> None:
+        """Adds episodes, the oldest ones making room."""
+        if len(episodes) > self.capacity:
+            raise ValueError(f'{len(episodes)} episodes exceed the capacity of {self.capacity}')
+        rows = (self._next + np.arange(len(episodes))) % self.capacity
+        self._ring.observation[rows] = episodes.observation
+        self._ring.achieved_goal[rows] = episodes.achieved_goal
+        self._ring.desired_goal[rows] = episodes.desired_goal
+        self._ring.action[rows] = episodes.action
+        self._next = int((self._next + len(episodes)) % self.capacity)
+        self._size = min(self._size + len(episodes), self.capacity)

@@ -1,0 +1,153 @@
+"""Progress of a run: a live line, CSV, TensorBoard where installed, and the curve as PNG."""
+
+from __future__ import annotations
+
+import csv
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+COLUMNS = (
+    'seconds',
+    'env_steps',
+    'episodes',
+    'updates',
+    'train_success',
+    'eval_success',
+    'eval_episodes',
+    'critic_loss',
+    'actor_loss',
+    'mean_value',
+    'steps_per_second',
+    'samples_per_second',
+)
+# Seconds between lines where the output is no terminal.
+_PLAIN_INTERVAL = 15.0
+
+
+class RunLog:
+    """Writes one row per cycle; a resumed run appends to the same file."""
+
+    def __init__(self, output: Path, total_steps: int, time_limit: float) -> None:
+        self.path = output / 'progress.csv'
+        self._total_steps = total_steps
+        self._time_limit = time_limit
+        existing = self.path.is_file() and self.path.stat().st_size > 0
+        self._file: IO[str] = self.path.open('a', newline='')
+        self._writer = csv.DictWriter(self._file, COLUMNS)
+        if not existing:
+            self._writer.writeheader()
+        self._board = _tensorboard(output)
+        self._console = Console(stderr=True)
+        self._live = Live(console=self._console, refresh_per_second=4, transient=False)
+        self._last_plain = 0.0
+        self._last_eval = ''
+        if self._console.is_terminal:
+            self._live.start()
+
+    def write(self, row: dict[str, float | None]) -> None:
+        """Records one cycle; None leaves a column empty."""
+        self._writer.writerow({name: _short(row.get(name)) for name in COLUMNS})
+        self._file.flush()
+        if self._board is not None:
+            for name, value in row.items():
+                if value is not None and name != 'env_steps':
+                    self._board.add_scalar(name, value, int(row['env_steps'] or 0))
+        self._show(row)
+
+    def say(self, text: str) -> None:
+        """Prints a lasting line."""
+        self._console.print(text, highlight=False, soft_wrap=True)
+
+    def close(self) -> None:
+        """Ends the live line and closes the files."""
+        if self._console.is_terminal:
+            self._live.stop()
+        self._file.close()
+        if self._board is not None:
+            self._board.close()
+
+    def _show(self, row: dict[str, float | None]) -> None:
+        if row.get('eval_success') is not None:
+            self._last_eval = f'{row["eval_success"]:.3f} of {row["eval_episodes"]:.0f}'
+        steps, seconds = row['env_steps'] or 0, row['seconds'] or 0
+        line = (
+            f'{steps:,.0f} steps  {row["steps_per_second"] or 0:,.0f} steps/s  '
+            f'{row["samples_per_second"] or 0:,.0f} samples/s  '
+            f'train {row["train_success"] or 0:.2f}  eval {self._last_eval or "-"}  '
+            f'{_clock(seconds)}  ETA {self._remaining(row)}'
+        )
+        if self._console.is_terminal:
+            self._live.update(Text(line))
+        elif time.monotonic() - self._last_plain > _PLAIN_INTERVAL:
+            self._last_plain = time.monotonic()
+            print(line, file=sys.stderr, flush=True)
+
+    def _remaining(self, row: dict[str, float | None]) -> str:
+        speed = row['steps_per_second'] or 0
+        if speed <= 0:
+            return '-'
+        remaining = (self._total_steps - (row['env_steps'] or 0)) / speed
+        if self._time_limit > 0:
+            remaining = min(remaining, self._time_limit - (row['seconds'] or 0))
+        return _clock(max(remaining, 0.0))
+
+
+def _short(value: float | None) -> str:
+    return '' if value is None else f'{value:.6g}' if isinstance(value, float) else str(value)
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f'{hours}:{minutes:02}:{rest:02}'
+
+
+def _tensorboard(output: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    return SummaryWriter(str(output / 'tensorboard'))  # type: ignore[no-untyped-call]
+
+
+def read_progress(path: str | Path) -> list[dict[str, float]]:
+    """Reads `progress.csv`; empty columns are left out of a row."""
+    with open(path, newline='') as file:
+        rows = list(csv.DictReader(file))
+    return [{name: float(text) for name, text in row.items() if text} for row in rows]
+
+
+def draw_curve(rows: Sequence[dict[str, float]], title: str, path: str | Path) -> None:
+    """Draws success against environment steps as PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.0), layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    evaluated = [row for row in rows if 'eval_success' in row]
+    axes.plot(
+        [row['env_steps'] for row in rows],
+        [row['train_success'] for row in rows],
+        color='tab:gray',
+        alpha=0.5,
+        label='while exploring',
+    )
+    axes.plot(
+        [row['env_steps'] for row in evaluated],
+        [row['eval_success'] for row in evaluated],
+        marker='.',
+        label='deterministic evaluation',
+    )
+    axes.set(xlabel='environment steps', ylabel='success at the last step', ylim=(-0.02, 1.02))
+    axes.set_title(title)
+    axes.grid(alpha=0.3)
+    axes.legend(loc='lower right')
+    figure.savefig(path, dpi=120)

@@ -1,0 +1,378 @@
+"""The training loop: collect, learn, evaluate, keep the best."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node import checkpoint
+from policy_node.actor import Actor, NetworkShape
+from policy_node.checkpoint import ActorInfo
+from policy_node.training.collector import Collector
+from policy_node.training.config import TrainConfig
+from policy_node.training.ddpg import DDPG, Losses, choose_device
+from policy_node.training.distributed import Workers
+from policy_node.training.evaluate import EpisodeOutcomes, evaluate, wilson_interval
+from policy_node.training.hindsight import goal_mixture, sample_transitions
+from policy_node.training.normalizer import RunningStatistics
+from policy_node.training.replay import EpisodeReplay, Episodes
+from policy_node.training.run_log import RunLog
+from policy_node.training.training_state import Counters, load_state, read_extra, save_state
+
+# Seeds of evaluation episodes start here; those of training runs stay far below.
+EVALUATION_SEED = 1_000_000_000
+STATE_FILE = 'training_state.safetensors'
+LATEST_FILE = 'latest.safetensors'
+BEST_FILE = 'best.safetensors'
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on; the message names the step and the cause."""
+
+
+@dataclass(frozen=True, slots=True)
+class Collected:
+    """What one cycle of collection, and the evaluation when one was due, gave."""
+
+    episodes: Episodes
+    train_success: float
+    evaluation: EpisodeOutcomes | None
+    actor: Actor
+
+
+class Trainer:
+    """One run of one configuration, on one of several workers."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        output: Path,
+        workers: Workers,
+        command: str = '',
+        source_revision: str = '',
+    ) -> None:
+        """Prepares simulations, networks and the output folder.
+
+        Args:
+            config: What to train and how.
+            output: Folder for checkpoints and logs.
+            workers: This worker among all.
+            command: Command line, for the metadata of checkpoints.
+            source_revision: Revision of the source, likewise.
+        """
+        self.config = config
+        self.output = output
+        self.workers = workers
+        self._command = command
+        self._source_revision = source_revision
+        self.device = choose_device(config.device)
+        if config.torch_threads:
+            torch.set_num_threads(config.torch_threads)
+        torch.manual_seed(config.seed)
+        self._build_simulations()
+        self._build_learner()
+        self.counters = Counters()
+        self._stop_reason = ''
+        self._next_evaluation = 0
+        self._learning_starts = config.learning_starts
+        self._last_checkpoint = time.monotonic()
+
+    def _build_simulations(self) -> None:
+        config, share = self.config, self.workers.share
+        options: dict[str, Any] = {
+            'num_threads': config.simulation_threads,
+            'reward_type': config.reward_type,
+            'success_rule': config.success_rule,
+            'control_hz': config.control_hz,
+        }
+        num_envs = share(config.num_envs)
+        self.simulation = Simulation(config.task, num_envs=num_envs, **options)
+        # Evaluation has its own copies, so that it leaves no trace in the training episodes.
+        count = min(num_envs, config.evaluation_episodes)
+        self._evaluation = Simulation(config.task, num_envs=count, **options)
+        self.spec = self.simulation.spec
+        seeds = np.random.SeedSequence([config.seed, self.workers.rank])
+        collector_seeds, sampler_seed = seeds.spawn(2)
+        self.collector = Collector(
+            self.simulation,
+            [int(seed) >> 2 for seed in collector_seeds.generate_state(num_envs)],
+            config.noise_std,
+            config.random_epsilon,
+        )
+        self._generator = np.random.default_rng(sampler_seed)
+
+    def _build_learner(self) -> None:
+        config, spec, share = self.config, self.spec, self.workers.share
+        shape = NetworkShape(
+            observation_size=spec.observation_size,
+            goal_size=spec.goal.size,
+            action_size=spec.robot.action_size,
+            hidden_sizes=config.hidden_sizes,
+            layer_norm=config.layer_norm,
+        )
+        self.learner = DDPG(shape, config, self.device, self.workers)
+        self.statistics = {
+            'observation_statistics': RunningStatistics(spec.observation_size),
+            'goal_statistics': RunningStatistics(spec.goal.size),
+        }
+        capacity = max(share(config.replay_transitions) // spec.episode_ticks, 1)
+        self.replay = EpisodeReplay(
+            max(capacity, self.simulation.num_envs),
+            spec.episode_ticks,
+            spec.observation_size,
+            spec.goal.size,
+            spec.robot.action_size,
+        )
+        self.batch_size = share(config.batch_size)
+
+    def stop(self, reason: str) -> None:
+        """Asks the run to end after the current cycle, with a checkpoint."""
+        self._stop_reason = reason
+
+    def resume(self, path: Path) -> None:
+        """Continues from a training state; the replay fills up before learning goes on.
+
+        Raises:
+            ValueError: If the file does not fit the configuration.
+        """
+        extra = read_extra(path)
+        self.counters = load_state(path, self.learner, self.statistics)
+        if self.workers.world_size == 1:
+            self.collector.load_state(extra['collector_generator'])
+            self._generator.bit_generator.state = extra['sampler_generator']
+        refill = min(self.counters.env_steps, self.config.replay_transitions, 100_000)
+        self._learning_starts = max(self._learning_starts, refill)
+        self._next_evaluation = self.counters.env_steps + self.config.evaluate_every
+
+    def train(self, log: RunLog | None = None) -> str:
+        """Runs until a limit is reached or `stop` is called; returns why it ended.
+
+        Raises:
+            TrainingError: If a loss or an observation is not finite; the checkpoints written before
+                are left as they are.
+        """
+        started = time.monotonic() - self.counters.seconds
+        with ThreadPoolExecutor(1, 'collector') as executor:
+            submit = executor.submit if self.config.overlap else _run_now
+            collected = self._collect_or_explain(submit(self._collect, *self._request()))
+            while True:
+                before = time.monotonic()
+                self._absorb(collected)
+                job = submit(self._collect, *self._request()) if self.config.overlap else None
+                losses = self._learn()
+                if job is None:
+                    job = submit(self._collect, *self._request())
+                collected = self._collect_or_explain(job)
+                self.counters.seconds = time.monotonic() - started
+                self._check(losses)
+                self._keep_best(collected)
+                if log is not None:
+                    log.write(self._row(collected, losses, time.monotonic() - before))
+                reason = self._reason_to_stop(collected)
+                if reason or self._checkpoint_due():
+                    self.save()
+                if reason:
+                    return reason
+
+    def _request(self) -> tuple[Actor, bool, bool]:
+        """What to collect next: the actor of now, whether at random, and whether to evaluate."""
+        steps = self.counters.env_steps
+        evaluation_due = steps >= max(self._next_evaluation, 1) and self.counters.updates > 0
+        if evaluation_due:
+            self._next_evaluation = steps + self.config.evaluate_every
+        actor = copy.deepcopy(self.learner.actor).cpu().eval()
+        return actor, steps < self.config.random_steps, evaluation_due
+
+    def _collect(self, actor: Actor, random: bool, evaluation_due: bool) -> Collected:
+        outcomes = self._evaluate(actor) if evaluation_due and self.workers.is_first else None
+        episodes, success = self.collector.collect(actor, random)
+        return Collected(episodes, success, outcomes, actor)
+
+    def _evaluate(self, actor: Actor) -> EpisodeOutcomes:
+        def hopeless(outcomes: EpisodeOutcomes) -> bool:
+            successes = int(self._successes(outcomes).sum())
+            return wilson_interval(successes, len(outcomes))[1] < self.counters.best_success
+
+        episodes = self.config.evaluation_episodes
+        return evaluate(self._evaluation, actor, episodes, EVALUATION_SEED, hopeless)
+
+    def _successes(self, outcomes: EpisodeOutcomes) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        paper = self.config.success_rule == 'paper'
+        return outcomes.success_paper if paper else outcomes.success_gymnasium
+
+    def _collect_or_explain(self, job: Future[Collected]) -> Collected:
+        collected = job.result()
+        for name in ('observation', 'achieved_goal', 'desired_goal', 'action'):
+            if not np.isfinite(getattr(collected.episodes, name)).all():
+                raise TrainingError(
+                    f'{name} is not finite after {self.counters.env_steps} environment steps'
+                )
+        return collected
+
+    def _absorb(self, collected: Collected) -> None:
+        """Puts new episodes into the replay and into the normalisers."""
+        episodes = collected.episodes
+        if len(episodes):
+            self.replay.add(episodes)
+        count = self.workers.sum(torch.tensor([len(episodes)])).item()
+        self.counters.episodes += int(count)
+        self.counters.env_steps += int(count) * self.spec.episode_ticks
+        self._update_normalizers(episodes)
+
+    def _update_normalizers(self, episodes: Episodes) -> None:
+        """Adds the new episodes, goals relabelled as the networks will see them."""
+        observation = episodes.observation[:, :-1]
+        goal = np.zeros((0, self.spec.goal.size))
+        if len(episodes):
+            count = len(episodes) * episodes.ticks
+            goal = sample_transitions(
+                episodes, count, self._mixture(), self.simulation.compute_reward, self._generator
+            ).goal
+        actor = self.learner.actor
+        for name, values, normalizer in (
+            ('observation_statistics', observation, actor.observation_normalizer),
+            ('goal_statistics', goal, actor.goal_normalizer),
+        ):
+            self.statistics[name].update(values, self.workers)
+            self.statistics[name].write(normalizer)
+
+    def _mixture(self) -> dict[str, float]:
+        config = self.config
+        early = self.counters.env_steps < config.future_only_steps
+        strategy = 'future' if early and config.strategy == 'futureactual' else config.strategy
+        return goal_mixture(strategy, config.hindsight_k)
+
+    def _learn(self) -> list[Losses]:
+        held = len(self.replay) * self.spec.episode_ticks
+        if self.workers.any(held < max(self.workers.share(self._learning_starts), 1)):
+            return []
+        mixture, episodes = self._mixture(), self.replay.episodes
+        losses = []
+        for _ in range(self.config.updates_per_cycle):
+            batch = sample_transitions(
+                episodes,
+                self.batch_size,
+                mixture,
+                self.simulation.compute_reward,
+                self._generator,
+            )
+            losses.append(self.learner.update(batch))
+        self.counters.updates = self.learner.updates
+        return losses
+
+    def _check(self, losses: list[Losses]) -> None:
+        """Stops on the first loss that is not finite."""
+        first = self.counters.updates - len(losses)
+        for name in ('critic', 'actor'):
+            values = [getattr(loss, name) for loss in losses]
+            finite = torch.isfinite(torch.stack(values)).tolist() if values else []
+            if not all(finite):
+                update = first + finite.index(False) + 1
+                raise TrainingError(
+                    f'{name} loss is {float(values[finite.index(False)])} in update {update}, '
+                    f'after {self.counters.env_steps} environment steps'
+                )
+
+    def _keep_best(self, collected: Collected) -> None:
+        outcomes = collected.evaluation
+        if outcomes is None or len(outcomes) < self.config.evaluation_episodes:
+            return
+        success = float(self._successes(outcomes).mean())
+        if success > self.counters.best_success:
+            self.counters.best_success = success
+            self._save_actor(BEST_FILE, collected.actor, outcomes)
+
+    def _reason_to_stop(self, collected: Collected) -> str:
+        config, reason = self.config, self._stop_reason
+        target = config.success_target
+        if not reason and 0 < target <= self.counters.best_success:
+            reason = f'success target {target:g} reached'
+        if not reason and self.counters.env_steps >= config.total_steps:
+            reason = f'{config.total_steps:,} environment steps done'
+        if not reason and 0 < config.time_limit <= self.counters.seconds:
+            reason = f'time limit of {config.time_limit:g} s reached'
+        return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
+
+    def _checkpoint_due(self) -> bool:
+        elapsed = time.monotonic() - self._last_checkpoint
+        return self.workers.is_first and elapsed >= self.config.checkpoint_seconds
+
+    def save(self) -> None:
+        """Writes the latest actor and the training state (worker 0 only)."""
+        self._last_checkpoint = time.monotonic()
+        if not self.workers.is_first:
+            return
+        self._save_actor(LATEST_FILE, self.learner.actor, None)
+        extra = {
+            'config': dataclasses.asdict(self.config),
+            'collector_generator': self.collector.state(),
+            'sampler_generator': self._generator.bit_generator.state,
+        }
+        path = self.output / STATE_FILE
+        save_state(path, self.learner, self.statistics, self.counters, extra)
+
+    def _save_actor(self, name: str, actor: Actor, outcomes: EpisodeOutcomes | None) -> None:
+        if not self.workers.is_first:
+            return
+        config, success = self.config, {}
+        if outcomes is not None:
+            rate = float(self._successes(outcomes).mean())
+            success = {'last_step': rate, 'episodes': len(outcomes), 'rule': config.success_rule}
+        info = ActorInfo(
+            task=config.task,
+            observation_layout=checkpoint.observation_layout(self.spec),
+            goal_size=self.spec.goal.size,
+            action_size=self.spec.robot.action_size,
+            hidden_sizes=config.hidden_sizes,
+            layer_norm=config.layer_norm,
+            control_hz=config.control_hz,
+            seed=config.seed,
+            command=self._command,
+            source_revision=self._source_revision,
+            env_steps=self.counters.env_steps,
+            config=dataclasses.asdict(config),
+            success=success,
+        )
+        checkpoint.save(self.output / name, actor, info)
+
+    def _row(
+        self, collected: Collected, losses: list[Losses], seconds: float
+    ) -> dict[str, float | None]:
+        counters, outcomes = self.counters, collected.evaluation
+        samples = len(losses) * self.batch_size * self.workers.world_size
+        steps = self.simulation.num_envs * self.spec.episode_ticks * self.workers.world_size
+
+        def mean(name: str) -> float | None:
+            return float(torch.stack([getattr(x, name) for x in losses]).mean()) if losses else None
+
+        return {
+            'seconds': counters.seconds,
+            'env_steps': counters.env_steps,
+            'episodes': counters.episodes,
+            'updates': counters.updates,
+            'train_success': collected.train_success,
+            'eval_success': None if outcomes is None else float(self._successes(outcomes).mean()),
+            'eval_episodes': None if outcomes is None else len(outcomes),
+            'critic_loss': mean('critic'),
+            'actor_loss': mean('actor'),
+            'mean_value': mean('value'),
+            'steps_per_second': steps / seconds,
+            'samples_per_second': samples / seconds,
+        }
+
+
+def _run_now(function: Callable[..., Collected], *arguments: Any) -> Future[Collected]:
+    """Runs a job at once, in this thread, behind the interface of an executor."""
+    future: Future[Collected] = Future()
+    future.set_result(function(*arguments))
+    return future
