@@ -1,0 +1,27 @@
+"""Episodes as MCAP files: one rosbag2 bag per episode, complete or marked as interrupted."""
+
+from fetch_hand_sim.episode_log.episode_metadata import episode_metadata
+from fetch_hand_sim.episode_log.episodes import EpisodeDirectory, episode_name
+from fetch_hand_sim.episode_log.errors import EpisodeExistsError, EpisodeLogError, EpisodeReadError
+from fetch_hand_sim.episode_log.leftovers import Leftover, find_leftovers
+from fetch_hand_sim.episode_log.log_times import log_time
+from fetch_hand_sim.episode_log.reader import Episode, read_episode
+from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
+from fetch_hand_sim.episode_log.writer import EpisodeWriter
+
+__all__ = [
+    'Attachment',
+    'Episode',
+    'EpisodeDirectory',
+    'EpisodeExistsError',
+    'EpisodeLogError',
+    'EpisodeReadError',
+    'EpisodeWriter',
+    'Leftover',
+    'LogSettings',
+    'episode_metadata',
+    'episode_name',
+    'find_leftovers',
+    'log_time',
+    'read_episode',
+]

@@ -1,0 +1,151 @@
+"""One MCAP file as rosbag2, rosbags and Foxglove want it.
+
+Profile `ros2`, `ros2msg` schemas, `cdr` messages, quality of service and type hash per channel,
+chunks with CRC and message index, schemas and channels repeated in the summary, statistics. Knows
+nothing of episodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import BinaryIO, Literal
+
+from mcap.writer import CompressionType, Writer
+
+from fetch_hand_sim.episode_log.bag_metadata import BagInfo, ChannelInfo
+
+Compression = Literal['none', 'lz4', 'zstd']
+COMPRESSIONS = {
+    'none': CompressionType.NONE,
+    'lz4': CompressionType.LZ4,
+    'zstd': CompressionType.ZSTD,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelSpec:
+    """What readers are told about a topic.
+
+    Attributes:
+        topic: Resolved name, with a leading slash.
+        type_name: ROS name of the message type.
+        schema_text: `ros2msg` definition of the type and of all types it is made of.
+        qos_yaml: `offered_qos_profiles` as YAML text, a list of profiles.
+        type_hash: RIHS01 hash of the type.
+    """
+
+    topic: str
+    type_name: str
+    schema_text: str
+    qos_yaml: str
+    type_hash: str
+
+
+@dataclass(slots=True)
+class _Channel:
+    spec: ChannelSpec
+    id: int
+    count: int = 0
+
+
+class BagFile:
+    """Writes messages to an open stream, whose `OSError`s come through and end the file.
+
+    Args:
+        stream: Where to write; stays the caller's to flush and close.
+        file_name: Name of the file in its bag directory.
+        chunk_size: Bytes of messages after which a chunk is compressed and written.
+        compression: Of the chunks.
+    """
+
+    def __init__(
+        self, stream: BinaryIO, file_name: str, chunk_size: int, compression: Compression
+    ) -> None:
+        self._file_name = file_name
+        self._writer = Writer(stream, chunk_size=chunk_size, compression=COMPRESSIONS[compression])
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, _Channel] = {}
+        self._start_ns = 0
+        self._end_ns = -1
+        self._writer.start(profile='ros2')
+
+    def write(self, spec: ChannelSpec, data: bytes, log_time_ns: int) -> None:
+        """Appends a message; the first of a topic makes its channel: readers reject empty ones.
+
+        The sequence number counts the messages of the channel from 0, so a reader can prove that
+        none is missing.
+
+        Raises:
+            ValueError: If the time is not later than that of the message before.
+        """
+        if log_time_ns <= self._end_ns:
+            raise ValueError(
+                f'log time {log_time_ns} ns of {spec.topic} is not later than the one before it, '
+                f'{self._end_ns} ns'
+            )
+        channel = self._channels.get(spec.topic) or self._add_channel(spec)
+        self._writer.add_message(
+            channel_id=channel.id,
+            log_time=log_time_ns,
+            data=data,
+            publish_time=log_time_ns,
+            sequence=channel.count,
+        )
+        if self._end_ns < 0:
+            self._start_ns = log_time_ns
+        self._end_ns = log_time_ns
+        channel.count += 1
+
+    def _add_channel(self, spec: ChannelSpec) -> _Channel:
+        if spec.type_name not in self._schemas:
+            self._schemas[spec.type_name] = self._writer.register_schema(
+                name=spec.type_name, encoding='ros2msg', data=spec.schema_text.encode()
+            )
+        channel_id = self._writer.register_channel(
+            topic=spec.topic,
+            message_encoding='cdr',
+            schema_id=self._schemas[spec.type_name],
+            metadata={
+                'offered_qos_profiles': spec.qos_yaml,
+                'topic_type_hash': spec.type_hash,
+            },
+        )
+        self._channels[spec.topic] = channel = _Channel(spec, channel_id)
+        return channel
+
+    def add_record(self, name: str, content: dict[str, str]) -> None:
+        """Writes a metadata record."""
+        self._writer.add_metadata(name, content)
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Writes an attachment, with no time: what is attached holds for the whole file."""
+        self._writer.add_attachment(
+            create_time=0, log_time=0, name=name, media_type=media_type, data=data
+        )
+
+    def flush(self) -> None:
+        """Ends the chunk in progress and hands everything to the operating system."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def finish(self) -> None:
+        """Writes the last chunk and the summary."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+
+    @property
+    def info(self) -> BagInfo:
+        """What is in the file so far."""
+        return BagInfo(
+            file_name=self._file_name,
+            start_ns=self._start_ns,
+            end_ns=max(self._end_ns, 0),
+            channels=[
+                ChannelInfo(
+                    topic=channel.spec.topic,
+                    type_name=channel.spec.type_name,
+                    qos_yaml=channel.spec.qos_yaml,
+                    type_hash=channel.spec.type_hash,
+                    message_count=channel.count,
+                )
+                for channel in self._channels.values()
+            ],
+        )

@@ -1,0 +1,106 @@
+"""File system steps of an episode: claimed under a hidden name, shown when complete."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+from fetch_hand_sim.episode_log.errors import EpisodeExistsError
+
+_PREFIX, _SUFFIX = '.', '.active'
+_MIB = 1024 * 1024
+
+
+def active_path(directory: Path, name: str) -> Path:
+    """Returns the directory in which the episode `name` is written."""
+    return directory / f'{_PREFIX}{name}{_SUFFIX}'
+
+
+def active_name(path: Path) -> str | None:
+    """Returns the name of the episode that is written in `path`, None for other directories."""
+    if path.name.startswith(_PREFIX) and path.name.endswith(_SUFFIX):
+        return path.name[len(_PREFIX) : -len(_SUFFIX)]
+    return None
+
+
+def claim(directory: Path, name: str) -> Path:
+    """Creates and returns the hidden directory of an episode; of several processes one succeeds.
+
+    Raises:
+        EpisodeExistsError: If an episode of this name is finished or being written.
+    """
+    active = active_path(directory, name)
+    try:
+        active.mkdir()
+    except FileExistsError:
+        raise EpisodeExistsError(
+            f'{active} exists: {name} is being written or was cut off'
+        ) from None
+    # Only now: whoever holds the claim is the only one to finish under this name.
+    if (directory / name).exists():
+        active.rmdir()
+        raise EpisodeExistsError(f'{directory / name} exists; episodes are never overwritten')
+    return active
+
+
+def require_free_space(directory: Path, minimum_bytes: int) -> None:
+    """Raises `OSError` if less than `minimum_bytes` can be written to the disk of `directory`."""
+    status = os.statvfs(directory)
+    free = status.f_bavail * status.f_frsize
+    if free < minimum_bytes:
+        raise OSError(
+            errno.ENOSPC,
+            f'{free / _MIB:.1f} MiB free on the disk, {minimum_bytes / _MIB:.1f} MiB wanted',
+        )
+
+
+def lock(stream: IO[bytes]) -> None:
+    """Marks a file as being written for as long as this process lives and keeps it open."""
+    # File systems without locks only lose the distinction between running and cut-off episodes.
+    with suppress(OSError):
+        fcntl.flock(stream, fcntl.LOCK_EX)
+
+
+def is_locked(path: Path) -> bool:
+    """Whether some process has the file open and locked."""
+    with path.open('rb') as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+    return False
+
+
+def sync(stream: IO[bytes]) -> None:
+    """Brings what was written to the disk, not only to the operating system."""
+    stream.flush()
+    os.fsync(stream.fileno())
+
+
+def sync_directory(path: Path) -> None:
+    """Brings the entries of a directory to the disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file to the disk."""
+    with path.open('wb') as stream:
+        stream.write(text.encode())
+        sync(stream)
+
+
+def publish(active: Path, final: Path) -> None:
+    """Gives a complete episode its name, in one step that a crash leaves done or not done."""
+    sync_directory(active)
+    active.rename(final)
+    sync_directory(final.parent)

@@ -1,0 +1,71 @@
+"""What makes an episode reproducible, as the strings of the metadata record `episode`."""
+
+from __future__ import annotations
+
+import json
+import platform
+from functools import cache
+from importlib import metadata
+
+from msgs_spec.tasks import PHYSICS_TIMESTEP, TaskSpec
+
+_PACKAGES = ('fetch_hand_sim', 'mujoco', 'numpy', 'gymnasium-robotics', 'mcap')
+
+
+@cache
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return 'unknown'
+
+
+def episode_metadata(
+    task: TaskSpec,
+    *,
+    episode: int,
+    seed: int,
+    reward_type: str,
+    success_rule: str,
+    control_hz: float,
+    model_sha256: str,
+    source_revision: str | None = None,
+    checkpoint_sha256: str | None = None,
+    started: str | None = None,
+) -> dict[str, str]:
+    """Returns the contents of the record `episode`.
+
+    Args:
+        task: The task.
+        episode: Number of the episode in this run, from 0; the number in the file name goes on over
+            runs.
+        seed: Seed of the reset.
+        reward_type: 'sparse' or 'dense'.
+        success_rule: 'gymnasium' or 'paper'.
+        control_hz: Ticks per simulated second.
+        model_sha256: Fingerprint of the compiled model, see `model_sha256`.
+        source_revision: Revision of this project, if known.
+        checkpoint_sha256: Fingerprint of the actor that gives the commands, if known.
+        started: Wall-clock time of the start, ISO 8601. The one value that differs between equal
+            runs; leave it out for files that are equal byte by byte.
+    """
+    known = {
+        'task': task.name,
+        'episode': str(episode),
+        'seed': str(seed),
+        'reward_type': reward_type,
+        'success_rule': success_rule,
+        'control_hz': repr(float(control_hz)),
+        'physics_timestep_s': repr(PHYSICS_TIMESTEP),
+        'episode_ticks': str(task.episode_ticks),
+        'robot': task.robot.name,
+        'joint_order': json.dumps(task.robot.joints),
+        'command_order': json.dumps([part.name for part in task.robot.command]),
+        'model_sha256': model_sha256,
+        'source_revision': source_revision,
+        'checkpoint_sha256': checkpoint_sha256,
+        'started': started,
+        'python_version': platform.python_version(),
+        **{f'{package}_version': _version(package) for package in _PACKAGES},
+    }
+    return {key: value for key, value in known.items() if value is not None}

@@ -1,0 +1,252 @@
+"""Writes one episode: its messages, what they mean, and how it ended."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from fetch_hand_sim.episode_log import durable
+from fetch_hand_sim.episode_log.bag_file import BagFile, ChannelSpec
+from fetch_hand_sim.episode_log.bag_metadata import metadata_record, metadata_yaml
+from fetch_hand_sim.episode_log.errors import EpisodeLogError
+from fetch_hand_sim.episode_log.log_times import log_time
+from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
+from msgs_spec.qos import rosbag2_yaml
+from msgs_spec.schemas import schema_text, type_hash
+from msgs_spec.topics import TopicSpec
+
+# Names of the metadata records.
+EPISODE, EPISODE_RESULT, ROSBAG2 = 'episode', 'episode_result', 'rosbag2'
+
+
+def _strings(content: Mapping[str, str]) -> dict[str, str]:
+    """A copy, after a check: MCAP would fail on anything else in the middle of the file."""
+    for key, value in content.items():
+        if not isinstance(key, str) or not isinstance(value, str):
+            raise ValueError(f'episode metadata are strings, not {key!r}: {value!r}')
+    return dict(content)
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error)
+
+
+def complete_bag(
+    bag: BagFile,
+    stream: BinaryIO,
+    directory: Path,
+    metadata: dict[str, str],
+    result: dict[str, str],
+) -> None:
+    """Writes how the episode ended, the summary and `metadata.yaml`, down to the disk."""
+    custom_data = {**metadata, **result}
+    bag.flush()
+    info = bag.info
+    bag.add_record(EPISODE_RESULT, result)
+    bag.add_record(ROSBAG2, metadata_record(info, custom_data))
+    bag.finish()
+    durable.sync(stream)
+    durable.write_text(directory / 'metadata.yaml', metadata_yaml(info, custom_data))
+
+
+class EpisodeWriter:
+    """A rosbag2 bag that appears in a directory under its name when it is complete, and not before.
+
+    It is written in the hidden directory `.<name>.active`, from which `finish` or `abort` makes a
+    valid bag. A process that is killed leaves the hidden directory behind, for `find_leftovers` to
+    report.
+
+    Whatever the disk does, the simulation can go on: an error is raised once, as one line; after it
+    `write` does nothing and returns False, and `finish` returns None. Not thread-safe, and not for
+    use in signal handlers.
+
+    Args:
+        directory: Where episodes are collected; created if missing.
+        name: Name of the episode, see `episode_name`.
+        metadata: Contents of the metadata record `episode`, see `episode_metadata`; `episode_id`,
+            the name, is added.
+        attachments: Files to store.
+        settings: How to write.
+        namespace: ROS namespace of relative topic names.
+
+    Raises:
+        EpisodeExistsError: If the name is taken; episodes are never overwritten.
+        EpisodeLogError: If the disk is too full or the file cannot be written; nothing is left
+            behind.
+        ValueError: If metadata are not strings.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        name: str,
+        metadata: Mapping[str, str],
+        attachments: Iterable[Attachment] = (),
+        settings: LogSettings | None = None,
+        namespace: str = '/',
+    ) -> None:
+        self._metadata = {'episode_id': name, **_strings(metadata)}
+        self._settings = settings or LogSettings()
+        self._namespace = namespace.rstrip('/') + '/'
+        self._final = directory / name
+        self._channels: dict[str, ChannelSpec] = {}
+        self._flushed_ns: int | None = None
+        self._tick_ns: int | None = None
+        self._rank = 0
+        self._completed: Path | None = None
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            durable.require_free_space(directory, self._settings.minimum_free_bytes)
+            self._active = durable.claim(directory, name)
+            self._stream = (self._active / f'{name}_0.mcap').open('xb')
+        except OSError as error:
+            raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
+        self._is_open = True
+        try:
+            self._begin(attachments)
+        except OSError as error:
+            failure = self._fail(error)
+            self._discard()
+            raise failure from error
+
+    @property
+    def is_open(self) -> bool:
+        """Whether messages are taken: neither completed nor failed."""
+        return self._is_open
+
+    def write(self, topic: TopicSpec, data: bytes, log_time_ns: int) -> bool:
+        """Appends a message.
+
+        Args:
+            topic: What it is.
+            data: Its CDR bytes.
+            log_time_ns: Simulated time, later than that of the message before, see `log_times`.
+
+        Returns:
+            True if the message was taken, False if the episode is completed or has failed.
+
+        Raises:
+            EpisodeLogError: At the first error of the disk.
+            ValueError: If the time does not grow, or the topic had another type before.
+        """
+        if not self._is_open:
+            return False
+        try:
+            self._flush_if_due(log_time_ns)
+            self._bag.write(self._channel(topic), data, log_time_ns)
+        except OSError as error:
+            raise self._fail(error) from error
+        return True
+
+    def write_tick(self, stamp_ns: int, messages: Iterable[tuple[TopicSpec, bytes]]) -> bool:
+        """Appends all messages of the tick stamped `stamp_ns`, in their order; see `write`."""
+        self._tick_ns, self._rank = stamp_ns, 0
+        for topic, data in messages:
+            self._write_next(topic, data)
+        return self._is_open
+
+    def write_received(self, topic: TopicSpec, data: bytes) -> bool:
+        """Appends a command received since the last tick: it follows the messages of that tick.
+
+        Raises:
+            ValueError: If there was no tick yet: earlier commands are not part of the episode.
+        """
+        return self._write_next(topic, data)
+
+    def finish(self, result: Mapping[str, str]) -> Path | None:
+        """Completes the bag of an episode that ran to its end.
+
+        Args:
+            result: Contents of the metadata record `episode_result`; `complete` is added.
+
+        Returns:
+            The bag directory. None, and no bag, if writing had failed before or no message was
+            written.
+
+        Raises:
+            EpisodeLogError: If the bag cannot be completed; the hidden directory stays.
+            ValueError: If the result is not made of strings.
+        """
+        return self._complete({**result, 'complete': 'true'})
+
+    def abort(self, reason: str, result: Mapping[str, str] | None = None) -> Path | None:
+        """Completes the bag of an episode that was cut short, marked as such; see `finish`."""
+        return self._complete({**(result or {}), 'complete': 'false', 'reason': reason})
+
+    def _begin(self, attachments: Iterable[Attachment]) -> None:
+        durable.lock(self._stream)
+        self._bag = BagFile(
+            self._stream,
+            Path(self._stream.name).name,
+            self._settings.chunk_size,
+            self._settings.compression,
+        )
+        self._bag.add_record(EPISODE, self._metadata)
+        self._bag.add_record(ROSBAG2, metadata_record(self._bag.info, self._metadata))
+        for attachment in attachments:
+            self._bag.add_attachment(attachment.name, attachment.media_type, attachment.data)
+        self._bag.flush()
+
+    def _channel(self, topic: TopicSpec) -> ChannelSpec:
+        channel = self._channels.get(topic.name)
+        if channel is None:
+            channel = self._channels[topic.name] = ChannelSpec(
+                topic=topic.name if topic.name.startswith('/') else self._namespace + topic.name,
+                type_name=topic.type_name,
+                schema_text=schema_text(topic.type_name),
+                qos_yaml=rosbag2_yaml(topic.qos),
+                type_hash=type_hash(topic.type_name),
+            )
+        if channel.type_name != topic.type_name:
+            raise ValueError(
+                f'topic {topic.name} is {channel.type_name} in this episode, not {topic.type_name}'
+            )
+        return channel
+
+    def _flush_if_due(self, log_time_ns: int) -> None:
+        if self._flushed_ns is None:
+            self._flushed_ns = log_time_ns
+        elif log_time_ns - self._flushed_ns >= self._settings.flush_period_ns:
+            self._bag.flush()
+            self._flushed_ns = log_time_ns
+
+    def _write_next(self, topic: TopicSpec, data: bytes) -> bool:
+        if self._tick_ns is None:
+            raise ValueError(f'{topic.name} was written before the first tick of the episode')
+        time_ns = log_time(self._tick_ns, self._rank)
+        self._rank += 1
+        return self.write(topic, data, time_ns)
+
+    def _complete(self, result: Mapping[str, str]) -> Path | None:
+        record = _strings(result)
+        if not self._is_open:
+            return self._completed
+        try:
+            if self._bag.info.message_count == 0:
+                self._discard()
+                return None
+            complete_bag(self._bag, self._stream, self._active, self._metadata, record)
+            durable.publish(self._active, self._final)
+            self._is_open = False
+            self._stream.close()
+        except OSError as error:
+            raise self._fail(error) from error
+        self._completed = self._final
+        return self._completed
+
+    def _fail(self, error: OSError) -> EpisodeLogError:
+        """Stops logging for good; the lock goes with the stream."""
+        self._is_open = False
+        with suppress(OSError):
+            self._stream.close()
+        return EpisodeLogError(f'episode log stopped, {self._stream.name}: {_reason(error)}')
+
+    def _discard(self) -> None:
+        """Removes what this writer created; only called while there is no message in it."""
+        self._is_open = False
+        with suppress(OSError):
+            self._stream.close()
+        shutil.rmtree(self._active, ignore_errors=True)
