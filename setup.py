@@ -6,6 +6,18 @@ from setuptools import find_packages, setup
 
 PACKAGE = 'fetch_hand_sim'
 
+# What test/ needs beyond the package itself. An extra called `test` makes `colcon test` use pytest.
+TEST = [
+    'colcon-core',
+    'colcon-python-setup-py',
+    'colcon-ros',
+    'mcap-ros2-support',
+    'pytest',
+    'pytest-timeout',
+    'setuptools',
+    'stable-baselines3',
+]
+
 setup(
     name=PACKAGE,
     version='0.1.0',
@@ -43,18 +55,8 @@ setup(
         # ROS 2 Jazzy itself, for a machine without it.
         'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
         'train': ['matplotlib', 'tensorboard'],
-        'dev': [
-            'colcon-core',
-            'colcon-python-setup-py',
-            'colcon-ros',
-            'mcap-ros2-support',
-            'mypy',
-            'pytest',
-            'pytest-timeout',
-            'ruff',
-            'setuptools',
-            'stable-baselines3',
-        ],
+        'test': TEST,
+        'dev': [*TEST, 'mypy', 'ruff'],
     },
     entry_points={
         'console_scripts': [

@@ -1,0 +1,90 @@
+"""A private ROS graph for the whole run, and processes that never outlive their test."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+
+import pytest
+
+# Low domains are what people set by hand; above 101 the ports of DDS meet Linux' ephemeral ones.
+DOMAINS = range(40, 102)
+# The ports of `domain_coordinator` (ament_cmake_ros), so its users and this run avoid each other.
+DOMAIN_LOCK_PORT = 32768
+
+
+def reserve_domain() -> tuple[int, socket.socket]:
+    """Returns a ROS domain nobody else tests in; it is reserved while the socket is open."""
+    for domain in DOMAINS:
+        lock = socket.socket()
+        try:
+            lock.bind(('', DOMAIN_LOCK_PORT + domain))
+            return domain, lock
+        except OSError:
+            lock.close()
+    raise RuntimeError(f'no free ROS domain among {DOMAINS.start} ... {DOMAINS.stop - 1}')
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Sets the environment of ROS before any message class is imported; children inherit it."""
+    domain, lock = reserve_domain()
+    config.add_cleanup(lock.close)
+    log_directory = tempfile.mkdtemp(prefix='ros_log_')
+    config.add_cleanup(lambda: shutil.rmtree(log_directory, ignore_errors=True))
+    os.environ.update(
+        ROS_DOMAIN_ID=str(domain),
+        ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
+        # Off by default since Iron: without it a wrong type in a message field passes silently.
+        ROS_PYTHON_CHECK_FIELDS='1',
+        ROS_LOG_DIR=log_directory,
+    )
+    for variable in ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'):
+        os.environ.pop(variable, None)
+
+
+@pytest.fixture(scope='session')
+def ros_domain_id() -> int:
+    """The private ROS domain of this run."""
+    return int(os.environ['ROS_DOMAIN_ID'])
+
+
+@pytest.fixture
+def ros_environment() -> dict[str, str]:
+    """A copy of the environment nodes are started with, for a test to add to."""
+    return os.environ | {'PYTHONUNBUFFERED': '1'}
+
+
+@pytest.fixture
+def start_process(
+    ros_environment: dict[str, str],
+) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts processes with text pipes; what still runs after the test is killed with its children.
+
+    Takes the command, then the keyword arguments of `subprocess.Popen`.
+    """
+    started: list[subprocess.Popen[str]] = []
+
+    def start(*command: object, **options: object) -> subprocess.Popen[str]:
+        defaults = {
+            'env': ros_environment,
+            'stdout': subprocess.PIPE,
+            'stderr': subprocess.PIPE,
+            'text': True,
+            'start_new_session': True,
+        }
+        process = subprocess.Popen([str(part) for part in command], **(defaults | options))
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        try:
+            os.killpg(process.pid, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
+        process.communicate()
