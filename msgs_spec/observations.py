@@ -1,16 +1,20 @@
 """The observation vectors of the benchmark: the one place of their formulas.
 
 The simulation and the policy call the same functions, so an actor sees on ROS what it was trained
-on, bit for bit. All take any leading batch shape, work element by element and return fresh float64
-arrays.
+on, bit for bit. The functions take any leading batch shape, work element by element and return
+fresh float64 arrays.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msgs_spec.rotations import matrix_to_euler, quaternion_to_matrix
+from msgs_spec.tasks import PHYSICS_TIMESTEP, GoalKind, TaskSpec, substeps_per_tick
+from msgs_spec.topics import topic
 
 Array = NDArray[np.float64]
 
@@ -120,3 +124,72 @@ def hand_object_observation(
 
 def _concatenate(*parts: ArrayLike) -> Array:
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts], axis=-1)
+
+
+class ObservationAssembler:
+    """Rebuilds the dict observation of a task from its topics of one stamp.
+
+    Args:
+        task: The task.
+        control_hz: Ticks per simulated second, as `episode_status` says.
+
+    Attributes:
+        topics: The topics that are needed.
+
+    Raises:
+        ValueError: If the rate is not allowed.
+    """
+
+    def __init__(self, task: TaskSpec, control_hz: float) -> None:
+        self._task = task
+        self._tick_duration = substeps_per_tick(control_hz) * PHYSICS_TIMESTEP
+        names = (*_observed_topics(task), 'achieved_goal', 'desired_goal')
+        self.topics = tuple(topic(task, name) for name in names)
+
+    def assemble(self, vectors: Mapping[str, Array]) -> dict[str, Array]:
+        """Returns `observation`, `achieved_goal` and `desired_goal`, float64.
+
+        Args:
+            vectors: What `codecs.decode` made of each topic, by name; others are ignored.
+
+        Raises:
+            ValueError: If a topic is missing or holds a value that is not finite.
+        """
+        for name in (spec.name for spec in self.topics):
+            if name not in vectors:
+                raise ValueError(f'no {name} for an observation of {self._task.name}')
+            if not np.isfinite(vectors[name]).all():
+                raise ValueError(f'{name}: not every value is finite')
+        return {
+            'observation': self._observation(vectors),
+            'achieved_goal': vectors['achieved_goal'].copy(),
+            'desired_goal': vectors['desired_goal'].copy(),
+        }
+
+    def _observation(self, vectors: Mapping[str, Array]) -> Array:
+        position, velocity, _ = np.split(vectors['joint_states'], 3)
+        if self._task.robot.has_gripper_command:
+            return self._fetch(position, velocity, vectors)
+        if self._task.goal is GoalKind.FINGERTIPS:
+            return hand_reach_observation(position, velocity, vectors['fingertip_poses'])
+        qpos, qvel = np.split(vectors['object_joint'], [7])
+        return hand_object_observation(position, velocity, qvel, qpos)
+
+    def _fetch(self, position: Array, velocity: Array, vectors: Mapping[str, Array]) -> Array:
+        gripper = vectors['end_effector_pose'][:3]
+        gripper_velocity = vectors['end_effector_twist'][:3]
+        robot = (gripper, gripper_velocity, position, velocity, self._tick_duration)
+        if not self._task.has_object:
+            return fetch_observation(*robot)
+        object_position, object_quaternion = np.split(vectors['object_pose'], [3])
+        linear, angular = np.split(vectors['object_twist'], 2)
+        return fetch_observation(*robot, object_position, object_quaternion, linear, angular)
+
+
+def _observed_topics(task: TaskSpec) -> tuple[str, ...]:
+    if task.goal is GoalKind.FINGERTIPS:
+        return ('joint_states', 'fingertip_poses')
+    if task.goal is GoalKind.POSE:
+        return ('joint_states', 'object_joint')
+    robot = ('joint_states', 'end_effector_pose', 'end_effector_twist')
+    return (*robot, 'object_pose', 'object_twist') if task.has_object else robot
