@@ -1,0 +1,82 @@
+"""`ship_actor`: puts the best actor of a run into the package, unless a better one is there."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node import checkpoint
+from policy_node.training.evaluate import evaluate, summarize
+from policy_node.training.evaluate_policy import FIRST_SEED, print_table
+from policy_node.training.run_log import draw_curve, read_progress
+from policy_node.training.trainer import BEST_FILE
+
+ACTORS = Path(__file__).parents[1] / 'actors'
+
+
+def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Parses the command line."""
+    parser = argparse.ArgumentParser(prog='ship_actor', description=__doc__)
+    add = parser.add_argument
+    add('run', type=Path, help='output folder of train_her')
+    add('--episodes', type=int, default=1000, help='default: 1000')
+    add('--num-envs', type=int, default=100, help='simulations in the batch; default: 100')
+    add('--threads', type=int, default=0, help='simulation threads; default: all cores')
+    add('--checkpoint', default=BEST_FILE, help=f'file in the run; default: {BEST_FILE}')
+    add('--actors', type=Path, default=ACTORS, help='where to; default: the package')
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit status."""
+    options = parse_arguments(arguments)
+    try:
+        return ship(options)
+    except (ValueError, OSError) as error:
+        print(f'ship_actor: {error}', file=sys.stderr)
+        return 2
+
+
+def ship(options: argparse.Namespace) -> int:
+    """Evaluates, compares with the shipped actor, and copies checkpoint, evaluation and curve."""
+    actor, info = checkpoint.load(options.run / options.checkpoint)
+    num_envs = min(options.num_envs, options.episodes)
+    simulation = Simulation(
+        info.task, num_envs=num_envs, num_threads=options.threads, control_hz=info.control_hz
+    )
+    summary = summarize(evaluate(simulation, actor, options.episodes, FIRST_SEED))
+    print_table({'actor': str(options.run), 'task': info.task, **summary})
+    shipped = options.actors / f'{info.task}.json'
+    if shipped.is_file() and not is_better(summary, json.loads(shipped.read_text())):
+        print(f'ship_actor: the actor in {options.actors} is at least as good; nothing changed')
+        return 1
+    target = options.actors / f'{info.task}.safetensors'
+    checkpoint.save(target, actor, replace(info, success=summary))
+    report = {
+        'actor': info.task,
+        'sha256': checkpoint.checkpoint_hash(target),
+        'env_steps': info.env_steps,
+        'command': info.command,
+        'source_revision': info.source_revision,
+        **summary,
+    }
+    shipped.write_text(json.dumps(report, indent=2) + '\n')
+    title = f'{info.task}, {info.config["recipe"]} recipe, seed {info.seed}'
+    draw_curve(read_progress(options.run / 'progress.csv'), title, target.with_suffix('.png'))
+    return 0
+
+
+def is_better(new: dict[str, Any], old: dict[str, Any]) -> bool:
+    """Whether an evaluation is better: by last-step success, then by return."""
+    keys = ('success_gymnasium', 'mean_return')
+    return [new[key] for key in keys] > [old[key] for key in keys]
+
+
+if __name__ == '__main__':
+    sys.exit(main())
