@@ -109,7 +109,7 @@ class _Dumper(_SafeDumper):  # type: ignore[misc]
 
 _Dumper.add_representer(
     _Quoted,
-    lambda dumper, text: dumper.represent_scalar('tag:yaml.org,2002:str', text, style='"'),
+    lambda dumper, text: dumper.represent_scalar('tag:yaml.org,2002:str', str(text), style='"'),
 )
 
 

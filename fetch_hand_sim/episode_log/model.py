@@ -1,16 +1,16 @@
-"""The compiled model as part of an episode: its fingerprint, its text, and on request itself.
+"""The model as part of an episode: its fingerprint, its text, and on request all of it.
 
 A compiled model is 7 to 13 MB (3.0 to 3.4 MB with zstd), nearly all of it meshes that are the same
-in every episode, while the messages of an episode are about 0.1 MB. So the default is the MJCF text
-of the model, 15 to 34 KB, which names its meshes and textures, and the SHA-256 of the compiled
-model in the metadata. MuJoCo writes MJCF with six to seven digits; whoever needs every bit compiles
-the model again from the versions in the metadata and compares the fingerprint, or logs the compiled
-model too.
+in every episode, while the messages of an episode are about 0.1 MB. So the default is the MJCF
+text, 15 to 34 KB, which names its meshes and textures, and the SHA-256 of the compiled model in the
+metadata. MuJoCo writes MJCF with about seven digits; for every bit, compile the model with the
+versions in the metadata and compare the fingerprint, or store the compiled model too.
 """
 
 from __future__ import annotations
 
 import hashlib
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -31,18 +31,13 @@ def model_sha256(model: mujoco.MjModel) -> str:
     return hashlib.sha256(compiled_bytes(model)).hexdigest()
 
 
-def model_attachments(
-    mjcf: str, model: mujoco.MjModel, with_compiled: bool = False
-) -> list[Attachment]:
-    """Returns what to store of a model; make it once and use it for all episodes.
+def mjcf_attachment(path: Path) -> Attachment:
+    """Returns the MJCF at `path` as one text: files it includes are part of it, meshes are not."""
+    text = mujoco.MjSpec.from_file(str(path)).to_xml()
+    return Attachment('model.xml', 'application/xml', text.encode())
 
-    Args:
-        mjcf: Text of the model, as `mujoco.MjSpec.to_xml` writes it.
-        model: The compiled model.
-        with_compiled: Whether to store the compiled model as well, 3 MB per episode.
-    """
-    attachments = [Attachment('model.xml', 'application/xml', mjcf.encode())]
-    if with_compiled:
-        compressed = zstandard.ZstdCompressor(level=10).compress(compiled_bytes(model))
-        attachments.append(Attachment('model.mjb.zst', 'application/zstd', compressed))
-    return attachments
+
+def compiled_attachment(model: mujoco.MjModel) -> Attachment:
+    """Returns the compiled model, compressed with zstd to 3 MB; make it once for all episodes."""
+    data = zstandard.ZstdCompressor(level=10).compress(compiled_bytes(model))
+    return Attachment('model.mjb.zst', 'application/zstd', data)
