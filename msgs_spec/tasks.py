@@ -82,7 +82,7 @@ class TaskSpec:
         return self.object_name is not None
 
 
-_GRIPPER_STATE = VectorPart('gripper_state', 2, 'm (right, left finger)')
+_GRIPPER_STATE = VectorPart('gripper_state', 2, 'm, right and left finger')
 _GRIPPER_VELOCITY = VectorPart('gripper_velocity', 2, 'm per tick')
 _FETCH_REACH_OBSERVATION = (
     VectorPart('end_effector_position', 3, 'm'),
@@ -95,7 +95,7 @@ _FETCH_OBJECT_OBSERVATION = (
     VectorPart('object_position', 3, 'm'),
     VectorPart('object_relative_position', 3, 'm'),
     _GRIPPER_STATE,
-    VectorPart('object_rotation', 3, 'rad (Euler xyz)'),
+    VectorPart('object_rotation', 3, 'rad, Euler xyz'),
     VectorPart('object_relative_velocity', 3, 'm per tick'),
     VectorPart('object_angular_velocity', 3, 'rad per tick'),
     VectorPart('end_effector_velocity', 3, 'm per tick'),
@@ -111,7 +111,7 @@ _HAND_REACH_OBSERVATION = (
 )
 _HAND_OBJECT_OBSERVATION = (
     *_HAND_JOINT_PARTS,
-    VectorPart('object_velocity', 6, 'm/s (world), rad/s (object frame)'),
+    VectorPart('object_velocity', 6, 'm/s in the world, rad/s in the object frame'),
     VectorPart('object_pose', 7, 'm, quaternion wxyz'),
 )
 

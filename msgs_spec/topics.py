@@ -14,7 +14,7 @@ from msgs_spec.tasks import GoalKind, TaskSpec, VectorPart
 WORLD = 'world'
 
 _POSITION = VectorPart('position', 3, 'm')
-_QUATERNION = VectorPart('orientation', 4, 'quaternion wxyz')
+_QUATERNION = VectorPart('orientation', 4, 'quaternion')
 _POSE = (_POSITION, _QUATERNION)
 _TWIST = (VectorPart('linear', 3, 'm/s'), VectorPart('angular', 3, 'rad/s'))
 _FREE_JOINT = (
@@ -88,8 +88,9 @@ def _subscribed(
     *,
     frame: str = '',
     names: tuple[str, ...] = (),
+    offer: QosSpec = qos.COMMAND,
 ) -> TopicSpec:
-    return TopicSpec(name, type_name, qos.COMMAND, frame, layout, names, 'subscribed', description)
+    return TopicSpec(name, type_name, offer, frame, layout, names, 'subscribed', description)
 
 
 def _command_layout(task: TaskSpec) -> tuple[VectorPart, ...]:
@@ -119,8 +120,8 @@ def _body_topics(task: TaskSpec) -> list[TopicSpec]:
     pose, twist = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/TwistStamped'
     if task.robot.has_gripper_command:
         specs = [
-            _published('end_effector_pose', pose, 'Gripper site.', _POSE, frame=WORLD),
-            _published('end_effector_twist', twist, 'Gripper site.', _TWIST, frame=WORLD),
+            _published('end_effector_pose', pose, 'Site between the fingers.', _POSE, frame=WORLD),
+            _published('end_effector_twist', twist, 'The same site.', _TWIST, frame=WORLD),
         ]
     else:
         text = 'Fingertip positions; orientations are identity.'
@@ -128,8 +129,8 @@ def _body_topics(task: TaskSpec) -> list[TopicSpec]:
         specs = [_published('fingertip_poses', array, text, _FINGERTIPS, frame=WORLD)]
     if task.has_object:
         specs += [
-            _published('object_pose', pose, 'Object.', _POSE, frame=WORLD),
-            _published('object_twist', twist, 'Object, in world axes.', _TWIST, frame=WORLD),
+            _published('object_pose', pose, 'Centre of the object.', _POSE, frame=WORLD),
+            _published('object_twist', twist, 'The same, in world axes.', _TWIST, frame=WORLD),
         ]
     if task.goal is GoalKind.POSE:
         joint = f'{task.object_name}:joint'
@@ -143,7 +144,7 @@ def _body_topics(task: TaskSpec) -> list[TopicSpec]:
 
 def _goal_topics(task: TaskSpec) -> list[TopicSpec]:
     type_name, layout = _GOAL_TYPES[task.goal]
-    desired, achieved = 'Goal of the episode.', 'The same quantity as it is now.'
+    desired, achieved = 'Goal of the episode.', 'What the goal is compared with, as it is now.'
     return [
         _published('desired_goal', type_name, desired, layout, frame=WORLD, offer=qos.LATCHED),
         _published('achieved_goal', type_name, achieved, layout, frame=WORLD),
@@ -191,8 +192,12 @@ def _command_topics(task: TaskSpec) -> list[TopicSpec]:
             )
         )
     type_name, goal_layout = _GOAL_TYPES[task.goal]
-    text = 'Replaces the goal of the running episode.'
-    return [*specs, _subscribed('set_goal', type_name, text, goal_layout, frame=WORLD)]
+    text = 'Replaces the goal of the running episode from the next tick on.'
+    specs.append(_subscribed('set_goal', type_name, text, goal_layout, frame=WORLD))
+    text = 'Who commands: checkpoint and its SHA-256 as key/value pairs, for the log.'
+    status = 'diagnostic_msgs/msg/DiagnosticArray'
+    specs.append(_subscribed('policy_status', status, text, (), offer=qos.LATCHED))
+    return specs
 
 
 @cache

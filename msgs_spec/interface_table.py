@@ -1,0 +1,231 @@
+"""The interface section of the README, generated from this package.
+
+`python -m msgs_spec.interface_table` prints it, `--write README.md` puts it between its markers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from msgs_spec.parameters import POLICY_NODE, SIM_NODE, ParameterSpec
+from msgs_spec.qos import QosSpec
+from msgs_spec.robots import FETCH, FINGERTIPS, SHADOW_HAND, CommandPart
+from msgs_spec.services import SERVICES
+from msgs_spec.tasks import TASKS, GoalKind, TaskSpec, VectorPart
+from msgs_spec.tick import EpisodeStatus
+from msgs_spec.topics import TopicSpec, topics
+
+_PREFIX = 'robot0:'
+START, END = '<!-- interface table -->', '<!-- /interface table -->'
+
+_PUBLISHING = (
+    'All messages of a tick carry one stamp. `reward` and `applied_command` start with the first step '
+    'of\nan episode; `episode_status` is sent when it changes, `desired_goal` every tick.'
+)
+_FAMILIES: dict[str, Callable[[TaskSpec], bool]] = {
+    'all': lambda task: True,
+    'Fetch*': lambda task: task.robot is FETCH,
+    'Hand*': lambda task: task.robot is SHADOW_HAND,
+    'with an object': lambda task: task.has_object,
+    'FetchReach': lambda task: task.robot is FETCH and not task.has_object,
+    'FetchPush, FetchSlide, FetchPickAndPlace': lambda task: (
+        task.robot is FETCH and task.has_object
+    ),
+    'HandReach': lambda task: task.goal is GoalKind.FINGERTIPS,
+    'HandManipulate*': lambda task: task.goal is GoalKind.POSE,
+}
+
+
+def interface_markdown() -> str:
+    """Returns the section as GitHub Markdown."""
+    parts = [
+        ('Topics published by `sim_node`', f'{_topic_table("published")}\n\n{_PUBLISHING}'),
+        ('Topics `sim_node` subscribes to', _topic_table('subscribed')),
+        ('Order of values', _orders()),
+        ('Observation vectors', _observation_table()),
+        ('Parameters', _parameter_table()),
+        ('Services', _service_table()),
+    ]
+    return '\n\n'.join(f'### {title}\n\n{text}' for title, text in parts)
+
+
+def replace_section(text: str) -> str:
+    """Returns a README with what is between its markers replaced.
+
+    Raises:
+        ValueError: If the two markers are not there, once each and in order.
+    """
+    if text.count(START) != 1 or text.count(END) != 1 or text.index(START) > text.index(END):
+        raise ValueError(f'allowed: a file with one {START} and, after it, one {END}')
+    before, rest = text.split(START)
+    after = rest.split(END)[1]
+    return f'{before}{START}\n\n{interface_markdown()}\n\n{END}{after}'
+
+
+def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    titles = list(header)
+    lines = [titles, ['---'] * len(titles), *rows]
+    return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
+
+
+def _code(text: str) -> str:
+    return f'`{text}`'
+
+
+def _family(tasks: Iterable[TaskSpec]) -> str:
+    """What a set of tasks is called."""
+    names = {task.name for task in tasks}
+    for label, belongs in _FAMILIES.items():
+        if names == {task.name for task in TASKS.values() if belongs(task)}:
+            return label
+    raise LookupError(f'no name for the tasks {", ".join(sorted(names))}')
+
+
+def _topic_names() -> list[str]:
+    """Names of the topics of all tasks, in an order that agrees with that of each task."""
+    names: list[str] = []
+    for task in TASKS.values():
+        place = 0
+        for spec in topics(task):
+            if spec.name not in names:
+                names.insert(place, spec.name)
+            place = names.index(spec.name) + 1
+    return names
+
+
+def _topic_table(direction: str) -> str:
+    tasks: dict[TopicSpec, list[TaskSpec]] = {}
+    for task in TASKS.values():
+        for spec in topics(task):
+            tasks.setdefault(spec, []).append(task)
+    ordered = sorted(tasks, key=lambda spec: _topic_names().index(spec.name))
+    return _table(
+        ('topic', 'type', 'tasks', 'values', 'unit', 'frame', 'QoS', 'content'),
+        (
+            (
+                _code(spec.name),
+                spec.type_name.replace('/msg/', '/'),
+                _family(tasks[spec]),
+                str(spec.size or ''),
+                spec.unit,
+                spec.frame,
+                _qos(spec.qos),
+                spec.description,
+            )
+            for spec in ordered
+            if spec.direction == direction
+        ),
+    )
+
+
+def _qos(spec: QosSpec) -> str:
+    kept = 'latched' if spec.durability == 'transient_local' else f'last {spec.depth}'
+    return f'{spec.reliability}, {kept}'
+
+
+def _orders() -> str:
+    keys = [field.name for field in dataclasses.fields(EpisodeStatus)]
+    lines = (
+        ('Quaternions', 'xyzw in messages, wxyz in observations and goals.'),
+        ('`joint_states`, Fetch', _names(FETCH.joints)),
+        ('`joint_states`, hand', _names(SHADOW_HAND.joints)),
+        ('`commands`, `applied_command`, Fetch', _command(FETCH.command)),
+        ('`commands`, `applied_command`, hand', _command(SHADOW_HAND.command)),
+        ('Fingertips', _names(FINGERTIPS)),
+        ('`episode_status` keys', _names(keys)),
+    )
+    return '\n'.join(f'- {title}: {text}' for title, text in lines)
+
+
+def _names(names: Sequence[str]) -> str:
+    prefix = _PREFIX if all(name.startswith(_PREFIX) for name in names) else ''
+    text = ', '.join(_code(name.removeprefix(prefix)) for name in names)
+    return f'`{prefix}` + {text}' if prefix else text
+
+
+def _command(parts: Sequence[CommandPart]) -> str:
+    """Parts with their ranges; units once per run of equal ones."""
+    names = [part.name.removeprefix(_PREFIX) for part in parts]
+    texts = [f'`{n}` {p.lower:g} ... {p.upper:g}' for n, p in zip(names, parts, strict=True)]
+    for index, (part, following) in enumerate(zip(parts, [*parts[1:], None], strict=True)):
+        if following is None or following.unit != part.unit:
+            texts[index] += f' ({part.unit})'
+    return (f'`{_PREFIX}` + ' if parts[0].name.startswith(_PREFIX) else '') + ', '.join(texts)
+
+
+def _observation_table() -> str:
+    tasks: dict[tuple[VectorPart, ...], list[TaskSpec]] = {}
+    for task in TASKS.values():
+        tasks.setdefault(task.observation, []).append(task)
+    return _table(
+        ('tasks', 'size', 'goal size', 'parts in order'),
+        (
+            (
+                _family(users),
+                str(users[0].observation_size),
+                str(users[0].goal.size),
+                ', '.join(f'`{part.name}` {part.size} ({part.unit})' for part in parts),
+            )
+            for parts, users in tasks.items()
+        ),
+    )
+
+
+def _parameter_table() -> str:
+    rows = [('sim_node', spec) for spec in SIM_NODE] + [('policy_node', s) for s in POLICY_NODE]
+    return _table(
+        ('node', 'parameter', 'type', 'default', 'allowed', 'at run time', 'meaning'),
+        (
+            (
+                node,
+                _code(spec.name),
+                spec.type,
+                _code(repr(spec.default)),
+                _allowed(spec),
+                'fixed' if spec.read_only else 'settable',
+                spec.description,
+            )
+            for node, spec in rows
+        ),
+    )
+
+
+def _allowed(spec: ParameterSpec) -> str:
+    if set(TASKS) <= set(spec.choices):
+        others = [choice for choice in spec.choices if choice not in TASKS]
+        return ', '.join([*map(_code, map(repr, others)), f'one of the {len(TASKS)} tasks'])
+    return ', '.join(map(_code, map(repr, spec.choices))) or spec.allowed
+
+
+def _service_table() -> str:
+    return _table(
+        ('service', 'type', 'node', 'what it does'),
+        (
+            (_code(spec.name), spec.type_name.replace('/srv/', '/'), spec.node, spec.description)
+            for spec in SERVICES
+        ),
+    )
+
+
+def main(args: list[str] | None = None) -> int:
+    """Prints or writes the section; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--write', type=Path, metavar='README.md', help='file to update')
+    path: Path | None = parser.parse_args(args).write
+    if path is None:
+        print(interface_markdown())
+        return 0
+    try:
+        path.write_text(replace_section(path.read_text(encoding='utf-8')), encoding='utf-8')
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        print(f'interface_table: {path}: {error}', file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
