@@ -40,13 +40,13 @@ test: lint
 	$(BIN)/python -m pytest
 
 lint: env
-	$(BIN)/ruff check $(PYTHON_FILES)
-	$(BIN)/ruff format --check $(PYTHON_FILES)
-	$(BIN)/mypy
+	$(BIN)/python -m ruff check $(PYTHON_FILES)
+	$(BIN)/python -m ruff format --check $(PYTHON_FILES)
+	$(BIN)/python -m mypy
 
 format: env
-	$(BIN)/ruff format $(PYTHON_FILES)
-	$(BIN)/ruff check --fix $(PYTHON_FILES)
+	$(BIN)/python -m ruff format $(PYTHON_FILES)
+	$(BIN)/python -m ruff check --fix $(PYTHON_FILES)
 
 twin: env
 	$(BIN)/python -m pytest --twin-seeds 20 --timeout 0 test/test_twin.py

@@ -23,9 +23,9 @@ BIN = Path(sys.prefix) / 'bin'
 
 def tracked_files() -> list[str]:
     """The files git tracks: a forgotten `git add` must break the build here, not elsewhere."""
-    listing = subprocess.run(
-        ['git', 'ls-files', '-z'], cwd=ROOT, capture_output=True, text=True, check=True
-    )
+    # A build machine may run the tests as another user than the one who cloned.
+    command = ['git', '-c', f'safe.directory={ROOT}', 'ls-files', '-z']
+    listing = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     return [name for name in listing.stdout.split('\0') if name and (ROOT / name).exists()]
 
 

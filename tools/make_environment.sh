@@ -33,7 +33,7 @@ fi
 quiet=--quiet
 if [ -t 1 ]; then quiet=; fi
 
-echo "make env: installing what constraints.txt pins (about 1.6 GB; minutes the first time)"
+echo "make env: installing the packages pinned in constraints.txt (minutes the first time)"
 pip_install() {
     # shellcheck disable=SC2086
     "$venv/bin/python" -m pip install --disable-pip-version-check $quiet ${PIP_OPTIONS:-} \
