@@ -1,7 +1,7 @@
 """Finds and compiles the MJCF models of the installed `gymnasium-robotics` package.
 
-The package is only used as a container of assets: it is located, never imported, because importing it on
-MuJoCo >= 3.17 registers environments that do not start.
+The package is only used as a container of assets: it is located, never imported, because importing
+it on MuJoCo >= 3.17 registers environments that do not start.
 """
 
 from __future__ import annotations

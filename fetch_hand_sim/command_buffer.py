@@ -1,8 +1,8 @@
 """Holds the latest valid command and says what the next tick applies.
 
-Habits of ros2_control's forward_command_controller: a command of the wrong size or with a value that is not
-finite is dropped and counted, out of range is clipped, nothing is applied before the first valid one, and
-when commands stop for longer than the timeout the robot holds.
+Habits of ros2_control's forward_command_controller: a command of the wrong size or with a value
+that is not finite is dropped and counted, out of range is clipped, nothing is applied before the
+first valid one, and when commands stop for longer than the timeout the robot holds.
 """
 
 from __future__ import annotations
@@ -107,7 +107,8 @@ class CommandBuffer:
         """Takes joint positions by name, in any order; joints not named keep their target.
 
         Raises:
-            CommandRejected: If names and positions do not match, a name is unknown or given twice, or a
+            CommandRejected: If names and positions do not match, a name is unknown or given twice,
+            or a
                 value is not finite; the buffer is unchanged.
         """
         values = np.asarray(positions, dtype=np.float64).ravel()
@@ -152,7 +153,8 @@ class CommandBuffer:
             index = int(np.argmin(finite))
             self._reject(
                 'not finite',
-                f'command dropped: {self._names[index]} is {command[index]}; allowed: finite numbers',
+                f'command dropped: {self._names[index]} is {command[index]}; allowed: finite '
+                'numbers',
             )
         self._command = clip_command(self._robot, command)
         self._received_at = now

@@ -1,7 +1,7 @@
 """Episodes of one robot, tick by tick: command in, `Tick` out.
 
-Nothing here knows of ROS, of files or of wall time: what paces the ticks is outside, so real time, lockstep and
-a Python loop give the same ticks for the same commands.
+Nothing here knows of ROS, of files or of wall time: what paces the ticks is outside, so real time,
+lockstep and a Python loop give the same ticks for the same commands.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ FIRST_STAMP_NS = 1_000_000_000
 class EpisodeRunner:
     """Runs episodes one after the other on a `Simulation` of one robot.
 
-    Each reset takes a tick of its own: `advance` starts an episode when `is_between_episodes`, and steps it
-    otherwise. Episode i has the seed `first_seed + i`. Stamps grow by one period per tick and never go back.
+    Each reset takes a tick of its own: `advance` starts an episode when `is_between_episodes`, and
+    steps it otherwise. Episode i has the seed `first_seed + i`. Stamps grow by one period per tick
+    and never go back.
     """
 
     def __init__(self, simulation: Simulation, *, first_seed: int = 0, episodes: int = 0) -> None:
@@ -70,12 +71,22 @@ class EpisodeRunner:
 
     @property
     def stamp_ns(self) -> int:
-        """Simulated time of the last tick; that of the first before there is one."""
-        return max(self._next_stamp_ns - self._period_ns, FIRST_STAMP_NS)
+        """Simulated time of the last tick; one period before the first if there is none."""
+        return self._next_stamp_ns - self._period_ns
+
+    @property
+    def has_started(self) -> bool:
+        """Whether there has been a tick."""
+        return self._next_stamp_ns > FIRST_STAMP_NS
+
+    def waiting_status(self) -> EpisodeStatus:
+        """What to say of the first episode before it starts."""
+        return self._status('waiting', is_success=False)
 
     def resting_command(self) -> Array:
         """The command (action size,) that leaves the robot as it is."""
-        return self.simulation.resting_commands()[0]
+        (command,) = self.simulation.resting_commands()
+        return np.asarray(command)
 
     def set_goal(self, goal: Array) -> None:
         """Replaces the goal (goal size,) of the running episode from the next tick on.
@@ -143,7 +154,6 @@ class EpisodeRunner:
     ) -> Tick:
         stamp_ns = self._next_stamp_ns
         self._next_stamp_ns += self._period_ns
-        metric = self.simulation.metric
         return Tick(
             stamp_ns=stamp_ns,
             **_first_rows(self.simulation.readings()),
@@ -152,18 +162,22 @@ class EpisodeRunner:
             reward=reward,
             is_success=is_success,
             applied_command=applied_command,
-            status=EpisodeStatus(
-                task=self.spec.name,
-                episode=self._episode,
-                seed=self.seed,
-                tick=self._tick,
-                phase=phase,
-                control_hz=self.simulation.control_hz,
-                reward_type=metric.reward_type,
-                success_rule=metric.success_rule,
-                episode_return=self._return,
-                is_success=is_success,
-            ),
+            status=self._status(phase, is_success=is_success),
+        )
+
+    def _status(self, phase: Phase, *, is_success: bool) -> EpisodeStatus:
+        metric = self.simulation.metric
+        return EpisodeStatus(
+            task=self.spec.name,
+            episode=self._episode,
+            seed=self.seed,
+            tick=self._tick,
+            phase=phase,
+            control_hz=self.simulation.control_hz,
+            reward_type=metric.reward_type,
+            success_rule=metric.success_rule,
+            episode_return=self._return,
+            is_success=is_success,
         )
 
 

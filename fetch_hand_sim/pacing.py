@@ -31,8 +31,8 @@ class RealTimePacer:
     def advance(self, now: float) -> None:
         """Notes that the due tick has begun and sets the next deadline.
 
-        A tick that comes a whole period late or more has missed deadlines: they are counted and skipped, so
-        the robot never runs faster than asked to catch up.
+        A tick that comes a whole period late or more has missed deadlines: they are counted and
+        skipped, so the robot never runs faster than asked to catch up.
         """
         period = self.period
         self._due += period

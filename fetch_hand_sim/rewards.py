@@ -1,7 +1,7 @@
-"""Goal distances, success rules and rewards: pure functions of goals, recomputable for any batch shape.
+"""Goal distances, success rules and rewards: pure functions of goals of any batch shape.
 
-Hindsight replay swaps goals after the fact, so nothing here may depend on the simulation. Sums run in a fixed
-order, so a batch gives the same bits as one call per row.
+Hindsight replay swaps goals after the fact, so nothing here may depend on the simulation. Sums run
+in a fixed order, so a batch gives the same bits as one call per row.
 """
 
 from __future__ import annotations
@@ -74,7 +74,9 @@ class GoalMetric:
         if self.spec.goal is GoalKind.FINGERTIPS and self.success_rule == 'paper':
             fingertips = (achieved - desired).reshape(*achieved.shape[:-1], -1, 3)
             per_fingertip = np.moveaxis(_norm(fingertips), -1, 0)
-            return np.asarray(sum(per_fingertip) / len(per_fingertip)), np.zeros(achieved.shape[:-1])
+            return np.asarray(sum(per_fingertip) / len(per_fingertip)), np.zeros(
+                achieved.shape[:-1]
+            )
         return _norm(achieved - desired), np.zeros(achieved.shape[:-1])
 
     def success(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> NDArray[np.bool_]:
@@ -126,9 +128,7 @@ class GoalMetric:
             euler = quaternion_to_euler(quaternion)
             euler[..., 2] = quaternion_to_euler(desired[..., 3:])[..., 2]
             quaternion = euler_to_quaternion(euler)
-        return rotation_angle(
-            quaternion, desired[..., 3:], antipodal=self.success_rule == 'paper'
-        )
+        return rotation_angle(quaternion, desired[..., 3:], antipodal=self.success_rule == 'paper')
 
 
 def _require_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

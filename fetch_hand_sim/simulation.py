@@ -1,7 +1,7 @@
 """`Simulation`: any number of copies of one task, stepped together.
 
-One copy serves the ROS node and `gymnasium.make`; sixty-four and more serve the trainer. It counts no steps
-and ends no episodes: whoever drives it decides.
+One copy serves the ROS node and `gymnasium.make`; sixty-four and more serve the trainer. It counts
+no steps and ends no episodes: whoever drives it decides.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from mujoco import mjtWarning
 from mujoco.batch import SimulationError
 from numpy.typing import ArrayLike, NDArray
 
+from fetch_hand_sim.assets import asset_path
 from fetch_hand_sim.rewards import RewardType, SuccessRule
 from fetch_hand_sim.tasks import Readings, make_task
 from msgs_spec.commands import command_from_action
@@ -98,6 +100,11 @@ class Simulation:
     def model(self) -> Any:
         """The compiled `mujoco.MjModel`."""
         return self._task.model
+
+    @property
+    def asset(self) -> Path:
+        """The MJCF file of the model."""
+        return asset_path(self._task.asset)
 
     @property
     def tick_duration(self) -> float:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
     from rclpy.parameter import Parameter
 
-Value = str | int | float
+Value = str | int | float | bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class ParameterSpec:
     """
 
     name: str
-    type: Literal['string', 'integer', 'double']
+    type: Literal['string', 'integer', 'double', 'bool']
     default: Value
     description: str
     choices: tuple[str, ...] = ()
@@ -48,8 +48,8 @@ class ParameterSpec:
         """Allowed values as text."""
         if self.choices:
             return ', '.join(repr(choice) for choice in self.choices)
-        if self.type == 'string':
-            return 'any string'
+        if self.type in ('string', 'bool'):
+            return 'any string' if self.type == 'string' else 'true, false'
         kind = 'an integer' if self.type == 'integer' else 'a number'
         return kind if math.isinf(self.upper) else f'{self.lower:.10g} ... {self.upper:.10g}'
 
@@ -123,10 +123,22 @@ SIM_NODE = (
         read_only=False,
     ),
     ParameterSpec(
+        'wait_for_commands',
+        'bool',
+        False,
+        'Whether the first episode waits until somebody publishes commands.',
+    ),
+    ParameterSpec(
         'episode_dir',
         'string',
         '',
         'Directory for episode logs; empty logs nothing.',
+    ),
+    ParameterSpec(
+        'log_compiled_model',
+        'bool',
+        True,
+        'Whether each log carries the compiled model, 3 MB, beside its MJCF text.',
     ),
 )
 
@@ -135,7 +147,7 @@ POLICY_NODE = (
         'checkpoint',
         'string',
         '',
-        'Actor file (.safetensors); empty takes the actor that comes with the task.',
+        'Actor file (.safetensors), random or resting; empty takes the actor shipped for the task.',
     ),
     ParameterSpec(
         'task',
@@ -158,6 +170,8 @@ def validate(spec: ParameterSpec, value: object) -> None:
 
 
 def _is_allowed(spec: ParameterSpec, value: object) -> bool:
+    if spec.type == 'bool':
+        return isinstance(value, bool)
     if spec.type == 'string':
         return isinstance(value, str) and (not spec.choices or value in spec.choices)
     kinds = (int,) if spec.type == 'integer' else (int, float)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import TopicSpec, topics
 
 Array = NDArray[np.float64]
-Phase = Literal['reset', 'running', 'finished']
+Phase = Literal['waiting', 'reset', 'running', 'finished']
+PHASES: tuple[Phase, ...] = get_args(Phase)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +30,8 @@ class EpisodeStatus:
         episode: Index of the episode since the node started, from 0.
         seed: Seed of the episode.
         tick: Steps of the episode so far; 0 is the state after the reset.
-        phase: `reset` at tick 0, `finished` at the last tick, `running` between.
+        phase: `waiting` before the first episode, `reset` at tick 0, `finished` at the last tick,
+            `running` between.
         control_hz: Ticks per second of simulated time; observations depend on it.
         reward_type: `sparse` or `dense`.
         success_rule: `gymnasium` or `paper`.
@@ -62,7 +64,7 @@ class EpisodeStatus:
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
         if missing:
             raise ValueError(f'episode_status without {", ".join(missing)}')
-        phases: dict[str, Phase] = {'reset': 'reset', 'running': 'running', 'finished': 'finished'}
+        phases: dict[str, Phase] = {phase: phase for phase in PHASES}
         flags = {'True': True, 'False': False}
         try:
             return cls(
@@ -198,10 +200,15 @@ class TickEncoder:
             if values is not None:
                 messages.append((spec, encoder.encode(tick.stamp_ns, values)))
         if latched:
-            messages.append((self._status, self._encode_status(tick)))
+            messages.append(self.encode_status(tick.stamp_ns, tick.status))
         return messages
 
-    def _encode_status(self, tick: Tick) -> bytes:
-        values = tick.status.to_values()
-        message = build_status(self._status, tick.stamp_ns, 'episode', values)
-        return serialize(self._status.type_name, message)
+    def encode_clock(self, stamp_ns: int) -> tuple[TopicSpec, bytes]:
+        """Returns `/clock` alone, for a simulation that stands still."""
+        spec, encoder, _ = self._encoders[0]
+        return spec, encoder.encode(stamp_ns, [])
+
+    def encode_status(self, stamp_ns: int, status: EpisodeStatus) -> tuple[TopicSpec, bytes]:
+        """Returns `episode_status` alone, for a simulation that has not started."""
+        message = build_status(self._status, stamp_ns, 'episode', status.to_values())
+        return self._status, serialize(self._status.type_name, message)

@@ -163,7 +163,9 @@ def actor_path(name_or_path: str | Path) -> Path:
     if path.is_file():
         return path
     names = ', '.join(shipped) or 'none'
-    raise ValueError(f'no actor {str(name_or_path)!r}; shipped: {names}; or the path of a checkpoint')
+    raise ValueError(
+        f'no actor {str(name_or_path)!r}; shipped: {names}; or the path of a checkpoint'
+    )
 
 
 def load_actor(name_or_path: str | Path, task: str | None = None) -> Actor:

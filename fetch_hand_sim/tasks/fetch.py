@@ -1,8 +1,9 @@
 """The four Fetch tasks: a mocap-driven gripper, with or without an object.
 
-Facts follow Gymnasium-Robotics 1.4.2 `fetch_env.py` to the bit, accidents included: positions are those of
-the last substep unless the gripper is blocked (then a forward pass refreshes them), velocities come from that
-Jacobian and the newest qvel, and the mocap body is re-anchored to the lagged gripper pose at each action.
+Facts follow Gymnasium-Robotics 1.4.2 `fetch_env.py` to the bit, accidents included: positions are
+those of the last substep unless the gripper is blocked (then a forward pass refreshes them),
+velocities come from that Jacobian and the newest qvel, and the mocap body is re-anchored to the
+lagged gripper pose at each action.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from msgs_spec.robots import GRIPPER_STEP
 from msgs_spec.rotations import quaternion_multiply
 from msgs_spec.tasks import TaskSpec
 
-# The gripper is held in this (unnormalised) orientation: fetch_env.py adds it to the mocap quaternion.
+# The gripper is held in this (unnormalised) orientation: fetch_env.py adds it to the mocap
+# quaternion.
 _GRIPPER_ROTATION = np.array([1.0, 0.0, 1.0, 0.0])
 # Where the gripper starts, relative to where the compiled model has it, metres.
 _GRIPPER_START = np.array([-0.498, 0.005, -0.431])
@@ -107,16 +109,12 @@ FETCH_CONFIGS = {
 class FetchTask(Task):
     """FetchReach, FetchPush, FetchSlide, FetchPickAndPlace."""
 
-    def __init__(
-        self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int
-    ) -> None:
+    def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
         """Lets the robot settle once and keeps that state as the start of every episode."""
         self.config = FETCH_CONFIGS[spec.name]
         model = load_model(self.config.asset)
         self._settle(model, spec)
-        super().__init__(
-            spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps
-        )
+        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
         self._grip = _SiteReader(self, 'robot0:grip')
         self._object = _SiteReader(self, 'object0') if spec.has_object else None
         self._fingers = self._joint_qpos[-2:]
@@ -138,17 +136,22 @@ class FetchTask(Task):
             data.joint('object0:joint').qpos = config.object_start
         model.eq_data[model.eq_type == mujoco.mjtEq.mjEQ_WELD, :7] = [0, 0, 0, 0, 0, 0, 1]
         mujoco.mj_forward(model, data)
-        target = _GRIPPER_START + [0.0, 0.0, config.gripper_extra_height]
+        target = _GRIPPER_START + np.array([0.0, 0.0, config.gripper_extra_height])
         data.mocap_pos[0] = target + data.site('robot0:grip').xpos
         data.mocap_quat[0] = _GRIPPER_ROTATION
         mujoco.mj_step(model, data, nstep=_SETTLING_SUBSTEPS)
-        self._gripper_start = data.site('robot0:grip').xpos.copy()
+        self._gripper_start: Array = data.site('robot0:grip').xpos.copy()
         if spec.has_object:
             self._object_height = float(data.site('object0').xpos[2])
         time, qpos, qvel = data.time, data.qpos.copy(), data.qvel.copy()
         mujoco.mj_resetData(model, data)
         data.time, data.qpos[:], data.qvel[:] = time, qpos, qvel
         self._start_state = integration_state(model, data)
+
+    @property
+    def asset(self) -> str:
+        """The MJCF asset."""
+        return self.config.asset
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Restores the settled state, places the objects, samples goals."""
@@ -270,8 +273,8 @@ class _SiteReader:
         self._site_quaternion = model.site_quat[site].copy()
         self._site_aligned = bool((self._site_quaternion == [1.0, 0.0, 0.0, 0.0]).all())
         self._dofs = _chain_dofs(model, body)
-        self._position = batch.bind('site_xpos')[:, site]
-        self._body_quaternion = batch.bind('xquat')[:, body]
+        self._position: Array = batch.bind('site_xpos')[:, site]
+        self._body_quaternion: Array = batch.bind('xquat')[:, body]
         self._center = batch.bind('subtree_com')[:, int(model.body_rootid[body])]
         self._cdof = batch.bind('cdof')
         self._qvel = batch.bind('qvel')

@@ -29,11 +29,9 @@ class HandTask(Task):
         substeps: int,
     ) -> None:
         """Binds controls and fingertip positions."""
-        super().__init__(
-            spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps
-        )
-        self._ctrl = self.batch.bind('ctrl')
-        self._site_xpos = self.batch.bind('site_xpos')
+        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
+        self._ctrl: Array = self.batch.bind('ctrl')
+        self._site_xpos: Array = self.batch.bind('site_xpos')
         self._fingertip_sites = fingertip_sites(model)
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:

@@ -1,8 +1,8 @@
 """The eight manipulation tasks: turn a block, an egg or a pen in the hand.
 
-Facts follow Gymnasium-Robotics 1.4.2 `manipulate.py` in a fresh instance. One thing is put right: the reference
-does not restore controls and warm start between episodes, so its n-th episode of a seed differs from the first;
-here every reset starts from the fresh state.
+Facts follow Gymnasium-Robotics 1.4.2 `manipulate.py` in a fresh instance. One thing is put right:
+the reference does not restore controls and warm start between episodes, so its n-th episode of a
+seed differs from the first; here every reset starts from the fresh state.
 """
 
 from __future__ import annotations
@@ -85,9 +85,7 @@ MANIPULATE_CONFIGS = {
 class HandManipulateTask(HandTask):
     """HandManipulateBlock*, HandManipulateEgg*, HandManipulatePen*."""
 
-    def __init__(
-        self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int
-    ) -> None:
+    def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
         """Keeps the fresh state, from which every episode starts."""
         self.config = MANIPULATE_CONFIGS[spec.name]
         model = load_model(self.config.asset)
@@ -95,15 +93,18 @@ class HandManipulateTask(HandTask):
         mujoco.mj_forward(model, data)
         self._start_state = integration_state(model, data)
         self._start_qpos = data.qpos.copy()
-        super().__init__(
-            spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps
-        )
+        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
         self._object_qpos = self._qpos[:, joint_qpos_slice(model, _OBJECT_JOINT)]
         self._object_qvel = self._qvel[:, joint_qvel_slice(model, _OBJECT_JOINT)]
         self._object_site = model.site(_OBJECT_SITE).id
         self._resting_command = resting_command(spec.robot)
         self._parallel_quaternions = euler_to_quaternion(_parallel_rotations())
         self.batch.state[:] = self._start_state
+
+    @property
+    def asset(self) -> str:
+        """The MJCF asset."""
+        return self.config.asset
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Drops the object on the palm until it stays there, then samples goals.

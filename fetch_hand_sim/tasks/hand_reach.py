@@ -13,6 +13,7 @@ from msgs_spec.observations import hand_reach_observation
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import TaskSpec
 
+_ASSET = 'hand/reach.xml'
 # Where fingers meet, relative to the palm, and how far that place scatters, metres.
 _MEETING_OFFSET = np.array([0.0, -0.09, 0.05])
 _MEETING_SCATTER = 0.005
@@ -52,22 +53,23 @@ _INITIAL_QPOS = {
 class HandReachTask(HandTask):
     """HandReach."""
 
-    def __init__(
-        self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int
-    ) -> None:
+    def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
         """Keeps the initial pose, its fingertips and the palm, from which goals are made."""
-        model = load_model('hand/reach.xml')
+        model = load_model(_ASSET)
         data = mujoco.MjData(model)
         for joint, value in _INITIAL_QPOS.items():
             data.joint(joint).qpos = value
         self._start_state = integration_state(model, data)
         mujoco.mj_forward(model, data)
-        self._start_fingertips = data.site_xpos[fingertip_sites(model)].copy()
+        self._start_fingertips: Array = data.site_xpos[fingertip_sites(model)].copy()
         self._palm = data.body('robot0:palm').xpos.copy()
-        super().__init__(
-            spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps
-        )
+        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
         self.batch.state[:] = self._start_state
+
+    @property
+    def asset(self) -> str:
+        """The MJCF asset."""
+        return _ASSET
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Restores the initial pose and samples goals."""

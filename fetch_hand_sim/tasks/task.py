@@ -11,7 +11,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from fetch_hand_sim.rewards import RewardType, SuccessRule, GoalMetric
+from fetch_hand_sim.rewards import GoalMetric, RewardType, SuccessRule
 from msgs_spec.tasks import TaskSpec
 
 Array = NDArray[np.float64]
@@ -73,12 +73,17 @@ class Task(ABC):
         self.model = model
         self.tick_duration = substeps * float(model.opt.timestep)
         self.batch = Batch(model, num_envs, min(num_threads, num_envs) if num_threads else 0)
-        self._qpos = self.batch.bind('qpos')
-        self._qvel = self.batch.bind('qvel')
-        self._actuator_force = self.batch.bind('qfrc_actuator')
+        self._qpos: Array = self.batch.bind('qpos')
+        self._qvel: Array = self.batch.bind('qvel')
+        self._actuator_force: Array = self.batch.bind('qfrc_actuator')
         joints = [model.joint(name) for name in spec.robot.joints]
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._joint_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
+
+    @property
+    @abstractmethod
+    def asset(self) -> str:
+        """The MJCF asset that the model was compiled from."""
 
     @abstractmethod
     def reset(self, ids: Ids, generators: Generators) -> Array:

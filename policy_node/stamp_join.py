@@ -1,0 +1,70 @@
+"""Joins topics by stamp: what was true at one moment, whatever order messages arrive in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vectors = dict[str, NDArray[np.float64]]
+
+
+class StampJoin:
+    """Collects the vectors of several topics until one stamp has them all.
+
+    Stamps that are incomplete when a later one completes are dropped, and so is everything that
+    arrives for a stamp no later than the last complete one: an actor wants the newest state, not
+    every state.
+    """
+
+    def __init__(self, topics: Iterable[str], max_pending: int = 8) -> None:
+        """Starts empty.
+
+        Args:
+            topics: Names of the topics to join.
+            max_pending: Incomplete stamps kept; the oldest goes first.
+        """
+        self._topics = frozenset(topics)
+        self._max_pending = max_pending
+        self._pending: dict[int, Vectors] = {}
+        self._last: int | None = None
+        self.dropped = 0
+
+    def add(self, topic: str, stamp: int, vector: NDArray[np.float64]) -> Vectors | None:
+        """Adds one vector.
+
+        Args:
+            topic: Its topic.
+            stamp: Nanoseconds.
+            vector: The vector.
+
+        Returns:
+            The vectors of all topics if they are complete for this stamp, else None.
+        """
+        if self._last is not None and stamp <= self._last:
+            self._forget_if_restarted(stamp)
+            if self._last is not None:
+                return None
+        vectors = self._pending.setdefault(stamp, {})
+        vectors[topic] = vector
+        if vectors.keys() == self._topics:
+            self._complete(stamp)
+            return vectors
+        while len(self._pending) > self._max_pending:
+            del self._pending[min(self._pending)]
+            self.dropped += 1
+        return None
+
+    def _complete(self, stamp: int) -> None:
+        self._last = stamp
+        incomplete = [other for other in self._pending if other < stamp]
+        self.dropped += len(incomplete)
+        for other in (*incomplete, stamp):
+            del self._pending[other]
+
+    def _forget_if_restarted(self, stamp: int) -> None:
+        """A stamp more than a second back is no late message but a simulation started anew."""
+        if self._last is not None and self._last - stamp > 1_000_000_000:
+            self._last = None
+            self._pending.clear()
