@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -92,6 +93,7 @@ def run_node(name: str, run: Callable[[StopSignals], None], args: list[str] | No
     from rclpy.exceptions import ROSInterruptException
     from rclpy.signals import SignalHandlerOptions
 
+    keep_discovery_local()
     stop = StopSignals()
     try:
         _refuse_plain_arguments(sys.argv[1:] if args is None else args)
@@ -108,6 +110,11 @@ def run_node(name: str, run: Callable[[StopSignals], None], args: list[str] | No
     finally:
         rclpy.try_shutdown()  # type: ignore[attr-defined]
     return EXIT_SUCCESS
+
+
+def keep_discovery_local() -> None:
+    """Keeps robots on this machine unless the user chose a discovery range."""
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 
 def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any) -> None:
