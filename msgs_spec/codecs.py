@@ -159,8 +159,14 @@ def _build_free_joint(topic: TopicSpec, values: Array) -> dict[str, Any]:
 
 def _read_free_joint(topic: TopicSpec, message: Any) -> Array:
     if tuple(message.joint_names) != topic.names:
-        raise ValueError(f'{topic.name}: joints {message.joint_names}; allowed: {topic.names}')
-    (transform,), (twist,) = message.transforms, message.twist
+        given, allowed = list(message.joint_names), list(topic.names)
+        raise ValueError(f'{topic.name}: joints {given} given; allowed: {allowed}')
+    if len(message.transforms) != 1 or len(message.twist) != 1:
+        raise ValueError(
+            f'{topic.name}: {len(message.transforms)} transforms and {len(message.twist)} twists '
+            'given; allowed: 1 of each'
+        )
+    transform, twist = message.transforms[0], message.twist[0]
     pose = _read_pose(transform.translation, transform.rotation)
     return np.concatenate([pose, _read_xyz(twist.linear, twist.angular)])
 

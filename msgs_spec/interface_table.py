@@ -23,8 +23,8 @@ _PREFIX = 'robot0:'
 START, END = '<!-- interface table -->', '<!-- /interface table -->'
 
 _PUBLISHING = (
-    'All messages of a tick carry one stamp. `reward` and `applied_command` start with the first step '
-    'of\nan episode; `episode_status` is sent when it changes, `desired_goal` every tick.'
+    'All messages of a tick carry one stamp. `reward` and `applied_command` start with the first\n'
+    'step of an episode; `episode_status` is sent when it changes, `desired_goal` every tick.'
 )
 _FAMILIES: dict[str, Callable[[TaskSpec], bool]] = {
     'all': lambda task: True,

@@ -1,0 +1,106 @@
+"""Rotations against Gymnasium-Robotics and MuJoCo, bit for bit."""
+
+from __future__ import annotations
+
+import platform
+
+import mujoco
+import numpy as np
+import pytest
+from gymnasium_robotics.utils import rotations as reference
+
+from msgs_spec import rotations
+
+COUNT = 2000
+
+
+def random_quaternions(seed):
+    quaternions = np.random.default_rng(seed).normal(size=(COUNT, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    quaternions[:4] = np.eye(4)
+    return quaternions
+
+
+def random_eulers():
+    eulers = np.random.default_rng(1).uniform(-np.pi, np.pi, size=(COUNT, 3))
+    # Gimbal lock, exactly and nearly.
+    eulers[:4, 1] = [np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, -np.pi / 2 + 1e-9]
+    return eulers
+
+
+def assert_same_bits(ours, theirs):
+    assert np.asarray(ours).tobytes() == np.asarray(theirs).tobytes()
+
+
+CASES = {
+    'quaternion_multiply': (
+        rotations.quaternion_multiply,
+        reference.quat_mul,
+        [random_quaternions(0), random_quaternions(1)],
+    ),
+    'quaternion_to_euler': (
+        rotations.quaternion_to_euler,
+        reference.quat2euler,
+        [random_quaternions(0) * 1.7],
+    ),
+    'matrix_to_euler': (
+        rotations.matrix_to_euler,
+        reference.mat2euler,
+        [np.concatenate([reference.quat2mat(random_quaternions(0)), reference.euler2mat(random_eulers())])],
+    ),
+    'euler_to_matrix': (rotations.euler_to_matrix, reference.euler2mat, [random_eulers()]),
+    'euler_to_quaternion': (rotations.euler_to_quaternion, reference.euler2quat, [random_eulers()]),
+}
+
+
+@pytest.mark.parametrize(('ours', 'theirs', 'arguments'), CASES.values(), ids=CASES)
+def test_equals_gymnasium_robotics(ours, theirs, arguments):
+    assert_same_bits(ours(*arguments), theirs(*arguments))
+
+
+@pytest.mark.parametrize(('ours', 'theirs', 'arguments'), CASES.values(), ids=CASES)
+def test_batches_of_any_shape_equal_single_calls(ours, theirs, arguments):
+    batch = ours(*(a[:60].reshape(3, 20, *a.shape[1:]) for a in arguments))
+    singles = np.stack([ours(*row) for row in zip(*(a[:60] for a in arguments), strict=True)])
+    assert_same_bits(batch, singles.reshape(batch.shape))
+
+
+@pytest.mark.skipif(
+    platform.machine() not in ('x86_64', 'AMD64'), reason='other compilers may contract to FMA'
+)
+def test_quaternion_to_matrix_equals_mujoco():
+    quaternions = random_quaternions(0)
+    expected = np.empty((COUNT, 9))
+    for quaternion, matrix in zip(quaternions, expected, strict=True):
+        mujoco.mju_quat2Mat(matrix, quaternion)
+    assert_same_bits(rotations.quaternion_to_matrix(quaternions).reshape(COUNT, 9), expected)
+
+
+def test_quaternion_from_axis_angle_equals_mujoco():
+    generator = np.random.default_rng(2)
+    axes, angles = generator.normal(size=(COUNT, 3)), generator.uniform(-6, 6, size=COUNT)
+    expected = np.empty((COUNT, 4))
+    for axis, angle, quaternion in zip(axes, angles, expected, strict=True):
+        mujoco.mju_axisAngle2Quat(quaternion, axis / np.linalg.norm(axis), angle)
+    ours = rotations.quaternion_from_axis_angle(axes, angles)
+    np.testing.assert_allclose(ours, expected, atol=1e-15)
+
+
+def test_message_order_and_back():
+    wxyz = random_quaternions(3).reshape(20, 100, 4)
+    xyzw = rotations.wxyz_to_xyzw(wxyz)
+    np.testing.assert_array_equal(xyzw[..., 3], wxyz[..., 0])
+    np.testing.assert_array_equal(xyzw[..., :3], wxyz[..., 1:])
+    assert_same_bits(rotations.xyzw_to_wxyz(xyzw), wxyz)
+
+
+def test_rotation_angle_of_both_conventions():
+    first = random_quaternions(4)[4:]
+    angle = np.random.default_rng(5).uniform(0.1, 3.0, size=len(first))
+    turn = rotations.quaternion_from_axis_angle([1.0, -2.0, 0.5], angle)
+    second = rotations.quaternion_multiply(turn, first)
+    for sign, raw in ((1, angle), (-1, 2 * np.pi - angle)):
+        rotation = rotations.rotation_angle(sign * second, first, antipodal=True)
+        np.testing.assert_allclose(rotation, angle, atol=1e-7)
+        quaternion = rotations.rotation_angle(sign * second, first, antipodal=False)
+        np.testing.assert_allclose(quaternion, raw, atol=1e-7)

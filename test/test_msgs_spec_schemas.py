@@ -1,0 +1,95 @@
+"""Definitions, hashes and QoS texts against the ROS installation and independent readers."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from msgs_spec import qos
+from msgs_spec.schemas import deserialize, message_class, schema_text, serialize, type_hash
+from msgs_spec.tasks import TASKS
+from msgs_spec.topics import topics
+
+TYPES = sorted({spec.type_name for task in TASKS.values() for spec in topics(task)})
+
+
+def installed_type(type_name: str) -> dict[str, object]:
+    """The type description that ROS itself installed."""
+    package, kind, name = type_name.split('/')
+    prefixes = [*filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(':')), sys.prefix]
+    for prefix in prefixes:
+        path = Path(prefix, 'share', package, kind, f'{name}.json')
+        if path.exists():
+            return json.loads(path.read_text())
+    pytest.skip(f'{package} is not installed')
+
+
+@pytest.mark.parametrize('type_name', TYPES)
+def test_hash_is_the_one_ros_installed(type_name):
+    assert installed_type(type_name)['type_hashes'][0] == {
+        'type_name': type_name,
+        'hash_string': type_hash(type_name),
+    }
+
+
+@pytest.mark.parametrize('type_name', TYPES)
+def test_schema_text_holds_every_type_ros_names(type_name):
+    description = installed_type(type_name)['type_description_msg']
+    types = [description['type_description'], *description['referenced_type_descriptions']]
+    sections = schema_text(type_name).split('=' * 80 + '\n')
+    headed = [f'MSG: {type_name.replace("/msg/", "/")}\n{sections[0]}', *sections[1:]]
+    found = {}
+    for section in headed:
+        title, *lines = section.strip('\n').split('\n')
+        fields = [line.split() for line in lines if '=' not in line]
+        found[title.removeprefix('MSG: ')] = [name for _, name in fields]
+    assert found == {
+        entry['type_name'].replace('/msg/', '/'): [field['name'] for field in entry['fields']]
+        for entry in types
+    }
+
+
+def test_unknown_type_is_named():
+    with pytest.raises(ValueError, match="unknown message type 'nav/Goal'; allowed: .*Jazzy"):
+        schema_text('nav/Goal')
+
+
+def test_serialisation_round_trip():
+    bool_type = 'std_msgs/msg/Bool'
+    data = serialize(bool_type, message_class(bool_type)(data=True))
+    assert data == b'\x00\x01\x00\x00\x01'
+    assert deserialize(bool_type, data).data is True
+
+
+def test_rosbag2_yaml_is_metadata_version_9():
+    assert qos.rosbag2_yaml(qos.LATCHED) == (
+        '- history: keep_last\n'
+        '  depth: 1\n'
+        '  reliability: reliable\n'
+        '  durability: transient_local\n'
+        '  deadline:\n'
+        '    sec: 9223372036\n'
+        '    nsec: 854775807\n'
+        '  lifespan:\n'
+        '    sec: 9223372036\n'
+        '    nsec: 854775807\n'
+        '  liveliness: automatic\n'
+        '  liveliness_lease_duration:\n'
+        '    sec: 9223372036\n'
+        '    nsec: 854775807\n'
+        '  avoid_ros_namespace_conventions: false\n'
+    )
+
+
+@pytest.mark.parametrize('spec', [qos.STATE, qos.LATCHED, qos.COMMAND, qos.CLOCK])
+def test_rclpy_profile_says_the_same_as_the_yaml(spec):
+    pytest.importorskip('rclpy')
+    profile = qos.rclpy_profile(spec)
+    assert profile.history.short_key == 'keep_last'
+    assert profile.depth == spec.depth
+    assert profile.reliability.short_key == spec.reliability
+    assert profile.durability.short_key == spec.durability
