@@ -12,7 +12,7 @@ import yaml
 import zstandard
 from episode_recorder import Recorder
 from mcap.reader import make_reader
-from mcap.records import Chunk, ChunkIndex, Header
+from mcap.records import Chunk, ChunkIndex, Header, SummaryOffset
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -156,6 +156,8 @@ def test_profile_chunks_and_indexes(bag):
     assert all(chunk.uncompressed_size < 2 * LogSettings().chunk_size for chunk in chunks)
     assert len(indexes) == len(chunks)
     assert all(index.message_index_offsets for index in indexes)
+    groups = [record for record in records if isinstance(record, SummaryOffset)]
+    assert groups and all(group.group_length > 0 for group in groups)
 
 
 def test_a_chunk_holds_at_most_half_a_simulated_second(bag):

@@ -6,6 +6,7 @@ from fetch_hand_sim.episode_log.errors import EpisodeExistsError, EpisodeLogErro
 from fetch_hand_sim.episode_log.leftovers import Leftover, find_leftovers
 from fetch_hand_sim.episode_log.log_times import log_time
 from fetch_hand_sim.episode_log.reader import Episode, read_episode
+from fetch_hand_sim.episode_log.recovery import recover_episode
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from fetch_hand_sim.episode_log.writer import EpisodeWriter
 
@@ -24,4 +25,5 @@ __all__ = [
     'find_leftovers',
     'log_time',
     'read_episode',
+    'recover_episode',
 ]

@@ -1,8 +1,8 @@
 """One MCAP file as rosbag2, rosbags and Foxglove want it.
 
 Profile `ros2`, `ros2msg` schemas, `cdr` messages, quality of service and type hash per channel,
-chunks with CRC and message index, schemas and channels repeated in the summary, statistics. Knows
-nothing of episodes.
+chunks with CRC and message index, schemas and channels repeated in the summary, statistics, CRC of
+all data. Knows nothing of episodes.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import BinaryIO, Literal
 
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
 from fetch_hand_sim.episode_log.bag_metadata import BagInfo, ChannelInfo
 
@@ -20,6 +20,7 @@ COMPRESSIONS = {
     'lz4': CompressionType.LZ4,
     'zstd': CompressionType.ZSTD,
 }
+_ALL_BUT_ATTACHMENTS = IndexType.ALL & ~IndexType.ATTACHMENT
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +57,25 @@ class BagFile:
         file_name: Name of the file in its bag directory.
         chunk_size: Bytes of messages after which a chunk is compressed and written.
         compression: Of the chunks.
+        has_attachments: Whether there will be any; validators reject an empty index of them.
     """
 
     def __init__(
-        self, stream: BinaryIO, file_name: str, chunk_size: int, compression: Compression
+        self,
+        stream: BinaryIO,
+        file_name: str,
+        chunk_size: int,
+        compression: Compression,
+        has_attachments: bool,
     ) -> None:
         self._file_name = file_name
-        self._writer = Writer(stream, chunk_size=chunk_size, compression=COMPRESSIONS[compression])
+        self._writer = Writer(
+            stream,
+            chunk_size=chunk_size,
+            compression=COMPRESSIONS[compression],
+            index_types=IndexType.ALL if has_attachments else _ALL_BUT_ATTACHMENTS,
+            enable_data_crcs=True,
+        )
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, _Channel] = {}
         self._start_ns = 0

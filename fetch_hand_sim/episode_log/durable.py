@@ -6,6 +6,7 @@ import errno
 import fcntl
 import os
 from contextlib import suppress
+from io import BufferedWriter
 from pathlib import Path
 from typing import IO
 
@@ -27,11 +28,19 @@ def active_name(path: Path) -> str | None:
     return None
 
 
-def claim(directory: Path, name: str) -> Path:
-    """Creates and returns the hidden directory of an episode; of several processes one succeeds.
+def bag_file(directory: Path, name: str) -> Path:
+    """Returns the MCAP file of the episode `name` in its directory, hidden or not."""
+    return directory / f'{name}_0.mcap'
+
+
+def claim(directory: Path, name: str) -> BufferedWriter:
+    """Creates the hidden directory of an episode; of several processes one succeeds.
+
+    Returns:
+        Its MCAP file, empty, locked and open for writing.
 
     Raises:
-        EpisodeExistsError: If an episode of this name is finished or being written.
+        EpisodeExistsError: If an episode of this name is finished, being written or cut off.
     """
     active = active_path(directory, name)
     try:
@@ -40,11 +49,16 @@ def claim(directory: Path, name: str) -> Path:
         raise EpisodeExistsError(
             f'{active} exists: {name} is being written or was cut off'
         ) from None
-    # Only now: whoever holds the claim is the only one to finish under this name.
-    if (directory / name).exists():
+    try:
+        # Only now: whoever holds the claim is the only one to finish under this name.
+        if (directory / name).exists():
+            raise EpisodeExistsError(f'{directory / name} exists; episodes are never overwritten')
+        stream = bag_file(active, name).open('xb')
+    except (OSError, EpisodeExistsError):
         active.rmdir()
-        raise EpisodeExistsError(f'{directory / name} exists; episodes are never overwritten')
-    return active
+        raise
+    lock(stream)
+    return stream
 
 
 def require_free_space(directory: Path, minimum_bytes: int) -> None:
@@ -65,16 +79,21 @@ def lock(stream: IO[bytes]) -> None:
         fcntl.flock(stream, fcntl.LOCK_EX)
 
 
+def try_lock(stream: IO[bytes], shared: bool = False) -> bool:
+    """Does the same without waiting; returns False if another process holds the lock."""
+    try:
+        fcntl.flock(stream, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass  # No locks here, see `lock`.
+    return True
+
+
 def is_locked(path: Path) -> bool:
-    """Whether some process has the file open and locked."""
+    """Whether a process is writing the file."""
     with path.open('rb') as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        except OSError:
-            return False
-    return False
+        return not try_lock(stream, shared=True)
 
 
 def sync(stream: IO[bytes]) -> None:

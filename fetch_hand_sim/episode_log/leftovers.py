@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fetch_hand_sim.episode_log import durable
+from fetch_hand_sim.episode_log.errors import EpisodeLogError
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +39,19 @@ def find_leftovers(directory: Path, now_s: float | None = None) -> list[Leftover
     Args:
         directory: Where episodes are collected; may be missing.
         now_s: Time since the epoch to measure age by; the system clock by default.
+
+    Raises:
+        EpisodeLogError: If the directory cannot be read.
     """
     now = time.time() if now_s is None else now_s
-    if not directory.is_dir():
+    try:
+        found = [_leftover(path, now) for path in sorted(directory.iterdir())]
+    except FileNotFoundError:
         return []
-    found = (_leftover(path, now) for path in sorted(directory.iterdir()))
+    except OSError as error:
+        raise EpisodeLogError(
+            f'cannot read episodes: {error.filename}: {error.strerror}'
+        ) from error
     return [leftover for leftover in found if leftover is not None]
 
 
@@ -51,15 +60,16 @@ def _leftover(path: Path, now_s: float) -> Leftover | None:
     if name is None:
         return None
     try:
-        files = [file for file in path.iterdir() if file.is_file()]
+        files = list(path.iterdir())
         if any(durable.is_locked(file) for file in files):
             return None
-        written = [status.stat() for status in (files or [path])]
+        statuses = [file.stat() for file in files]
+        written = max(status.st_mtime for status in statuses or [path.stat()])
     except FileNotFoundError:
-        return None  # Completed while we were looking.
+        return None  # It was completed while we looked.
     return Leftover(
         name=name,
         path=path,
-        size_bytes=sum(file.stat().st_size for file in files),
-        age_s=max(0.0, now_s - max(status.st_mtime for status in written)),
+        size_bytes=sum(status.st_size for status in statuses),
+        age_s=max(0.0, now_s - written),
     )

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 import zstandard
 from mcap.exceptions import McapError
-from mcap.reader import McapReader, make_reader
+from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
 
+from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
-from fetch_hand_sim.episode_log.writer import EPISODE, EPISODE_RESULT
+
+# CRC of the summary and magic, bytes.
+_FILE_END = 4 + 8
 
 # What the mcap package and its decompressors raise on damaged bytes.
 DAMAGED = (
@@ -96,36 +102,62 @@ def read_episode(path: Path) -> Episode:
         EpisodeReadError: If there is no such file, or it is truncated, damaged or no episode.
     """
     file = _mcap_file(path)
-    with _one_line(file), file.open('rb') as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        records = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
-        for name in (EPISODE, EPISODE_RESULT):
-            if name not in records:
-                raise EpisodeReadError(f'no episode: there is no metadata record {name!r}')
-        return Episode(
-            path=file,
-            topics=_topics(reader),
-            metadata=records[EPISODE],
-            result=records[EPISODE_RESULT],
-            attachments={item.name: item.data for item in reader.iter_attachments()},
-        )
+    contents = _Contents()
+    with _one_line_errors(file), file.open('rb') as stream:
+        for record in StreamReader(stream, validate_crcs=True).records:
+            contents.take(record)
+        _check_summary(stream, contents.summary_start, contents.summary_crc)
+    for name in (EPISODE, EPISODE_RESULT):
+        if name not in contents.metadata:
+            raise EpisodeReadError(f'{file}: no episode, there is no metadata record {name!r}')
+    return Episode(
+        path=file,
+        topics=contents.topics,
+        metadata=contents.metadata[EPISODE],
+        result=contents.metadata[EPISODE_RESULT],
+        attachments=contents.attachments,
+    )
 
 
-def _topics(reader: McapReader) -> dict[str, LoggedTopic]:
-    topics: dict[str, LoggedTopic] = {}
-    for schema, channel, message in reader.iter_messages():
-        if schema is None:
-            raise EpisodeReadError(f'topic {channel.topic} has no message type')
-        if channel.topic not in topics:
-            topics[channel.topic] = LoggedTopic(
-                type_name=schema.name,
-                qos_yaml=channel.metadata.get('offered_qos_profiles', ''),
-                type_hash=channel.metadata.get('topic_type_hash', ''),
-            )
-        topics[channel.topic].messages.append(
-            LoggedMessage(message.log_time, message.sequence, message.data)
-        )
-    return topics
+class _Contents:
+    """What the records of a file add up to."""
+
+    def __init__(self) -> None:
+        self.topics: dict[str, LoggedTopic] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: dict[str, bytes] = {}
+        self.summary_start = 0
+        self.summary_crc = 0
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, LoggedTopic] = {}
+
+    def take(self, record: McapRecord) -> None:
+        match record:
+            case Message():
+                self._channels[record.channel_id].messages.append(
+                    LoggedMessage(record.log_time, record.sequence, record.data)
+                )
+            case Metadata():
+                self.metadata[record.name] = dict(record.metadata)
+            case Attachment():
+                self.attachments[record.name] = record.data
+            case Footer():
+                self.summary_start, self.summary_crc = record.summary_start, record.summary_crc
+            case Schema():
+                self._schemas[record.id] = record
+            case Channel() if record.id not in self._channels:
+                self.topics[record.topic] = self._channels[record.id] = LoggedTopic(
+                    type_name=self._schemas[record.schema_id].name,
+                    qos_yaml=record.metadata.get('offered_qos_profiles', ''),
+                    type_hash=record.metadata.get('topic_type_hash', ''),
+                )
+
+
+def _check_summary(stream: BinaryIO, start: int, expected_crc: int) -> None:
+    """Checks the one CRC that `StreamReader` leaves out; it covers all but itself and the magic."""
+    stream.seek(start)
+    if expected_crc not in (0, zlib.crc32(stream.read()[:-_FILE_END])):
+        raise ValueError('crc validation failed in Summary')
 
 
 def _mcap_file(path: Path) -> Path:
@@ -140,12 +172,10 @@ def _mcap_file(path: Path) -> Path:
 
 
 @contextmanager
-def _one_line(file: Path) -> Iterator[None]:
+def _one_line_errors(file: Path) -> Iterator[None]:
     """Says in one line what is wrong with a file, whatever noticed it."""
     try:
         yield
-    except EpisodeReadError as error:
-        raise EpisodeReadError(f'{file}: {error}') from None
     except OSError as error:
         raise EpisodeReadError(f'{file}: {error.strerror or error}') from error
     except DAMAGED as error:

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
 
 from fetch_hand_sim.episode_log import durable
-from fetch_hand_sim.episode_log.bag_file import BagFile, ChannelSpec
-from fetch_hand_sim.episode_log.bag_metadata import metadata_record, metadata_yaml
+from fetch_hand_sim.episode_log.bag_file import ChannelSpec
+from fetch_hand_sim.episode_log.episode_bag import begin_bag, complete_bag
 from fetch_hand_sim.episode_log.errors import EpisodeLogError
 from fetch_hand_sim.episode_log.log_times import log_time
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from msgs_spec.qos import rosbag2_yaml
 from msgs_spec.schemas import schema_text, type_hash
 from msgs_spec.topics import TopicSpec
-
-# Names of the metadata records.
-EPISODE, EPISODE_RESULT, ROSBAG2 = 'episode', 'episode_result', 'rosbag2'
 
 
 def _strings(content: Mapping[str, str]) -> dict[str, str]:
@@ -32,24 +28,6 @@ def _strings(content: Mapping[str, str]) -> dict[str, str]:
 
 def _reason(error: OSError) -> str:
     return error.strerror or str(error)
-
-
-def complete_bag(
-    bag: BagFile,
-    stream: BinaryIO,
-    directory: Path,
-    metadata: dict[str, str],
-    result: dict[str, str],
-) -> None:
-    """Writes how the episode ended, the summary and `metadata.yaml`, down to the disk."""
-    custom_data = {**metadata, **result}
-    bag.flush()
-    info = bag.info
-    bag.add_record(EPISODE_RESULT, result)
-    bag.add_record(ROSBAG2, metadata_record(info, custom_data))
-    bag.finish()
-    durable.sync(stream)
-    durable.write_text(directory / 'metadata.yaml', metadata_yaml(info, custom_data))
 
 
 class EpisodeWriter:
@@ -84,7 +62,7 @@ class EpisodeWriter:
         directory: Path,
         name: str,
         metadata: Mapping[str, str],
-        attachments: Iterable[Attachment] = (),
+        attachments: Sequence[Attachment] = (),
         settings: LogSettings | None = None,
         namespace: str = '/',
     ) -> None:
@@ -100,17 +78,19 @@ class EpisodeWriter:
         try:
             directory.mkdir(parents=True, exist_ok=True)
             durable.require_free_space(directory, self._settings.minimum_free_bytes)
-            self._active = durable.claim(directory, name)
-            self._stream = (self._active / f'{name}_0.mcap').open('xb')
+            self._stream = durable.claim(directory, name)
         except OSError as error:
             raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
+        self._active = durable.active_path(directory, name)
         self._is_open = True
         try:
-            self._begin(attachments)
+            file_name = Path(self._stream.name).name
+            self._bag = begin_bag(
+                self._stream, file_name, self._settings, self._metadata, attachments
+            )
         except OSError as error:
-            failure = self._fail(error)
             self._discard()
-            raise failure from error
+            raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
 
     @property
     def is_open(self) -> bool:
@@ -176,20 +156,6 @@ class EpisodeWriter:
         """Completes the bag of an episode that was cut short, marked as such; see `finish`."""
         return self._complete({**(result or {}), 'complete': 'false', 'reason': reason})
 
-    def _begin(self, attachments: Iterable[Attachment]) -> None:
-        durable.lock(self._stream)
-        self._bag = BagFile(
-            self._stream,
-            Path(self._stream.name).name,
-            self._settings.chunk_size,
-            self._settings.compression,
-        )
-        self._bag.add_record(EPISODE, self._metadata)
-        self._bag.add_record(ROSBAG2, metadata_record(self._bag.info, self._metadata))
-        for attachment in attachments:
-            self._bag.add_attachment(attachment.name, attachment.media_type, attachment.data)
-        self._bag.flush()
-
     def _channel(self, topic: TopicSpec) -> ChannelSpec:
         channel = self._channels.get(topic.name)
         if channel is None:
@@ -230,23 +196,23 @@ class EpisodeWriter:
                 return None
             complete_bag(self._bag, self._stream, self._active, self._metadata, record)
             durable.publish(self._active, self._final)
-            self._is_open = False
-            self._stream.close()
         except OSError as error:
             raise self._fail(error) from error
+        self._stop()
         self._completed = self._final
         return self._completed
 
     def _fail(self, error: OSError) -> EpisodeLogError:
-        """Stops logging for good; the lock goes with the stream."""
-        self._is_open = False
-        with suppress(OSError):
-            self._stream.close()
+        self._stop()
         return EpisodeLogError(f'episode log stopped, {self._stream.name}: {_reason(error)}')
 
     def _discard(self) -> None:
         """Removes what this writer created; only called while there is no message in it."""
+        self._stop()
+        shutil.rmtree(self._active, ignore_errors=True)
+
+    def _stop(self) -> None:
+        """Takes no more messages; the lock goes with the stream."""
         self._is_open = False
         with suppress(OSError):
             self._stream.close()
-        shutil.rmtree(self._active, ignore_errors=True)

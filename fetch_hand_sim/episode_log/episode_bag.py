@@ -1,0 +1,56 @@
+"""What makes a bag an episode: the records at its beginning and at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+from fetch_hand_sim.episode_log import durable
+from fetch_hand_sim.episode_log.bag_file import BagFile
+from fetch_hand_sim.episode_log.bag_metadata import metadata_record, metadata_yaml
+from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
+
+# Names of the metadata records; of the two `rosbag2` ones readers take the last.
+EPISODE, EPISODE_RESULT, ROSBAG2 = 'episode', 'episode_result', 'rosbag2'
+
+
+def begin_bag(
+    stream: BinaryIO,
+    file_name: str,
+    settings: LogSettings,
+    metadata: dict[str, str],
+    attachments: Sequence[Attachment],
+) -> BagFile:
+    """Writes what identifies the episode, so that a cut-off file can be told too."""
+    bag = BagFile(
+        stream,
+        file_name,
+        settings.chunk_size,
+        settings.compression,
+        has_attachments=bool(attachments),
+    )
+    bag.add_record(EPISODE, metadata)
+    bag.add_record(ROSBAG2, metadata_record(bag.info, metadata))
+    for attachment in attachments:
+        bag.add_attachment(attachment.name, attachment.media_type, attachment.data)
+    bag.flush()
+    return bag
+
+
+def complete_bag(
+    bag: BagFile,
+    stream: BinaryIO,
+    directory: Path,
+    metadata: dict[str, str],
+    result: dict[str, str],
+) -> None:
+    """Writes how the episode ended, the summary and `metadata.yaml`, down to the disk."""
+    custom_data = {**metadata, **result}
+    bag.flush()
+    info = bag.info
+    bag.add_record(EPISODE_RESULT, result)
+    bag.add_record(ROSBAG2, metadata_record(info, custom_data))
+    bag.finish()
+    durable.sync(stream)
+    durable.write_text(directory / 'metadata.yaml', metadata_yaml(info, custom_data))
