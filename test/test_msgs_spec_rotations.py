@@ -46,7 +46,11 @@ CASES = {
     'matrix_to_euler': (
         rotations.matrix_to_euler,
         reference.mat2euler,
-        [np.concatenate([reference.quat2mat(random_quaternions(0)), reference.euler2mat(random_eulers())])],
+        [
+            np.concatenate(
+                [reference.quat2mat(random_quaternions(0)), reference.euler2mat(random_eulers())]
+            )
+        ],
     ),
     'euler_to_matrix': (rotations.euler_to_matrix, reference.euler2mat, [random_eulers()]),
     'euler_to_quaternion': (rotations.euler_to_quaternion, reference.euler2quat, [random_eulers()]),

@@ -54,7 +54,7 @@ def test_schema_text_holds_every_type_ros_names(type_name):
 
 
 def test_unknown_type_is_named():
-    with pytest.raises(ValueError, match="unknown message type 'nav/Goal'; allowed: .*Jazzy"):
+    with pytest.raises(ValueError, match=r"unknown message type 'nav/Goal'; allowed: .*Jazzy"):
         schema_text('nav/Goal')
 
 

@@ -78,7 +78,7 @@ def test_fingertips_are_sites_of_the_hand_models(task_and_model):
 def test_thirteen_tasks_and_their_names():
     assert len(TASKS) == 13
     assert all(task_spec(name).name == name for name in TASKS)
-    with pytest.raises(ValueError, match="unknown task 'Fetch'; allowed: FetchReach, .*PenFull"):
+    with pytest.raises(ValueError, match=r"unknown task 'Fetch'; allowed: FetchReach, .*PenFull"):
         task_spec('Fetch')
 
 
