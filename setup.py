@@ -43,20 +43,22 @@ setup(
     install_requires=[
         'gymnasium>=1.0',
         'gymnasium-robotics~=1.4.2',
-        'mcap>=1.2',
+        'mcap>=1.5',
         'mujoco~=4.0',
         'numpy>=1.26',
+        'PyYAML>=6',
         'rich>=13',
         'rosbags>=0.10',
         'safetensors>=0.4',
         'torch>=2.6',
+        'zstandard>=0.20',
     ],
     extras_require={
         # ROS 2 Jazzy itself, for a machine without it.
         'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
         'train': ['matplotlib', 'tensorboard'],
         'test': TEST,
-        'dev': [*TEST, 'mypy', 'ruff'],
+        'dev': [*TEST, 'mypy', 'ruff', 'types-PyYAML'],
     },
     entry_points={
         'console_scripts': [
