@@ -13,6 +13,9 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+import yaml
+
+from msgs_spec.parameters import POLICY_NODE, SIM_NODE, validate
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = 'fetch_hand_sim'
@@ -132,6 +135,15 @@ def test_launch_files_name_installed_executables_and_files(prefix):
         for part in text.split(f'$(find-pkg-share {PACKAGE})/')[1:]:
             assert (prefix / 'share' / PACKAGE / part.partition('"')[0]).is_file(), part
     assert launch_files
+
+
+@pytest.mark.parametrize(('node', 'specs'), [('sim_node', SIM_NODE), ('policy_node', POLICY_NODE)])
+def test_parameter_file_holds_every_parameter_with_an_allowed_value(node, specs):
+    nodes = yaml.safe_load((ROOT / 'config' / 'sim_node.yaml').read_text())
+    parameters = nodes[f'/**/{node}']['ros__parameters']
+    assert sorted(parameters) == sorted(spec.name for spec in specs)
+    for spec in specs:
+        validate(spec, parameters[spec.name])
 
 
 def test_the_install_is_what_python_imports(workspace, prefix, in_install):
