@@ -1,0 +1,104 @@
+"""Observations rebuilt from the bytes of topics against those of the simulation, bit for bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from random_ticks import random_tick
+
+from fetch_hand_sim.episode_runner import EpisodeRunner
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.codecs import decode
+from msgs_spec.commands import command_from_action
+from msgs_spec.observations import ObservationAssembler, fetch_observation
+from msgs_spec.schemas import deserialize
+from msgs_spec.tasks import TASKS
+from msgs_spec.tick import TickEncoder
+
+TICKS = 5
+
+
+def vectors_of(task, tick):
+    """What a subscriber that joins topics by stamp has."""
+    messages = TickEncoder(task).encode(tick)
+    return {spec.name: decode(spec, deserialize(spec.type_name, data)) for spec, data in messages}
+
+
+@pytest.mark.parametrize(
+    ('name', 'control_hz'), [*((name, 25.0) for name in TASKS), ('FetchPush', 125.0)]
+)
+def test_topics_give_the_observation_of_the_simulation(name, control_hz):
+    task = TASKS[name]
+    simulation = Simulation(name, control_hz=control_hz)
+    runner = EpisodeRunner(Simulation(name, control_hz=control_hz), first_seed=7)
+    assembler = ObservationAssembler(task, control_hz)
+    generator = np.random.default_rng(0)
+    expected = simulation.reset(seed=[7])
+    tick = runner.advance(runner.resting_command())
+    for _ in range(TICKS):
+        observation = assembler.assemble(vectors_of(task, tick))
+        assert observation.keys() == expected.keys()
+        for key, value in observation.items():
+            assert value.tobytes() == expected[key][0].tobytes(), key
+        action = generator.uniform(-1, 1, size=task.robot.action_size)
+        command = command_from_action(task.robot, action)
+        expected = simulation.step_commands(command[None]).observation
+        tick = runner.advance(command)
+
+
+@pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
+def test_sizes_are_those_of_the_specification(task):
+    observation = ObservationAssembler(task, 25.0).assemble(vectors_of(task, random_tick(task)))
+    assert observation['observation'].shape == (task.observation_size,)
+    assert observation['achieved_goal'].shape == (task.goal.size,)
+    assert observation['desired_goal'].shape == (task.goal.size,)
+
+
+def test_velocities_scale_with_the_tick():
+    task = TASKS['FetchReach']
+    vectors = vectors_of(task, random_tick(task))
+    slow = ObservationAssembler(task, 25.0).assemble(vectors)['observation']
+    fast = ObservationAssembler(task, 100.0).assemble(vectors)['observation']
+    np.testing.assert_allclose(slow[:5], fast[:5], rtol=0)
+    np.testing.assert_allclose(slow[5:], 4 * fast[5:])
+
+
+def test_batches_equal_single_calls():
+    generator = np.random.default_rng(3)
+    quaternion = generator.normal(size=(6, 4))
+    parts = [generator.normal(size=(6, size)) for size in (3, 3, 15, 15, 3, 3, 3)]
+    *robot, position, linear, angular = parts
+    batch = fetch_observation(*robot, 0.04, position, quaternion, linear, angular)
+    singles = [
+        fetch_observation(
+            *(p[i] for p in robot), 0.04, position[i], quaternion[i], linear[i], angular[i]
+        )
+        for i in range(6)
+    ]
+    assert batch.tobytes() == np.stack(singles).tobytes()
+
+
+def test_object_needs_all_its_values():
+    with pytest.raises(ValueError, match='object_position given without object_quaternion'):
+        fetch_observation([0] * 3, [0] * 3, [0] * 15, [0] * 15, 0.04, object_position=[0] * 3)
+
+
+@pytest.mark.parametrize('name', ['FetchPush', 'HandReach', 'HandManipulatePenRotate'])
+def test_needed_topics_are_needed(name):
+    task = TASKS[name]
+    assembler = ObservationAssembler(task, 25.0)
+    vectors = vectors_of(task, random_tick(task))
+    needed = [spec.name for spec in assembler.topics]
+    assembler.assemble({name: vectors[name] for name in needed})
+    for missing in needed:
+        with pytest.raises(ValueError, match=f'no {missing} for an observation of {name}'):
+            assembler.assemble({key: vectors[key] for key in needed if key != missing})
+        broken = vectors[missing].copy()
+        broken[-1] = np.nan
+        with pytest.raises(ValueError, match=f'{missing}: not every value is finite'):
+            assembler.assemble(vectors | {missing: broken})
+
+
+def test_rate_must_be_possible():
+    with pytest.raises(ValueError, match='control_hz 30 is not a whole number'):
+        ObservationAssembler(TASKS['FetchReach'], 30.0)
