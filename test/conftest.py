@@ -30,6 +30,16 @@ def reserve_domain() -> tuple[int, socket.socket]:
     raise RuntimeError(f'no free ROS domain among {DOMAINS.start} ... {DOMAINS.stop - 1}')
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Adds what `make twin` turns up."""
+    parser.addoption(
+        '--twin-seeds',
+        type=int,
+        default=2,
+        help='seeds per task in the comparison with Gymnasium-Robotics (default: 2)',
+    )
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Sets the environment of ROS before any message class is imported; children inherit it."""
     domain, lock = reserve_domain()
@@ -45,6 +55,12 @@ def pytest_configure(config: pytest.Config) -> None:
     )
     for variable in ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'):
         os.environ.pop(variable, None)
+
+
+@pytest.fixture(scope='session')
+def twin_seeds(pytestconfig: pytest.Config) -> range:
+    """The seeds of the comparison with Gymnasium-Robotics."""
+    return range(pytestconfig.getoption('--twin-seeds'))
 
 
 @pytest.fixture(scope='session')
