@@ -63,12 +63,6 @@ def twin_seeds(pytestconfig: pytest.Config) -> range:
     return range(pytestconfig.getoption('--twin-seeds'))
 
 
-@pytest.fixture(scope='session')
-def ros_domain_id() -> int:
-    """The private ROS domain of this run."""
-    return int(os.environ['ROS_DOMAIN_ID'])
-
-
 @pytest.fixture
 def ros_environment() -> dict[str, str]:
     """A copy of the environment nodes are started with, for a test to add to."""
