@@ -1,0 +1,119 @@
+"""A plain rclpy client of a robot, as any other program on the network would write it."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+
+from msgs_spec.codecs import decode_status
+from msgs_spec.qos import rclpy_profile
+from msgs_spec.ros import ros_message_class
+from msgs_spec.tasks import TaskSpec
+from msgs_spec.tick import EpisodeStatus
+from msgs_spec.topics import topic, topics
+
+SIM_NODE = (sys.executable, '-m', 'fetch_hand_sim.sim_node')
+POLICY_NODE = (sys.executable, '-m', 'policy_node.node')
+TIMEOUT = 30.0
+
+
+def ros_args(**parameters: object) -> list[str]:
+    """Command line of a node with these parameters."""
+    words = ['--ros-args']
+    for name, value in parameters.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        words += ['-p', f'{name}:={text}']
+    return words
+
+
+class Client:
+    """Receives every topic of a robot and sends commands."""
+
+    def __init__(self, spec: TaskSpec, name: str = 'client') -> None:
+        self.spec = spec
+        self.node = rclpy.create_node(name)
+        self.received: dict[str, list[Any]] = defaultdict(list)
+        self.received_at: dict[str, list[float]] = defaultdict(list)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._publishers: dict[str, Any] = {}
+
+    def subscribe(self, *names: str) -> None:
+        for name in names or [s.name for s in topics(self.spec) if s.direction == 'published']:
+            source = topic(self.spec, name)
+            self.node.create_subscription(
+                ros_message_class(source.type_name),
+                name,
+                self._collector(name),
+                rclpy_profile(source.qos),
+            )
+
+    def publish(self, name: str, message: Any) -> None:
+        self.publisher(name).publish(message)
+
+    def publisher(self, name: str) -> Any:
+        if name not in self._publishers:
+            target = topic(self.spec, name)
+            self._publishers[name] = self.node.create_publisher(
+                ros_message_class(target.type_name), name, rclpy_profile(target.qos)
+            )
+        return self._publishers[name]
+
+    def connect(self, name: str) -> None:
+        """Waits until the robot listens to a topic."""
+        publisher = self.publisher(name)
+        self.spin_until(lambda: publisher.get_subscription_count() > 0, f'a listener on {name}')
+
+    def spin(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def spin_until(
+        self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT
+    ) -> None:
+        end = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < end, f'no {what} within {timeout} s'
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def call(self, type_: Any, name: str, **fields: Any) -> Any:
+        client = self.node.create_client(type_, name)
+        self.spin_until(client.service_is_ready, f'service {name}')
+        future = client.call_async(type_.Request(**fields))
+        self.spin_until(future.done, f'answer of {name}')
+        return future.result()
+
+    def statuses(self) -> list[EpisodeStatus]:
+        messages = self.received['episode_status']
+        return [EpisodeStatus.from_values(decode_status(message)) for message in messages]
+
+    def close(self) -> None:
+        self._executor.remove_node(self.node)
+        self.node.destroy_node()
+
+    def _collector(self, name: str) -> Callable[[Any], None]:
+        def collect(message: Any) -> None:
+            self.received_at[name].append(time.monotonic())
+            self.received[name].append(message)
+
+        return collect
+
+
+@contextmanager
+def client(spec: TaskSpec, name: str = 'client') -> Iterator[Client]:
+    """A client on the private graph of this test run."""
+    rclpy.init()
+    connection = Client(spec, name)
+    try:
+        yield connection
+    finally:
+        connection.close()
+        rclpy.shutdown()
