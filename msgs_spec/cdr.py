@@ -28,7 +28,7 @@ class TopicEncoder:
     """Encodes the vectors of one topic.
 
     Args:
-        topic: Any topic but `episode_status`.
+        topic: Any topic but those of type DiagnosticArray.
     """
 
     def __init__(self, topic: TopicSpec) -> None:

@@ -1,7 +1,7 @@
 """Float64 vectors <-> message objects, topic by topic.
 
-Every topic but `/clock` and `episode_status` carries one float64 vector whose order is the topic's
-`layout`, quaternions wxyz. `build_message` makes the message, `decode` reads it back, also from the
+Every topic but the key/value ones (DiagnosticArray) carries one float64 vector, empty for `/clock`,
+whose order is the topic's `layout`, quaternions wxyz. `build_message` makes the message, `decode` reads it back, also from the
 messages of rclpy, whose fields have the same names. Stamps are nanoseconds of simulated time.
 """
 
@@ -33,7 +33,7 @@ def build_message(topic: TopicSpec, stamp: int, values: ArrayLike) -> Any:
     """Returns the message that carries a vector, as an instance of `schemas.message_class`.
 
     Args:
-        topic: Any topic but `episode_status`.
+        topic: Any topic but those of type DiagnosticArray.
         stamp: Nanoseconds; ignored where the type has no stamp.
         values: (topic.size,) in the order of the layout.
 

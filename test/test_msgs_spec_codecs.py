@@ -124,6 +124,14 @@ def test_quaternions_are_xyzw_in_messages_and_wxyz_in_vectors():
     assert message.joint_names == ['object:joint']
 
 
+def test_commands_say_what_their_values_are():
+    spec = topic(TASKS['FetchReach'], 'commands')
+    layout = build_message(spec, 0, np.zeros(4)).layout
+    (dimension,) = layout.dim
+    assert (dimension.label, dimension.size, dimension.stride) == ('x,y,z,gripper', 4, 4)
+    assert layout.data_offset == 0
+
+
 def test_joints_are_found_by_name_in_any_order():
     spec = topic(TASKS['HandReach'], 'joint_states')
     vector = random_vector(spec)

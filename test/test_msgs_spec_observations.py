@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+from gymnasium_robotics.utils import rotations as reference
 from random_ticks import random_tick
 
 from fetch_hand_sim.episode_runner import EpisodeRunner
@@ -52,6 +55,47 @@ def test_sizes_are_those_of_the_specification(task):
     assert observation['observation'].shape == (task.observation_size,)
     assert observation['achieved_goal'].shape == (task.goal.size,)
     assert observation['desired_goal'].shape == (task.goal.size,)
+
+
+def parts_of(task, observation):
+    """The named parts of an observation vector, as the task's layout has them."""
+    ends = np.cumsum([part.size for part in task.observation])
+    pieces = np.split(observation, ends[:-1])
+    return {part.name: piece for part, piece in zip(task.observation, pieces, strict=True)}
+
+
+@pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
+def test_layout_names_what_the_vector_holds(task):
+    tick = random_tick(task)
+    if task.has_object:
+        turn = tick.object_quaternion / np.linalg.norm(tick.object_quaternion)
+        tick = dataclasses.replace(tick, object_quaternion=turn)
+    observation = ObservationAssembler(task, 50.0).assemble(vectors_of(task, tick))['observation']
+    expected = {
+        'joint_position': tick.joint_position,
+        'joint_velocity': tick.joint_velocity,
+        'fingertip_positions': tick.fingertip_positions,
+        'object_pose': tick.object_qpos,
+        'object_velocity': tick.object_qvel,
+    }
+    if task.robot.has_gripper_command:
+        expected = {
+            'end_effector_position': tick.end_effector_position,
+            'end_effector_velocity': 0.02 * tick.end_effector_linear_velocity,
+            'gripper_state': tick.joint_position[-2:],
+            'gripper_velocity': 0.02 * tick.joint_velocity[-2:],
+        }
+    if task.robot.has_gripper_command and task.has_object:
+        expected |= {
+            'object_position': tick.object_position,
+            'object_relative_position': tick.object_position - tick.end_effector_position,
+            'object_rotation': reference.mat2euler(reference.quat2mat(turn)),
+            'object_relative_velocity': 0.02
+            * (tick.object_linear_velocity - tick.end_effector_linear_velocity),
+            'object_angular_velocity': 0.02 * tick.object_angular_velocity,
+        }
+    for name, piece in parts_of(task, observation).items():
+        np.testing.assert_allclose(piece, expected[name], atol=1e-14, err_msg=name)
 
 
 def test_velocities_scale_with_the_tick():
