@@ -1,8 +1,9 @@
 """Float64 vectors <-> message objects, topic by topic.
 
 Every topic but the key/value ones (DiagnosticArray) carries one float64 vector, empty for `/clock`,
-whose order is the topic's `layout`, quaternions wxyz. `build_message` makes the message, `decode` reads it back, also from the
-messages of rclpy, whose fields have the same names. Stamps are nanoseconds of simulated time.
+whose order is the topic's `layout`, quaternions wxyz. `build_message` makes the message, `decode`
+reads it back, also from the messages of rclpy, whose fields have the same names. Stamps are
+nanoseconds of simulated time.
 """
 
 from __future__ import annotations
