@@ -30,6 +30,11 @@ def asset_path(relative: str) -> Path:
     return path
 
 
+def load_spec(relative: str) -> mujoco.MjSpec:
+    """Reads an MJCF asset, for example `hand/reach.xml`, for editing and compiling."""
+    return mujoco.MjSpec.from_file(str(asset_path(relative)))
+
+
 def load_model(relative: str) -> mujoco.MjModel:
-    """Compiles an MJCF asset, for example `hand/reach.xml`."""
-    return mujoco.MjModel.from_xml_path(str(asset_path(relative)))
+    """Compiles an MJCF asset as it is published."""
+    return load_spec(relative).compile()

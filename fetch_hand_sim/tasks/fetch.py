@@ -14,7 +14,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.assets import load_model
+from fetch_hand_sim.assets import load_spec
+from fetch_hand_sim.model_tuning import (
+    FETCH_NEVER_TOUCHING,
+    exclude_body_pairs,
+    skip_unread_stages,
+)
 from fetch_hand_sim.rewards import GoalMetric, RewardType, SuccessRule
 from fetch_hand_sim.tasks.task import (
     Array,
@@ -112,7 +117,10 @@ class FetchTask(Task):
     def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
         """Lets the robot settle once and keeps that state as the start of every episode."""
         self.config = FETCH_CONFIGS[spec.name]
-        model = load_model(self.config.asset)
+        mjcf = load_spec(self.config.asset)
+        exclude_body_pairs(mjcf, FETCH_NEVER_TOUCHING)
+        model = mjcf.compile()
+        skip_unread_stages(model)
         self._settle(model, spec)
         super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
         self._grip = _SiteReader(self, 'robot0:grip')

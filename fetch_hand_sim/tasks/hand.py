@@ -6,9 +6,20 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from fetch_hand_sim.assets import load_spec
+from fetch_hand_sim.model_tuning import list_geom_pairs, skip_unread_stages
 from fetch_hand_sim.tasks.task import Array, Task
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import TaskSpec
+
+
+def load_hand_model(asset: str) -> mujoco.MjModel:
+    """Compiles a hand model, tuned to step fast along the same trajectories."""
+    mjcf = load_spec(asset)
+    list_geom_pairs(mjcf)
+    model = mjcf.compile()
+    skip_unread_stages(model)
+    return model
 
 
 def fingertip_sites(model: mujoco.MjModel) -> NDArray[np.intp]:

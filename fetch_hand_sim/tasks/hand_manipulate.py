@@ -14,9 +14,8 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from fetch_hand_sim.assets import load_model
 from fetch_hand_sim.rewards import GoalMetric, RewardType, SuccessRule
-from fetch_hand_sim.tasks.hand import HandTask
+from fetch_hand_sim.tasks.hand import HandTask, load_hand_model
 from fetch_hand_sim.tasks.task import (
     Array,
     Generators,
@@ -88,7 +87,7 @@ class HandManipulateTask(HandTask):
     def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
         """Keeps the fresh state, from which every episode starts."""
         self.config = MANIPULATE_CONFIGS[spec.name]
-        model = load_model(self.config.asset)
+        model = load_hand_model(self.config.asset)
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         self._start_state = integration_state(model, data)

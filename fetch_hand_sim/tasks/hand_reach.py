@@ -5,9 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from fetch_hand_sim.assets import load_model
 from fetch_hand_sim.rewards import GoalMetric, RewardType, SuccessRule
-from fetch_hand_sim.tasks.hand import HandTask, fingertip_sites
+from fetch_hand_sim.tasks.hand import HandTask, fingertip_sites, load_hand_model
 from fetch_hand_sim.tasks.task import Array, Generators, Ids, Readings, integration_state
 from msgs_spec.observations import hand_reach_observation
 from msgs_spec.robots import FINGERTIPS
@@ -55,7 +54,7 @@ class HandReachTask(HandTask):
 
     def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
         """Keeps the initial pose, its fingertips and the palm, from which goals are made."""
-        model = load_model(_ASSET)
+        model = load_hand_model(_ASSET)
         data = mujoco.MjData(model)
         for joint, value in _INITIAL_QPOS.items():
             data.joint(joint).qpos = value

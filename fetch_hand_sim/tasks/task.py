@@ -11,6 +11,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
+from fetch_hand_sim.engine import prepare_engine
 from fetch_hand_sim.rewards import GoalMetric, RewardType, SuccessRule
 from msgs_spec.tasks import TaskSpec
 
@@ -68,6 +69,7 @@ class Task(ABC):
             num_threads: Threads that step them; 0 for all processors.
             substeps: Physics steps per action.
         """
+        prepare_engine()
         self.spec = spec
         self.substeps = substeps
         self.model = model

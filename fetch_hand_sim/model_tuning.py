@@ -1,0 +1,117 @@
+"""Makes a model faster to step without changing a bit of any trajectory.
+
+What is computed and never read is switched off, and collision detection looks at fewer pairs of
+geoms while it finds the same contacts in the same order. `docs/simulation.md` has the gains and
+what was tried in vain.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+# Pairs of Fetch bodies that pass the bounding tests at every step and stay more than 1 cm apart for
+# all positions of the joints between them (`test_model_tuning.py` samples these).
+FETCH_NEVER_TOUCHING = (
+    ('robot0:base_link', 'table0'),
+    ('robot0:laser_link', 'table0'),
+    ('robot0:base_link', 'robot0:shoulder_pan_link'),
+    ('robot0:head_pan_link', 'robot0:torso_fixed_link'),
+    ('robot0:head_pan_link', 'robot0:shoulder_pan_link'),
+    ('robot0:head_pan_link', 'robot0:shoulder_lift_link'),
+    ('robot0:head_tilt_link', 'robot0:shoulder_pan_link'),
+    ('robot0:head_tilt_link', 'robot0:shoulder_lift_link'),
+    ('robot0:shoulder_pan_link', 'robot0:torso_fixed_link'),
+    ('robot0:shoulder_lift_link', 'robot0:elbow_flex_link'),
+    ('robot0:upperarm_roll_link', 'robot0:forearm_roll_link'),
+    ('robot0:elbow_flex_link', 'robot0:wrist_flex_link'),
+    ('robot0:forearm_roll_link', 'robot0:wrist_roll_link'),
+    ('robot0:forearm_roll_link', 'robot0:gripper_link'),
+)
+
+
+def exclude_body_pairs(spec: mujoco.MjSpec, pairs: Sequence[tuple[str, str]]) -> None:
+    """Keeps MuJoCo from testing pairs of bodies for contact; those the model lacks are ignored."""
+    bodies = {body.name for body in spec.bodies}
+    for first, second in pairs:
+        if first in bodies and second in bodies:
+            spec.add_exclude(bodyname1=first, bodyname2=second)
+
+
+def list_geom_pairs(spec: mujoco.MjSpec) -> None:
+    """Replaces the search for pairs of geoms that may collide by the list of these pairs.
+
+    With few such pairs the list is cheaper than sorting all bodies along an axis at every substep.
+    Contact parameters are mixed as MuJoCo mixes them (`mj_contactParam`; margins and gaps add up).
+    """
+    model = spec.compile()
+    geoms = {geom.id: geom for geom in spec.geoms}
+    for index, geom in geoms.items():
+        geom.name = geom.name or f'geom{index}'
+    for first, second in collision_candidates(model):
+        _add_pair(spec, model, geoms[first], geoms[second])
+    for geom in geoms.values():
+        geom.contype = geom.conaffinity = 0
+
+
+def collision_candidates(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """The pairs of geoms that MuJoCo's filters let collide, ascending, without explicit pairs."""
+    listed = set(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
+    return [
+        (first, second)
+        for first, second in itertools.combinations(range(model.ngeom), 2)
+        if _masks_match(model, first, second)
+        and _bodies_may_collide(model, first, second)
+        and (first, second) not in listed
+        and (second, first) not in listed
+    ]
+
+
+def skip_unread_stages(model: mujoco.MjModel) -> None:
+    """Switches off sensors, which nobody reads, and islands where there is only one."""
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
+    if model.ntree == 1:
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND.value
+
+
+def _masks_match(model: mujoco.MjModel, first: int, second: int) -> bool:
+    contype, conaffinity = model.geom_contype, model.geom_conaffinity
+    return bool(
+        contype[first] & conaffinity[second] or contype[second] & conaffinity[first]
+    )
+
+
+def _bodies_may_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
+    """False for one rigid body, parent and child (unless one is the world) and excluded bodies."""
+    bodies = sorted((int(model.geom_bodyid[first]), int(model.geom_bodyid[second])))
+    if (bodies[0] << 16) + bodies[1] in model.exclude_signature:
+        return False
+    rigid = [int(model.body_weldid[body]) for body in bodies]
+    parents = [int(model.body_weldid[model.body_parentid[body]]) for body in rigid]
+    if rigid[0] == rigid[1]:
+        return False
+    return not (all(rigid) and (rigid[0] == parents[1] or rigid[1] == parents[0]))
+
+
+def _add_pair(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, first: mujoco.MjsGeom, second: mujoco.MjsGeom
+) -> None:
+    ids = [first.id, second.id]
+    if np.ptp(model.geom_priority[ids]) or (model.geom_solref[ids, 0] <= 0).any():
+        raise ValueError(
+            f'geoms {first.name!r} and {second.name!r} differ in priority or have a direct solref; '
+            'only equal priorities and time constants can be mixed'
+        )
+    pair = spec.add_pair(geomname1=first.name, geomname2=second.name)
+    slide, spin, roll = model.geom_friction[ids].max(axis=0)
+    share = model.geom_solmix[ids[0]] / model.geom_solmix[ids].sum()
+    weights = np.array([share, 1.0 - share])
+    pair.friction = [slide, slide, spin, roll, roll]
+    pair.condim = int(model.geom_condim[ids].max())
+    pair.margin = model.geom_margin[ids].sum()
+    pair.gap = model.geom_gap[ids].sum()
+    pair.solref = weights[0] * model.geom_solref[ids[0]] + weights[1] * model.geom_solref[ids[1]]
+    pair.solimp = weights[0] * model.geom_solimp[ids[0]] + weights[1] * model.geom_solimp[ids[1]]
