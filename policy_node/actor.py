@@ -41,21 +41,32 @@ class NetworkShape:
         return self.observation_size + self.goal_size
 
 
-def mlp(input_size: int, output_size: int, shape: NetworkShape) -> nn.Sequential:
-    """Returns hidden layers with ReLU and a linear output, Glorot weights and zero biases.
+class MLP(nn.Module):
+    """Hidden layers with ReLU and a linear output, Glorot weights and zero biases.
 
-    The initialisation is that of the paper's code (`baselines/her/util.py`).
+    The initialisation is that of the paper's code (`baselines/her/util.py`). The output layer stays
+    float32 under autocast: values near -50 would otherwise be rounded to steps of 0.25.
     """
-    layers: list[nn.Module] = []
-    size = input_size
-    for width in shape.hidden_sizes:
-        layers.append(_linear(size, width))
-        if shape.layer_norm:
-            layers.append(nn.LayerNorm(width))
-        layers.append(nn.ReLU())
-        size = width
-    layers.append(_linear(size, output_size))
-    return nn.Sequential(*layers)
+
+    def __init__(self, input_size: int, output_size: int, shape: NetworkShape) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        size = input_size
+        for width in shape.hidden_sizes:
+            layers.append(_linear(size, width))
+            if shape.layer_norm:
+                layers.append(nn.LayerNorm(width))
+            layers.append(nn.ReLU())
+            size = width
+        self.hidden = nn.Sequential(*layers)
+        self.output = _linear(size, output_size)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Returns (..., output_size), float32."""
+        hidden = self.hidden(inputs).float()
+        with torch.autocast(hidden.device.type, enabled=False):
+            output: Tensor = self.output(hidden)
+        return output
 
 
 def _linear(input_size: int, output_size: int) -> nn.Linear:
@@ -93,7 +104,7 @@ class Actor(nn.Module):
         self.shape = shape
         self.observation_normalizer = Normalizer(shape.observation_size)
         self.goal_normalizer = Normalizer(shape.goal_size)
-        self.network = mlp(shape.feature_size, shape.action_size, shape)
+        self.network = MLP(shape.feature_size, shape.action_size, shape)
 
     def features(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Normalised network input (..., feature_size)."""

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.tasks import TASKS, TaskSpec
 from policy_node.actor import Actor, NetworkShape
 
 FORMAT = 'fetch_hand_actor'
@@ -88,7 +88,8 @@ def write_tensors(path: str | Path, tensors: dict[str, Tensor], metadata: dict[s
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f'.{path.name}.partial')
-    save_file({name: value.contiguous() for name, value in tensors.items()}, partial, metadata)
+    contents = to_bytes({name: value.contiguous() for name, value in tensors.items()}, metadata)
+    partial.write_bytes(contents)
     os.replace(partial, path)
 
 
@@ -164,7 +165,9 @@ def _info(path: str | Path, metadata: dict[str, str]) -> ActorInfo:
 
 
 def _check_sizes(path: str | Path, info: ActorInfo) -> None:
-    spec = task_spec(info.task)
+    if info.task not in TASKS:
+        raise ValueError(f'{path} was trained on unknown task {info.task!r}')
+    spec = TASKS[info.task]
     expected = (observation_layout(spec), spec.goal.size, spec.robot.action_size)
     found = (info.observation_layout, info.goal_size, info.action_size)
     for name, given, wanted in zip(('observation', 'goal', 'action'), found, expected, strict=True):

@@ -107,7 +107,9 @@ class TrainConfig:
         for name, lowest, highest in _RANGES:
             value = getattr(self, name)
             if not lowest <= value <= highest:
-                raise ValueError(f'{name} {value}; allowed: {lowest:g} ... {highest:g}')
+                raise ValueError(f'{name} {value}; allowed: {lowest:.6g} ... {highest:.6g}')
+        if not self.hidden_sizes or min(self.hidden_sizes) < 1:
+            raise ValueError(f'hidden_sizes {self.hidden_sizes}; allowed: one or more widths >= 1')
 
 
 _CHOICES = {

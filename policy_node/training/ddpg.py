@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from policy_node.actor import Actor, NetworkShape, mlp
+from policy_node.actor import MLP, Actor, NetworkShape
 from policy_node.training.config import TrainConfig
 from policy_node.training.distributed import Workers
 from policy_node.training.hindsight import Transitions
@@ -21,12 +21,12 @@ class Critic(nn.Module):
 
     def __init__(self, shape: NetworkShape) -> None:
         super().__init__()
-        self.network = mlp(shape.feature_size + shape.action_size, 1, shape)
+        self.network = MLP(shape.feature_size + shape.action_size, 1, shape)
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """Returns values (batch,), float32."""
         value: Tensor = self.network(torch.cat([features, action], dim=-1))
-        return value.squeeze(-1).float()
+        return value.squeeze(-1)
 
 
 @dataclass(frozen=True, slots=True)
