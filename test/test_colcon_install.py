@@ -49,6 +49,8 @@ def workspace(tmp_path_factory):
         [BIN / 'colcon', 'build'], cwd=workspace, env=environment, capture_output=True, text=True
     )
     assert build.returncode == 0, build.stdout + build.stderr
+    # colcon repairs an incomplete `data_files` and says so; pip would not.
+    assert 'WARNING' not in build.stderr
     return workspace
 
 
