@@ -162,7 +162,9 @@ class Trainer:
                 are left as they are.
         """
         started = time.monotonic() - self.counters.seconds
-        with ThreadPoolExecutor(1, 'collector') as executor:
+        # The number of tensor threads belongs to a thread: without its own, the collector's small
+        # products would start one per core, which then spin against the simulation and the learner.
+        with ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,)) as executor:
             submit = executor.submit if self.config.overlap else _run_now
             collected = self._collect_or_explain(submit(self._collect, *self._request()))
             while True:
