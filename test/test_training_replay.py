@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from policy_node.training.replay import EpisodeReplay, Episodes
+from policy_node.training.replay import EpisodeReplay, Episodes, has_moved
 
 
 def numbered(first: int, count: int, ticks: int = 3) -> Episodes:
@@ -50,3 +50,24 @@ def test_what_cannot_fit_is_refused() -> None:
         EpisodeReplay(0, 3, 5, 2, 4)
     with pytest.raises(ValueError, match='3 episodes exceed the capacity of 2'):
         EpisodeReplay(2, 3, 5, 2, 4).add(numbered(0, 3))
+
+
+def test_moved_episodes_are_those_whose_goal_left_its_start() -> None:
+    episodes = numbered(0, 3)
+    episodes.achieved_goal[1, 2, 1] += 0.02
+    episodes.achieved_goal[2, 1:] += 0.005
+    assert has_moved(episodes).tolist() == [False, True, False]
+
+
+def test_the_moved_share_of_a_draw() -> None:
+    replay = EpisodeReplay(8, 3, 5, 2, 4)
+    generator = np.random.default_rng(0)
+    replay.add(numbered(0, 6))
+    assert set(replay.draw(1000, 0.5, generator).tolist()) == set(range(6))
+    moved = numbered(6, 2)
+    moved.achieved_goal[:, -1] += 1.0
+    replay.add(moved)
+    assert (replay.draw(8000, 0.0, generator) >= 6).mean() == pytest.approx(1 / 4, abs=0.02)
+    assert (replay.draw(8000, 0.6, generator) >= 6).mean() == pytest.approx(0.7, abs=0.02)
+    replay.add(numbered(8, 8))
+    assert set(replay.draw(1000, 1.0, generator).tolist()) == set(range(8))

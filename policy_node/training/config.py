@@ -37,6 +37,8 @@ class TrainConfig:
     """Hindsight goals: final, future, episode, random, futureactual, or none (no hindsight)."""
     hindsight_k: int = 4
     """Relabelled goals for each goal kept, so k/(k+1) of a batch is relabelled."""
+    moved_share: float = 0.0
+    """Share of a batch from episodes in which the achieved goal moved; 0 draws uniformly."""
 
     total_steps: int = 5_000_000
     """Environment steps of the run."""
@@ -124,6 +126,7 @@ _INFINITY = float('inf')
 _RANGES = (
     ('seed', 0, 2**31 - 1),
     ('hindsight_k', 1, 1000),
+    ('moved_share', 0, 1),
     ('total_steps', 1, _INFINITY),
     ('time_limit', 0, _INFINITY),
     ('success_target', 0, 1),

@@ -60,23 +60,22 @@ def goal_mixture(strategy: str, k: int = 4) -> dict[str, float]:
 
 def sample_transitions(
     episodes: Episodes,
-    batch_size: int,
+    row: NDArray[np.int64],
     mixture: dict[str, float],
     compute_reward: RewardFunction,
     generator: np.random.Generator,
 ) -> Transitions:
-    """Draws transitions uniformly and relabels their goals.
+    """Draws a transition of each chosen episode and relabels its goal.
 
     Args:
-        episodes: Episodes to draw from, at least one.
-        batch_size: Number of transitions.
+        episodes: Episodes to draw from.
+        row: Episode of each transition, (batch,).
         mixture: Probability of each goal source; adds up to 1.
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
         generator: Source of all randomness.
     """
     ticks = episodes.ticks
-    row = generator.integers(len(episodes), size=batch_size)
-    tick = generator.integers(ticks, size=batch_size)
+    tick = generator.integers(ticks, size=len(row))
     goal = relabel(episodes, row, tick, mixture, generator)
     state = row * (ticks + 1) + tick
     observation = _flat(episodes.observation)

@@ -8,6 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
+# An episode counts as moved when its achieved goal has left its start by this much: metres, and for
+# poses units of the quaternion, whose 0.01 is a rotation by 0.02 rad.
+MOVED_DISTANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,8 @@ class EpisodeReplay:
             desired_goal=np.zeros((capacity, goal_size), np.float32),
             action=np.zeros((capacity, ticks, action_size), np.float32),
         )
+        self._moved = np.zeros(capacity, np.bool_)
+        self._moved_rows = np.zeros(0, np.int64)
         self.capacity = capacity
         self._size = 0
         self._next = 0
@@ -87,5 +92,33 @@ class EpisodeReplay:
         self._ring.achieved_goal[rows] = episodes.achieved_goal
         self._ring.desired_goal[rows] = episodes.desired_goal
         self._ring.action[rows] = episodes.action
+        self._moved[rows] = has_moved(episodes)
+        self._moved_rows = np.flatnonzero(self._moved)
         self._next = int((self._next + len(episodes)) % self.capacity)
         self._size = min(self._size + len(episodes), self.capacity)
+
+    def draw(
+        self, count: int, moved_share: float, generator: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """Draws episodes with replacement.
+
+        Args:
+            count: How many.
+            moved_share: Share drawn from the episodes whose achieved goal has moved; the others
+                come from all. Where nothing has moved it has no effect.
+            generator: Source of randomness.
+
+        Returns:
+            Rows of `episodes`, (count,).
+        """
+        row = generator.integers(self._size, size=count)
+        chosen = np.flatnonzero(generator.random(count) < moved_share)
+        if len(self._moved_rows):
+            row[chosen] = generator.choice(self._moved_rows, size=len(chosen))
+        return row
+
+
+def has_moved(episodes: Episodes) -> NDArray[np.bool_]:
+    """Whether the achieved goal of each episode has left its start, (episodes,)."""
+    offset = episodes.achieved_goal - episodes.achieved_goal[:, :1]
+    return np.asarray(np.square(offset).sum(axis=-1).max(axis=-1) > MOVED_DISTANCE**2)

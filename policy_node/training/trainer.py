@@ -236,9 +236,9 @@ class Trainer:
         observation = episodes.observation[:, :-1]
         goal = np.zeros((0, self.spec.goal.size))
         if len(episodes):
-            count = len(episodes) * episodes.ticks
+            row = np.repeat(np.arange(len(episodes)), episodes.ticks)
             goal = sample_transitions(
-                episodes, count, self._mixture(), self.simulation.compute_reward, self._generator
+                episodes, row, self._mixture(), self.simulation.compute_reward, self._generator
             ).goal
         actor = self.learner.actor
         for name, values, normalizer in (
@@ -263,7 +263,7 @@ class Trainer:
         for _ in range(self.config.updates_per_cycle):
             batch = sample_transitions(
                 episodes,
-                self.batch_size,
+                self.replay.draw(self.batch_size, self.config.moved_share, self._generator),
                 mixture,
                 self.simulation.compute_reward,
                 self._generator,
