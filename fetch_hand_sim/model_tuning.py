@@ -79,9 +79,7 @@ def skip_unread_stages(model: mujoco.MjModel) -> None:
 
 def _masks_match(model: mujoco.MjModel, first: int, second: int) -> bool:
     contype, conaffinity = model.geom_contype, model.geom_conaffinity
-    return bool(
-        contype[first] & conaffinity[second] or contype[second] & conaffinity[first]
-    )
+    return bool(contype[first] & conaffinity[second] or contype[second] & conaffinity[first])
 
 
 def _bodies_may_collide(model: mujoco.MjModel, first: int, second: int) -> bool:

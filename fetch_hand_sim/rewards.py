@@ -81,11 +81,7 @@ class GoalMetric:
 
     def success(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> NDArray[np.bool_]:
         """Whether goals (..., goal size) are reached: a boolean array (...)."""
-        distance, rotation = self.distances(achieved_goal, desired_goal)
-        reached = distance < self.spec.distance_threshold
-        if self.spec.rotation_threshold is not None:
-            reached = reached & (rotation < self.spec.rotation_threshold)
-        return np.asarray(reached)
+        return self._success(*self.distances(achieved_goal, desired_goal))
 
     def reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Array:
         """Reward of goals (..., goal size): an array (...).
@@ -99,13 +95,28 @@ class GoalMetric:
             info: Unused; part of Gymnasium's signature.
         """
         del info
-        distance, rotation = self.distances(achieved_goal, desired_goal)
+        return self._reward(*self.distances(achieved_goal, desired_goal))
+
+    def evaluate(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Reward and success of goals (..., goal size), from one measurement of the distance."""
+        distances = self.distances(achieved_goal, desired_goal)
+        return self._reward(*distances), self._success(*distances)
+
+    def _success(self, distance: Array, rotation: Array) -> NDArray[np.bool_]:
+        reached = distance < self.spec.distance_threshold
+        if self.spec.rotation_threshold is not None:
+            reached = reached & (rotation < self.spec.rotation_threshold)
+        return np.asarray(reached)
+
+    def _reward(self, distance: Array, rotation: Array) -> Array:
         if self.reward_type == 'dense':
             return -(10.0 * distance + rotation) if self.spec.goal is GoalKind.POSE else -distance
         if self.spec.rotation_threshold is None:
-            return -(distance > self.spec.distance_threshold).astype(np.float64)
-        reached = distance < self.spec.distance_threshold
-        return (reached & (rotation < self.spec.rotation_threshold)).astype(np.float64) - 1.0
+            # Exactly on the threshold is no success and yet worth 0, as in the reference.
+            return -(~(distance <= self.spec.distance_threshold)).astype(np.float64)
+        return self._success(distance, rotation).astype(np.float64) - 1.0
 
     def _checked(self, goal: ArrayLike) -> Array:
         values = np.ascontiguousarray(goal, dtype=np.float64)

@@ -26,7 +26,8 @@ from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind
 
 Array = NDArray[np.float64]
 Observation = dict[str, Array]
-Seeds = int | Sequence[int | None] | None
+Seed = int | np.random.Generator | None
+Seeds = int | Sequence[Seed] | None
 
 _LOGGER = logging.getLogger(__name__)
 # MuJoCo warnings after which it has thrown the state away.
@@ -92,6 +93,7 @@ class Simulation:
         self.control_hz = control_hz
         self.metric = self._task.goal_metric(success_rule, reward_type)
         self.divergences = 0
+        self._warnings = np.zeros(num_envs, dtype=np.int64)
         self._goals = np.zeros((num_envs, self.spec.goal.size))
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._all = np.arange(num_envs)
@@ -106,6 +108,10 @@ class Simulation:
         """The MJCF file of the model."""
         return asset_path(self._task.asset)
 
+    def data(self, index: int) -> Any:
+        """A copy of simulation `index` as a `mujoco.MjData`, to render or inspect."""
+        return self._task.batch.get_data(index)
+
     @property
     def tick_duration(self) -> float:
         """Simulated seconds per step."""
@@ -116,7 +122,8 @@ class Simulation:
 
         Args:
             seed: One seed (simulation i takes seed + i), one per reset simulation, or None: the
-                random generators go on. The same seed gives the reference's draws.
+                random generators go on. The same seed gives the reference's draws. Instead of a
+                seed there may be a generator, which is used from then on.
             ids: Which simulations: indices or a boolean mask (N,); None for all.
 
         Returns:
@@ -218,29 +225,26 @@ class Simulation:
         return self._observe()
 
     def _advance(self, commands: NDArray[np.floating]) -> StepResult:
-        warned = self._divergence_warnings()
         self._task.apply_commands(commands)
         try:
             self._task.step()
             failed = np.zeros(self.num_envs, dtype=bool)
         except SimulationError as error:
             failed = np.isin(self._all, error.ids)
-        diverged = failed | (self._divergence_warnings() > warned)
+        diverged = failed | self._has_diverged()
         if diverged.any():
             self._restart(diverged)
         observation = self._observe()
-        achieved = observation['achieved_goal']
-        return StepResult(
-            observation=observation,
-            reward=self.metric.reward(achieved, self._goals),
-            success=self.metric.success(achieved, self._goals),
-            diverged=diverged,
-        )
+        reward, success = self.metric.evaluate(observation['achieved_goal'], self._goals)
+        return StepResult(observation, reward, success, diverged)
 
-    def _divergence_warnings(self) -> NDArray[np.int64]:
-        """How often MuJoCo has given each simulation up, (N,)."""
+    def _has_diverged(self) -> NDArray[np.bool_]:
+        """Which simulations MuJoCo has given up since the last call, (N,)."""
         # The last axis of `Batch.warning` is (last info, number).
-        return np.asarray(self._task.batch.warning[:, _DIVERGENCE, 1].sum(axis=1))
+        warnings = self._task.batch.warning[:, _DIVERGENCE, 1].sum(axis=1)
+        diverged = warnings > self._warnings
+        self._warnings = warnings
+        return np.asarray(diverged)
 
     def _restart(self, diverged: NDArray[np.bool_]) -> None:
         ids = np.flatnonzero(diverged)
@@ -294,7 +298,7 @@ class Simulation:
         if seed is None:
             return
         if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
-            seeds: list[int | None] = [int(seed) + int(i) for i in selected]
+            seeds: list[Seed] = [int(seed) + int(i) for i in selected]
         elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes):
             seeds = list(seed)
         else:
@@ -314,6 +318,8 @@ class Simulation:
 
 
 def _generator_from(seed: Any) -> np.random.Generator:
+    if isinstance(seed, np.random.Generator):
+        return seed
     if not isinstance(seed, int | np.integer) or isinstance(seed, bool):
         raise TypeError(f'a seed is an integer, not {seed!r}')
     if seed < 0:
