@@ -150,7 +150,8 @@ class ObservationAssembler:
         """Returns `observation`, `achieved_goal` and `desired_goal`, float64.
 
         Args:
-            vectors: What `codecs.decode` made of each topic, by name; others are ignored.
+            vectors: What `codecs.decode` made of each topic, by name, (..., topic.size) with any
+                leading axes, such as ticks; others are ignored.
 
         Raises:
             ValueError: If a topic is missing or holds a value that is not finite.
@@ -167,22 +168,22 @@ class ObservationAssembler:
         }
 
     def _observation(self, vectors: Mapping[str, Array]) -> Array:
-        position, velocity, _ = np.split(vectors['joint_states'], 3)
+        position, velocity, _ = np.split(vectors['joint_states'], 3, axis=-1)
         if self._task.robot.has_gripper_command:
             return self._fetch(position, velocity, vectors)
         if self._task.goal is GoalKind.FINGERTIPS:
             return hand_reach_observation(position, velocity, vectors['fingertip_poses'])
-        qpos, qvel = np.split(vectors['object_joint'], [7])
+        qpos, qvel = np.split(vectors['object_joint'], [7], axis=-1)
         return hand_object_observation(position, velocity, qvel, qpos)
 
     def _fetch(self, position: Array, velocity: Array, vectors: Mapping[str, Array]) -> Array:
-        gripper = vectors['end_effector_pose'][:3]
-        gripper_velocity = vectors['end_effector_twist'][:3]
+        gripper = vectors['end_effector_pose'][..., :3]
+        gripper_velocity = vectors['end_effector_twist'][..., :3]
         robot = (gripper, gripper_velocity, position, velocity, self._tick_duration)
         if not self._task.has_object:
             return fetch_observation(*robot)
-        object_position, object_quaternion = np.split(vectors['object_pose'], [3])
-        linear, angular = np.split(vectors['object_twist'], 2)
+        object_position, object_quaternion = np.split(vectors['object_pose'], [3], axis=-1)
+        linear, angular = np.split(vectors['object_twist'], 2, axis=-1)
         return fetch_observation(*robot, object_position, object_quaternion, linear, angular)
 
 

@@ -13,13 +13,15 @@ from typing import BinaryIO
 import zstandard
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
 
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
+from fetch_hand_sim.episode_log.untrusted import read_records
 
 # CRC of the summary and magic, bytes.
-_FILE_END = 4 + 8
+FILE_END = 4 + 8
+
+_LONGEST_REASON = 200
 
 # What the mcap package and its decompressors raise on damaged bytes.
 DAMAGED = (
@@ -101,12 +103,12 @@ def read_episode(path: Path) -> Episode:
     Raises:
         EpisodeReadError: If there is no such file, or it is truncated, damaged or no episode.
     """
-    file = _mcap_file(path)
+    file = mcap_file(path)
     contents = _Contents()
-    with _one_line_errors(file), file.open('rb') as stream:
-        for record in StreamReader(stream, validate_crcs=True).records:
+    with one_line_errors(file), file.open('rb') as stream:
+        for record in read_records(stream):
             contents.take(record)
-        _check_summary(stream, contents.summary_start, contents.summary_crc)
+        check_summary(stream, contents.summary_start, contents.summary_crc)
     for name in (EPISODE, EPISODE_RESULT):
         if name not in contents.metadata:
             raise EpisodeReadError(f'{file}: no episode, there is no metadata record {name!r}')
@@ -153,17 +155,24 @@ class _Contents:
                 )
 
 
-def _check_summary(stream: BinaryIO, start: int, expected_crc: int) -> None:
+def check_summary(stream: BinaryIO, start: int, expected_crc: int) -> None:
     """Checks the one CRC that `StreamReader` leaves out; it covers all but itself and the magic."""
     stream.seek(start)
-    if expected_crc not in (0, zlib.crc32(stream.read()[:-_FILE_END])):
+    if expected_crc not in (0, zlib.crc32(stream.read()[:-FILE_END])):
         raise ValueError('crc validation failed in Summary')
 
 
-def _mcap_file(path: Path) -> Path:
+def mcap_file(path: Path) -> Path:
+    """Returns the MCAP file of a bag directory, or the path itself if it is no directory.
+
+    Raises:
+        EpisodeReadError: If the directory does not hold exactly one.
+    """
     if not path.is_dir():
+        if path.exists() and not path.is_file():
+            raise EpisodeReadError(f'{path} is no regular file')  # A pipe would never end.
         return path
-    files = sorted(path.glob('*.mcap'))
+    files = sorted(file for file in path.glob('*.mcap') if file.is_file())
     if len(files) != 1:
         raise EpisodeReadError(
             f'{path} holds {len(files)} MCAP files; an episode is a directory of one'
@@ -171,13 +180,18 @@ def _mcap_file(path: Path) -> Path:
     return files[0]
 
 
+def printable(text: str) -> str:
+    """Returns text from a file with what could command a terminal escaped."""
+    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 @contextmanager
-def _one_line_errors(file: Path) -> Iterator[None]:
+def one_line_errors(file: Path) -> Iterator[None]:
     """Says in one line what is wrong with a file, whatever noticed it."""
     try:
         yield
     except OSError as error:
         raise EpisodeReadError(f'{file}: {error.strerror or error}') from error
     except DAMAGED as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
+        text = printable(' '.join(str(error).split()) or type(error).__name__)[:_LONGEST_REASON]
         raise EpisodeReadError(f'{file}: truncated, damaged or no MCAP file ({text})') from error

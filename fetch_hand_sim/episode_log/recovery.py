@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap import records
-from mcap.stream_reader import StreamReader
 
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.bag_file import ChannelSpec
@@ -16,6 +15,7 @@ from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT, begi
 from fetch_hand_sim.episode_log.errors import EpisodeLogError, EpisodeReadError
 from fetch_hand_sim.episode_log.reader import DAMAGED, read_episode
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
+from fetch_hand_sim.episode_log.untrusted import read_records
 
 
 @dataclass(slots=True)
@@ -76,7 +76,7 @@ def recover_episode(leftover: Path) -> Path:
 def _read(stream: BinaryIO) -> _Remains:
     remains = _Remains()
     with suppress(*DAMAGED):
-        for record in StreamReader(stream, validate_crcs=True).records:
+        for record in read_records(stream):
             match record:
                 case records.Message():
                     remains.messages.append(record)

@@ -1,0 +1,197 @@
+"""Episodes as arrays, to learn from: a file at a time, not a message at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
+from fetch_hand_sim.episode_log.errors import EpisodeReadError
+from fetch_hand_sim.episode_log.messages import MessageFile, MessageRows, read_messages
+from fetch_hand_sim.episode_log.summary import find_episodes
+from msgs_spec.cdr import TopicEncoder
+from msgs_spec.commands import action_from_command
+from msgs_spec.observations import ObservationAssembler
+from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.topics import topic
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeArrays:
+    """One episode of N steps.
+
+    Step k leads from observation k to observation k + 1.
+
+    Attributes:
+        path: The MCAP file.
+        spec: The task.
+        observations: `observation`, `achieved_goal` and `desired_goal`, (N + 1, size) each, as
+            `Simulation` returns them, bit for bit.
+        actions: (N, action size), normalised to [-1, 1].
+        commands: (N, action size), what was applied, command units.
+        rewards: (N,).
+        terminated: (N,): no task ends in a terminal state, so all False.
+        truncated: (N,): True at the last step, where time, divergence or an interruption ended it.
+        success: (N + 1,): whether the goal was reached.
+        stamps: (N + 1,) simulated time, nanoseconds.
+        metadata: The record `episode`.
+        result: The record `episode_result`.
+    """
+
+    path: Path
+    spec: TaskSpec
+    observations: dict[str, Array]
+    actions: Array
+    commands: Array
+    rewards: Array
+    terminated: Flags
+    truncated: Flags
+    success: Flags
+    stamps: NDArray[np.int64]
+    metadata: dict[str, str]
+    result: dict[str, str]
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    @property
+    def goals(self) -> Array:
+        """Desired goals, (N + 1, goal size); they change where somebody set another."""
+        return self.observations['desired_goal']
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the episode ran to its end; False if it was interrupted."""
+        return self.result.get('complete') == 'true'
+
+
+def load_episodes(
+    path: Path | str, on_skip: Callable[[EpisodeReadError], None] | None = None
+) -> list[EpisodeArrays]:
+    """Loads one episode, or all of a directory of episodes, by name.
+
+    Interrupted episodes come too, as far as their ticks are whole; `is_complete` tells them.
+
+    Args:
+        path: A bag directory, an MCAP file, or a directory of either.
+        on_skip: Called for what cannot be read, which is left out then; None raises instead.
+
+    Raises:
+        EpisodeReadError: If the path, or with `on_skip` None any episode, cannot be read.
+    """
+    path = Path(path)
+    is_collection = path.is_dir() and not (path / 'metadata.yaml').exists()
+    episodes = []
+    for candidate in find_episodes(path) if is_collection else [path]:
+        try:
+            episodes.append(load_episode(candidate))
+        except EpisodeReadError as error:
+            if on_skip is None:
+                raise
+            on_skip(error)
+    return episodes
+
+
+def load_episode(path: Path) -> EpisodeArrays:
+    """Loads one episode; see `load_episodes`."""
+    file = read_messages(path)
+    for name in (EPISODE, EPISODE_RESULT):
+        if name not in file.metadata:
+            raise EpisodeReadError(f'{file.path}: no episode, there is no metadata record {name!r}')
+    try:
+        return _Decoder(file).decode()
+    except EpisodeReadError:
+        raise
+    except (ValueError, KeyError) as error:
+        raise EpisodeReadError(f'{file.path}: no readable episode: {error}') from error
+
+
+@cache
+def _encoder(task: TaskSpec, name: str) -> TopicEncoder:
+    return TopicEncoder(topic(task, name))
+
+
+@cache
+def _assembler(task: TaskSpec, control_hz: float) -> ObservationAssembler:
+    return ObservationAssembler(task, control_hz)
+
+
+class _Decoder:
+    """Decodes the topics of one file and joins them by tick."""
+
+    def __init__(self, file: MessageFile) -> None:
+        metadata = file.metadata[EPISODE]
+        self._file = file
+        self._task = task_spec(metadata['task'])
+        self._assembler = _assembler(self._task, float(metadata['control_hz']))
+        self._resolved = {name.rpartition('/')[2]: name for name in file.offsets}
+
+    def decode(self) -> EpisodeArrays:
+        metadata, result = self._file.metadata[EPISODE], self._file.metadata[EPISODE_RESULT]
+        states = {spec.name: self._rows(spec.name) for spec in self._assembler.topics}
+        success = self._rows('is_success')
+        # Of an episode that was cut off, the last tick may be there in part.
+        ticks = min(len(rows.data) for rows in (*states.values(), success))
+        stamps, vectors = self._states(states, ticks)
+        rewards = self._steps('reward', stamps)[:, 0]
+        commands = self._steps('applied_command', stamps)
+        steps = ticks - 1
+        if result.get('steps', str(steps)) != str(steps) and result.get('complete') == 'true':
+            raise ValueError(f'it says {result["steps"]} steps and holds {steps}')
+        return EpisodeArrays(
+            path=self._file.path,
+            spec=self._task,
+            observations=self._assembler.assemble(vectors),
+            actions=action_from_command(self._task.robot, commands),
+            commands=commands,
+            rewards=rewards,
+            terminated=np.zeros(steps, dtype=bool),
+            truncated=np.arange(steps) == steps - 1,
+            success=self._decoded('is_success', success, stamps, first=0)[:, 0] != 0.0,
+            stamps=stamps,
+            metadata=metadata,
+            result=result,
+        )
+
+    def _rows(self, name: str) -> MessageRows:
+        return self._file.rows(self._resolved.get(name, name))
+
+    def _states(
+        self, rows: dict[str, MessageRows], ticks: int
+    ) -> tuple[NDArray[np.int64], dict[str, Array]]:
+        """Vectors of the observed topics, which share the stamp of each tick."""
+        vectors: dict[str, Array] = {}
+        stamps: NDArray[np.int64] | None = None
+        for name, found in rows.items():
+            given, values = _encoder(self._task, name).decode(found.data[:ticks])
+            vectors[name] = values
+            stamps = given if stamps is None else stamps
+            if given is None or stamps is None or not np.array_equal(given, stamps):
+                raise ValueError(f'{name} has other stamps than the topics before it')
+        if stamps is None or not (np.diff(stamps) > 0).all():
+            raise ValueError('stamps do not grow')
+        return stamps, vectors
+
+    def _steps(self, name: str, stamps: NDArray[np.int64]) -> Array:
+        """Vectors of a topic that starts with the first step."""
+        if len(stamps) == 1:
+            return np.zeros((0, topic(self._task, name).size))
+        return self._decoded(name, self._rows(name), stamps, first=1)
+
+    def _decoded(
+        self, name: str, rows: MessageRows, stamps: NDArray[np.int64], first: int
+    ) -> Array:
+        """Vectors of a topic without stamps, whose log times tell the tick."""
+        count = len(stamps) - first
+        ticks = np.searchsorted(stamps, rows.log_times[:count], side='right') - 1
+        if not np.array_equal(ticks, np.arange(first, len(stamps))):
+            raise ValueError(f'{name} is missing at some ticks')
+        return _encoder(self._task, name).decode(rows.data[:count])[1]

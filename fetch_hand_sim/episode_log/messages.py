@@ -1,0 +1,162 @@
+"""Raw messages of an episode as arrays of bytes, topic by topic, a whole file at a time."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Metadata
+from numpy.typing import NDArray
+
+from fetch_hand_sim.episode_log.errors import EpisodeReadError
+from fetch_hand_sim.episode_log.reader import mcap_file, one_line_errors
+from fetch_hand_sim.episode_log.untrusted import MAX_UNPACKED_BYTES, unpack
+
+_MAGIC = bytes([137, 77, 67, 65, 80, 48, 13, 10])
+_RECORD = struct.Struct('<BQ')
+# Opcode, length and, of a message, its channel.
+_MESSAGE = struct.Struct('<BQH')
+# Opcode and length; then channel, sequence, log time and publish time.
+_PREFIX = _RECORD.size
+_HEADER = 2 + 4 + 8 + 8
+_LOG_TIME = slice(_PREFIX + 6, _PREFIX + 14)
+
+
+@dataclass(frozen=True, slots=True)
+class MessageRows:
+    """The messages of one topic.
+
+    Attributes:
+        log_times: (n,), nanoseconds.
+        data: (n, size) CDR bytes.
+    """
+
+    log_times: NDArray[np.int64]
+    data: NDArray[np.uint8]
+
+
+@dataclass(slots=True)
+class MessageFile:
+    """The messages of a file, unpacked, and where each of them lies.
+
+    Attributes:
+        path: The MCAP file.
+        metadata: Contents of the metadata records by name; of equal names the last counts.
+        unpacked: All chunks, one after the other.
+        offsets: Where the messages of a topic start in `unpacked`, by resolved name.
+        sizes: Their lengths without opcode and length.
+    """
+
+    path: Path
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    unpacked: bytes = b''
+    offsets: dict[str, list[int]] = field(default_factory=dict)
+    sizes: dict[str, list[int]] = field(default_factory=dict)
+
+    def rows(self, topic: str) -> MessageRows:
+        """Returns the messages of a topic in the order of the file.
+
+        Raises:
+            EpisodeReadError: If there are none, or not all of one size.
+        """
+        sizes = set(self.sizes.get(topic, ()))
+        if len(sizes) != 1:
+            found = f'sizes {sorted(sizes)}' if sizes else 'no message'
+            raise EpisodeReadError(f'{self.path}: {found} of {topic}; one size is needed')
+        size = sizes.pop()
+        buffer = np.frombuffer(self.unpacked, np.uint8)
+        starts = np.array(self.offsets[topic])[:, None]
+        records = buffer[starts + np.arange(_PREFIX + size)]
+        times = np.ascontiguousarray(records[:, _LOG_TIME]).view('<i8')[:, 0]
+        return MessageRows(times, records[:, _PREFIX + _HEADER :])
+
+
+def read_messages(path: Path) -> MessageFile:
+    """Unpacks a file and finds its messages; CRCs of chunks are checked.
+
+    Args:
+        path: The bag directory, or its MCAP file.
+
+    Raises:
+        EpisodeReadError: If there is no such file, or it is truncated or damaged.
+    """
+    file = MessageFile(mcap_file(path))
+    with one_line_errors(file.path), file.path.open('rb') as stream:
+        with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as buffer:
+            _Scan(file).take(buffer)
+    return file
+
+
+class _Scan:
+    def __init__(self, file: MessageFile) -> None:
+        self._file = file
+        self._chunks: list[bytes] = []
+        self._size = 0
+        self._topics: dict[int, str] = {}
+        self._offsets: dict[int, list[int]] = defaultdict(list)
+        self._sizes: dict[int, list[int]] = defaultdict(list)
+
+    def take(self, buffer: mmap.mmap) -> None:
+        for opcode, content in _data_section(buffer):
+            if opcode == Opcode.CHUNK:
+                self._take_chunk(Chunk.read(ReadDataStream(BytesIO(content))))
+            elif opcode == Opcode.METADATA:
+                record = Metadata.read(ReadDataStream(BytesIO(content)))
+                self._file.metadata[record.name] = dict(record.metadata)
+        self._file.unpacked = b''.join(self._chunks)
+        for id, topic in self._topics.items():
+            self._file.offsets[topic] = self._offsets[id]
+            self._file.sizes[topic] = self._sizes[id]
+
+    def _take_chunk(self, chunk: Chunk) -> None:
+        if self._size + chunk.uncompressed_size > MAX_UNPACKED_BYTES:
+            raise ValueError(f'more than {MAX_UNPACKED_BYTES} bytes of messages')
+        data = unpack(chunk)
+        if zlib.crc32(data) != chunk.uncompressed_crc:
+            raise ValueError('crc validation failed in Chunk')
+        self._find_messages(data)
+        self._chunks.append(data)
+        self._size += len(data)
+
+    def _find_messages(self, data: bytes) -> None:
+        position, end, base = 0, len(data), self._size
+        offsets, sizes, read = self._offsets, self._sizes, _MESSAGE.unpack_from
+        while position < end:
+            opcode, size, channel = read(data, position)
+            following = position + _PREFIX + size
+            if following > end:
+                raise ValueError('a record is longer than its chunk')
+            if opcode == Opcode.MESSAGE:
+                offsets[channel].append(base + position)
+                sizes[channel].append(size)
+            elif opcode == Opcode.CHANNEL:
+                content = BytesIO(data[position + _PREFIX : following])
+                record = Channel.read(ReadDataStream(content))
+                self._topics[record.id] = record.topic
+            position = following
+
+
+def _data_section(buffer: mmap.mmap) -> Iterator[tuple[int, bytes]]:
+    """Yields opcode and content of chunks and metadata records; others are passed over."""
+    if buffer[: len(_MAGIC)] != _MAGIC or buffer[-len(_MAGIC) :] != _MAGIC:
+        raise ValueError('it does not begin and end as an MCAP file')
+    position, end = len(_MAGIC), len(buffer) - len(_MAGIC)
+    while position < end:
+        opcode, size = _RECORD.unpack_from(buffer, position)
+        start, position = position + _PREFIX, position + _PREFIX + size
+        if position > end:
+            raise ValueError('a record is longer than the file')
+        if opcode == Opcode.DATA_END:
+            return
+        if opcode in (Opcode.CHUNK, Opcode.METADATA):
+            yield opcode, buffer[start:position]
+    raise ValueError('no end of data')

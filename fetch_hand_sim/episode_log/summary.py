@@ -1,0 +1,134 @@
+"""What an episode is and how it ended, from the records at its ends: no message is read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.records import Footer, McapRecord, Metadata, MetadataIndex, Statistics
+from mcap.stream_reader import StreamReader, read_magic
+
+from fetch_hand_sim.episode_log import durable
+from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
+from fetch_hand_sim.episode_log.errors import EpisodeReadError
+from fetch_hand_sim.episode_log.reader import check_summary, mcap_file, one_line_errors
+from fetch_hand_sim.episode_log.untrusted import BoundedStream
+
+_MAGIC_BYTES = 8
+# Opcode, length, two offsets and a CRC.
+_FOOTER_BYTES = 1 + 8 + 8 + 8 + 4
+_MAX_SUMMARY_BYTES = 2**20
+_MAX_METADATA_RECORDS = 16
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeSummary:
+    """An episode without its messages.
+
+    Attributes:
+        path: The MCAP file.
+        metadata: The record `episode`.
+        result: The record `episode_result`.
+        message_count: Messages in the file.
+        duration_s: Simulated seconds from the first message to the last.
+        size_bytes: Size of the file.
+    """
+
+    path: Path
+    metadata: dict[str, str]
+    result: dict[str, str]
+    message_count: int
+    duration_s: float
+    size_bytes: int
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the episode ran to its end; False if it was interrupted."""
+        return self.result.get('complete') == 'true'
+
+
+def read_summary(path: Path) -> EpisodeSummary:
+    """Reads what the end of a file says of it, about 1 ms whatever its size.
+
+    The CRC of the summary is checked, that of the messages is not: `read_episode` does that.
+
+    Args:
+        path: The bag directory, or its MCAP file.
+
+    Raises:
+        EpisodeReadError: If there is no such file, or it is truncated, damaged or no episode.
+    """
+    file = mcap_file(path)
+    with one_line_errors(file), file.open('rb') as stream:
+        records = list(_summary_records(stream))
+        statistics = next(r for r in records if isinstance(r, Statistics))
+        indexes = [r for r in records if isinstance(r, MetadataIndex)][:_MAX_METADATA_RECORDS]
+        found = {index.name: _metadata_at(stream, index) for index in indexes}
+        size = file.stat().st_size
+    for name in (EPISODE, EPISODE_RESULT):
+        if name not in found:
+            raise EpisodeReadError(f'{file}: no episode, there is no metadata record {name!r}')
+    return EpisodeSummary(
+        path=file,
+        metadata=found[EPISODE],
+        result=found[EPISODE_RESULT],
+        message_count=statistics.message_count,
+        duration_s=(statistics.message_end_time - statistics.message_start_time) / 1e9,
+        size_bytes=size,
+    )
+
+
+def _summary_records(stream: BinaryIO) -> Iterator[McapRecord]:
+    read_magic(ReadDataStream(BytesIO(stream.read(_MAGIC_BYTES))))
+    end = stream.seek(0, 2)
+    footer_start = end - _MAGIC_BYTES - _FOOTER_BYTES
+    stream.seek(max(0, footer_start))
+    footer = next(StreamReader(BytesIO(stream.read()), skip_magic=True).records)
+    if not isinstance(footer, Footer):
+        raise ValueError('no footer')
+    if not 0 < footer.summary_start <= footer_start:
+        raise ValueError('no summary')
+    if footer_start - footer.summary_start > _MAX_SUMMARY_BYTES:
+        raise ValueError(f'summary larger than {_MAX_SUMMARY_BYTES} bytes')
+    check_summary(stream, footer.summary_start, footer.summary_crc)
+    stream.seek(footer.summary_start)
+    yield from StreamReader(BytesIO(stream.read()), skip_magic=True).records
+
+
+def _metadata_at(stream: BinaryIO, index: MetadataIndex) -> dict[str, str]:
+    stream.seek(index.offset)
+    reader = StreamReader(
+        BoundedStream(stream),  # type: ignore[arg-type]
+        skip_magic=True,
+        record_size_limit=_MAX_SUMMARY_BYTES,
+    )
+    record = next(reader.records)
+    if not isinstance(record, Metadata) or record.name != index.name:
+        raise ValueError(f'no metadata record {index.name!r} where the summary says')
+    return dict(record.metadata)
+
+
+def find_episodes(directory: Path) -> list[Path]:
+    """Returns what claims to be an episode in a directory, by name; nothing is opened.
+
+    These are bag directories and MCAP files, but not the hidden directories of episodes that are
+    being written or were cut off, see `find_leftovers`.
+
+    Raises:
+        EpisodeReadError: If it is no directory or cannot be read.
+    """
+    try:
+        entries = sorted(directory.iterdir())
+        return [path for path in entries if not durable.active_name(path) and _is_bag(path)]
+    except OSError as error:
+        raise EpisodeReadError(f'{error.filename or directory}: {error.strerror}') from error
+
+
+def _is_bag(path: Path) -> bool:
+    if path.is_dir():
+        return (path / 'metadata.yaml').exists() or any(path.glob('*.mcap'))
+    return path.suffix == '.mcap'
