@@ -7,12 +7,12 @@ lockstep and a Python loop give the same ticks for the same commands.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Observation, Simulation
+from fetch_hand_sim.tasks import Readings
 from msgs_spec.tick import EpisodeStatus, Phase, Tick
 
 Array = NDArray[np.float64]
@@ -29,13 +29,24 @@ class EpisodeRunner:
     and never go back.
     """
 
-    def __init__(self, simulation: Simulation, *, first_seed: int = 0, episodes: int = 0) -> None:
+    def __init__(
+        self,
+        simulation: Simulation,
+        *,
+        first_seed: int = 0,
+        episodes: int = 0,
+        first_episode: int = 0,
+        first_stamp_ns: int = FIRST_STAMP_NS,
+    ) -> None:
         """Prepares the first episode.
 
         Args:
             simulation: With `num_envs` 1.
             first_seed: Seed of the first episode.
             episodes: How many episodes to run; 0 for no end.
+            first_episode: Index of the first episode, which has the seed `first_seed` plus it; to
+                run an episode from the middle of a series again.
+            first_stamp_ns: Simulated time of the first tick, likewise.
 
         Raises:
             ValueError: If the simulation holds more than one robot.
@@ -47,8 +58,8 @@ class EpisodeRunner:
         self._first_seed = first_seed
         self._episodes = episodes
         self._period_ns = round(simulation.tick_duration * 1e9)
-        self._next_stamp_ns = FIRST_STAMP_NS
-        self._episode = 0
+        self._first_stamp_ns = self._next_stamp_ns = first_stamp_ns
+        self._episode = first_episode
         self._tick = 0
         self._return = 0.0
         self.is_between_episodes = True
@@ -70,6 +81,11 @@ class EpisodeRunner:
         return self._first_seed + self._episode
 
     @property
+    def tick(self) -> int:
+        """Steps of the running or last episode so far."""
+        return self._tick
+
+    @property
     def stamp_ns(self) -> int:
         """Simulated time of the last tick; one period before the first if there is none."""
         return self._next_stamp_ns - self._period_ns
@@ -77,7 +93,7 @@ class EpisodeRunner:
     @property
     def has_started(self) -> bool:
         """Whether there has been a tick."""
-        return self._next_stamp_ns > FIRST_STAMP_NS
+        return self._next_stamp_ns > self._first_stamp_ns
 
     def waiting_status(self) -> EpisodeStatus:
         """What to say of the first episode before it starts."""
@@ -156,7 +172,7 @@ class EpisodeRunner:
         self._next_stamp_ns += self._period_ns
         return Tick(
             stamp_ns=stamp_ns,
-            **_first_rows(self.simulation.readings()),
+            **robot_readings(self.simulation.readings(), 0),
             desired_goal=observation['desired_goal'][0],
             achieved_goal=observation['achieved_goal'][0],
             reward=reward,
@@ -181,7 +197,7 @@ class EpisodeRunner:
         )
 
 
-def _first_rows(readings: Any) -> dict[str, Array]:
-    """Readings of the only robot, without those it does not have."""
+def robot_readings(readings: Readings, index: int) -> dict[str, Array]:
+    """Returns what one of the robots reads, without what it does not have."""
     fields = ((f.name, getattr(readings, f.name)) for f in dataclasses.fields(readings))
-    return {name: values[0] for name, values in fields if values is not None}
+    return {name: values[index] for name, values in fields if values is not None}

@@ -9,7 +9,12 @@ from fetch_hand_sim.episode_log.log_times import log_time
 from fetch_hand_sim.episode_log.reader import Episode, read_episode
 from fetch_hand_sim.episode_log.recovery import recover_episode
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
-from fetch_hand_sim.episode_log.summary import EpisodeSummary, find_episodes, read_summary
+from fetch_hand_sim.episode_log.summary import (
+    EpisodeSummary,
+    expand_episodes,
+    find_episodes,
+    read_summary,
+)
 from fetch_hand_sim.episode_log.writer import EpisodeWriter
 
 __all__ = [
@@ -26,6 +31,7 @@ __all__ = [
     'LogSettings',
     'episode_metadata',
     'episode_name',
+    'expand_episodes',
     'find_episodes',
     'find_leftovers',
     'load_episodes',

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.messages import MessageFile, MessageRows, read_messages
-from fetch_hand_sim.episode_log.summary import find_episodes
+from fetch_hand_sim.episode_log.summary import expand_episodes
 from msgs_spec.cdr import TopicEncoder
 from msgs_spec.commands import action_from_command
 from msgs_spec.observations import ObservationAssembler
@@ -87,10 +87,8 @@ def load_episodes(
     Raises:
         EpisodeReadError: If the path, or with `on_skip` None any episode, cannot be read.
     """
-    path = Path(path)
-    is_collection = path.is_dir() and not (path / 'metadata.yaml').exists()
     episodes = []
-    for candidate in find_episodes(path) if is_collection else [path]:
+    for candidate in expand_episodes(Path(path)):
         try:
             episodes.append(load_episode(candidate))
         except EpisodeReadError as error:

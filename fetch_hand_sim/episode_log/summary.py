@@ -128,6 +128,17 @@ def find_episodes(directory: Path) -> list[Path]:
         raise EpisodeReadError(f'{error.filename or directory}: {error.strerror}') from error
 
 
+def expand_episodes(path: Path) -> list[Path]:
+    """Returns the path itself if it is an episode or no directory, else the episodes in it.
+
+    Raises:
+        EpisodeReadError: If it is a directory that cannot be read.
+    """
+    if not path.is_dir() or (path / 'metadata.yaml').exists():
+        return [path]
+    return find_episodes(path)
+
+
 def _is_bag(path: Path) -> bool:
     if path.is_dir():
         return (path / 'metadata.yaml').exists() or any(path.glob('*.mcap'))

@@ -1,0 +1,124 @@
+"""`generate_episodes`: logs episodes of an actor in the batched simulation, without ROS.
+
+The files are byte-compatible with those of `sim_node`. The same command line gives the same
+messages.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import Progress
+
+from fetch_hand_sim.episode_generator import EpisodeGenerator
+from fetch_hand_sim.episode_log import EpisodeLogError
+from fetch_hand_sim.recording_context import RecordingContext
+from fetch_hand_sim.simulation import Observation, Simulation
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS
+from policy_node import checkpoint
+from policy_node.actor import actor_path
+from policy_node.training.evaluate_policy import FLOORS, load_policy
+
+
+def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Parses the command line."""
+    parser = argparse.ArgumentParser(prog='generate_episodes', description=__doc__)
+    add = parser.add_argument
+    add(
+        '--policy',
+        required=True,
+        help='shipped actor, checkpoint file, random, resting, or sb3:<class>:<file.zip>',
+    )
+    add('--task', choices=list(TASKS), metavar='TASK', help='default: the task of the checkpoint')
+    add('--episodes', type=int, default=1000, help='default: 1000')
+    add('--output', type=Path, required=True, help='directory in which episodes are collected')
+    add('--first-seed', type=int, default=0, help='episode i has this seed plus i; default: 0')
+    add('--num-envs', type=int, default=64, help='simulations in the batch; default: 64')
+    add('--threads', type=int, default=0, help='simulation threads; default: all cores')
+    add('--success-rule', choices=('gymnasium', 'paper'), default='gymnasium')
+    add('--reward-type', choices=('sparse', 'dense'), default='sparse')
+    add('--compiled-model', action='store_true', help='store the compiled model in every file')
+    options = parser.parse_args(arguments)
+    for name in ('episodes', 'num_envs'):
+        if getattr(options, name) < 1:
+            parser.error(f'--{name.replace("_", "-")} {getattr(options, name)}; allowed: >= 1')
+    if options.first_seed < 0:
+        parser.error(f'--first-seed {options.first_seed}; allowed: >= 0')
+    return options
+
+
+def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simulation]:
+    """Returns what makes the episodes, and its simulation.
+
+    Raises:
+        ValueError: If there is no such policy, or an option does not fit it.
+        ImportError: If a Stable-Baselines3 model is asked for and that is not installed.
+    """
+    policy, task, about = load_policy(options.policy, options.task)
+    is_actor = options.policy not in FLOORS and not options.policy.startswith('sb3:')
+    simulation = Simulation(
+        task,
+        num_envs=min(options.num_envs, options.episodes),
+        num_threads=options.threads,
+        reward_type=options.reward_type,
+        success_rule=options.success_rule,
+        control_hz=_control_hz(options.policy) if is_actor else DEFAULT_CONTROL_HZ,
+    )
+    context = RecordingContext(simulation, with_compiled_model=options.compiled_model)
+    context.checkpoint_sha256 = about.get('sha256')
+
+    def act(observation: Observation) -> np.ndarray:
+        return policy.predict(observation, deterministic=True)[0]
+
+    return EpisodeGenerator(simulation, options.output, act, context), simulation
+
+
+def _control_hz(actor: str) -> float:
+    return checkpoint.read_info(actor_path(actor)).control_hz
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    options = parse_arguments(arguments)
+    torch.set_num_threads(1)
+    try:
+        generator, simulation = make_generator(options)
+    except (ValueError, ImportError) as error:
+        return _fail(error, 2)
+    began, cpu_began = time.perf_counter(), time.process_time()
+    steps = successes = 0
+    try:
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            bar = progress.add_task(simulation.spec.name, total=options.episodes)
+            for logged in generator.generate(options.episodes, options.first_seed):
+                steps += logged.status.tick
+                successes += logged.status.is_success
+                progress.advance(bar)
+    except EpisodeLogError as error:
+        return _fail(error, 1)
+    except KeyboardInterrupt:
+        return _fail(KeyboardInterrupt('interrupted; finished episodes are kept'), 1)
+    wall, cpu = time.perf_counter() - began, time.process_time() - cpu_began
+    simulated = steps * simulation.tick_duration
+    print(
+        f'{options.episodes} episodes of {simulation.spec.name} in {options.output}: '
+        f'{successes} successes, {steps} steps, {wall:.1f} s, {simulated / wall:.0f} x real time, '
+        f'{simulated / cpu:.0f} x per core'
+    )
+    return 0
+
+
+def _fail(error: BaseException, code: int) -> int:
+    print(f'generate_episodes: {error}', file=sys.stderr)
+    return code
+
+
+if __name__ == '__main__':
+    sys.exit(main())
