@@ -66,6 +66,12 @@ setup(
             'policy_node = policy_node.node:main',
             'train_her = policy_node.training.train_her:main',
             'evaluate_policy = policy_node.training.evaluate_policy:main',
+            'replay_node = fetch_hand_sim.replay_node:main',
+            'list_episodes = fetch_hand_sim.list_episodes:main',
+            'check_episode = fetch_hand_sim.check_episode:main',
+            'recover_episodes = fetch_hand_sim.recover_episodes:main',
+            'export_episodes = fetch_hand_sim.export_episodes:main',
+            'generate_episodes = policy_node.training.generate_episodes:main',
         ],
     },
 )

@@ -23,7 +23,12 @@ FORBIDDEN = {
     TRAINING: (),
 }
 # The shells on the ROS graph; all else runs without ROS.
-NODES = ('fetch_hand_sim.demo', 'fetch_hand_sim.sim_node', 'policy_node.node')
+NODES = (
+    'fetch_hand_sim.demo',
+    'fetch_hand_sim.replay_node',
+    'fetch_hand_sim.sim_node',
+    'policy_node.node',
+)
 ROS = (
     'rclpy',
     'rcl_interfaces',

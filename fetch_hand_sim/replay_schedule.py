@@ -1,0 +1,168 @@
+"""What to publish when, to say an episode once more; nothing here knows of ROS."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from fetch_hand_sim.episode_log import Episode, EpisodeReadError, read_episode
+from fetch_hand_sim.episode_log.ticks import logged_topics
+from msgs_spec.schemas import deserialize
+from msgs_spec.topics import TopicSpec
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayMessage:
+    """A message to publish.
+
+    Attributes:
+        time_ns: Log time.
+        name: Resolved name of the topic.
+        data: CDR bytes.
+    """
+
+    time_ns: int
+    name: str
+    data: bytes
+
+
+class ReplaySchedule:
+    """The messages of an episode in order, as far as they are to be published.
+
+    Args:
+        path: Bag directory or MCAP file.
+        topics: Names of the topics to publish, resolved or not; empty for all that the robot
+            published.
+        with_inputs: Whether to publish also what the robot received: commands, goals.
+
+    Attributes:
+        topics: Published topics by resolved name.
+        messages: Their messages in order of log time.
+        start_ns: Log time of the first message of the episode, published or not.
+        end_ns: Log time of its last message.
+        period_ns: Recorded nanoseconds per tick.
+        namespace: ROS namespace of the recorded robot, '' for the root.
+
+    Raises:
+        EpisodeReadError: If the file is damaged, or holds what is no message of its type.
+        ValueError: If the episode has no topic of a given name.
+    """
+
+    def __init__(self, path: Path, topics: Iterable[str] = (), with_inputs: bool = False) -> None:
+        episode = read_episode(path)
+        specs = logged_topics(episode)
+        wanted = _wanted(specs, list(topics), with_inputs)
+        self.topics = {name: specs[name] for name in episode.topics if name in wanted}
+        self.messages = sorted(
+            (
+                ReplayMessage(message.log_time_ns, name, message.data)
+                for name in self.topics
+                for message in episode.topics[name].messages
+            ),
+            key=lambda message: message.time_ns,
+        )
+        for message in self.messages:
+            _require_readable(episode.path, self.topics[message.name], message)
+        times = [m.log_time_ns for logged in episode.topics.values() for m in logged.messages]
+        self.start_ns, self.end_ns = min(times), max(times)
+        self.period_ns = _period_ns(episode)
+        status = next((n for n in episode.topics if n.endswith('/episode_status')), '/')
+        self.namespace = status.rpartition('/')[0]
+
+    def index_at(self, time_ns: int) -> int:
+        """Index of the first message at or after a time."""
+        return next(
+            (i for i, message in enumerate(self.messages) if message.time_ns >= time_ns),
+            len(self.messages),
+        )
+
+    def latched_at(self, time_ns: int) -> list[ReplayMessage]:
+        """What late subscribers of the latched topics get at a time.
+
+        That is the last message of each before the time, or the first of all where there is none
+        yet: whoever listens learns at once which robot this is.
+        """
+        found: dict[str, ReplayMessage] = {}
+        for message in self.messages:
+            is_latched = self.topics[message.name].qos.durability == 'transient_local'
+            if is_latched and (message.time_ns < time_ns or message.name not in found):
+                found[message.name] = message
+        return list(found.values())
+
+
+def _wanted(specs: dict[str, TopicSpec], names: list[str], with_inputs: bool) -> set[str]:
+    short = {name.rpartition('/')[2]: name for name in specs}
+    unknown = [name for name in names if name not in specs and name not in short]
+    if unknown:
+        raise ValueError(f'no topic {unknown[0]!r} in the episode; allowed: {", ".join(specs)}')
+    if names:
+        return {name if name in specs else short[name] for name in names}
+    return {name for name, s in specs.items() if with_inputs or s.direction == 'published'}
+
+
+def _period_ns(episode: Episode) -> int:
+    try:
+        return round(1e9 / float(episode.metadata['control_hz']))
+    except (KeyError, ValueError, OverflowError, ZeroDivisionError) as error:
+        raise EpisodeReadError(f'{episode.path}: its control_hz cannot be read') from error
+
+
+def _require_readable(path: Path, spec: TopicSpec, message: ReplayMessage) -> None:
+    try:
+        deserialize(spec.type_name, message.data)
+    except Exception as error:  # The deserialiser raises what the bytes lead it into.
+        raise EpisodeReadError(
+            f'{path}: {message.name} at {message.time_ns} ns is no {spec.type_name}'
+        ) from error
+
+
+class Playhead:
+    """Position in an episode over time. `now` is seconds of any steady clock."""
+
+    def __init__(self, position_ns: int, rate: float, now: float, is_paused: bool) -> None:
+        """Starts at a position.
+
+        Args:
+            position_ns: Log time.
+            rate: Recorded seconds per second.
+            now: The time now.
+            is_paused: Whether to stand still until `resume`.
+        """
+        self._position_ns = position_ns
+        self._since = now
+        self._rate = rate
+        self.is_paused = is_paused
+
+    def position_ns(self, now: float) -> int:
+        """Log time to be published up to."""
+        if self.is_paused:
+            return self._position_ns
+        return self._position_ns + int((now - self._since) * self._rate * 1e9)
+
+    def remaining(self, time_ns: int, now: float) -> float:
+        """Seconds until a log time is due; infinite while paused."""
+        if self.is_paused:
+            return math.inf
+        return (time_ns - self._position_ns) / 1e9 / self._rate - (now - self._since)
+
+    def pause(self, now: float) -> None:
+        """Stands still."""
+        self._position_ns, self._since = self.position_ns(now), now
+        self.is_paused = True
+
+    def resume(self, now: float) -> None:
+        """Goes on."""
+        if self.is_paused:
+            self._since = now
+        self.is_paused = False
+
+    def set_rate(self, rate: float, now: float) -> None:
+        """Changes the rate from now on."""
+        self._position_ns, self._since = self.position_ns(now), now
+        self._rate = rate
+
+    def jump(self, position_ns: int, now: float) -> None:
+        """Goes to a position."""
+        self._position_ns, self._since = position_ns, now
