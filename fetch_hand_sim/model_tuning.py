@@ -13,8 +13,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-# Pairs of Fetch bodies that pass the bounding tests at every step and stay more than 1 cm apart for
-# all positions of the joints between them (`test_model_tuning.py` samples these).
+# Pairs of Fetch bodies that pass the bounding tests at most steps and stay more than 1 cm apart for
+# all positions of the joints between them, even 0.3 rad beyond the limits, which are soft and were
+# seen to give way by 0.13 rad (`test_model_tuning.py` samples these positions).
 FETCH_NEVER_TOUCHING = (
     ('robot0:base_link', 'table0'),
     ('robot0:laser_link', 'table0'),
@@ -26,10 +27,7 @@ FETCH_NEVER_TOUCHING = (
     ('robot0:head_tilt_link', 'robot0:shoulder_lift_link'),
     ('robot0:shoulder_pan_link', 'robot0:torso_fixed_link'),
     ('robot0:shoulder_lift_link', 'robot0:elbow_flex_link'),
-    ('robot0:upperarm_roll_link', 'robot0:forearm_roll_link'),
     ('robot0:elbow_flex_link', 'robot0:wrist_flex_link'),
-    ('robot0:forearm_roll_link', 'robot0:wrist_roll_link'),
-    ('robot0:forearm_roll_link', 'robot0:gripper_link'),
 )
 
 

@@ -138,6 +138,7 @@ class Simulation:
         generators = [self._generator(i) for i in selected.tolist()]
         if selected.size:
             self._goals[selected] = self._task.reset(selected, generators)
+            self._warnings = self._count_warnings()
         return self._observe()
 
     def step(self, actions: ArrayLike) -> StepResult:
@@ -154,7 +155,7 @@ class Simulation:
         if checked.size and (np.abs(checked) > 1.0).any():
             env, part = np.argwhere(np.abs(checked) > 1.0)[0]
             raise ValueError(
-                f'actions must lie in [-1, 1]; actions[{env}, {part}] is {checked[env, part]!r}'
+                f'actions must lie in [-1, 1]; actions[{env}, {part}] is {checked[env, part]}'
             )
         return self._advance(command_from_action(self.spec.robot, checked))
 
@@ -239,12 +240,14 @@ class Simulation:
         return StepResult(observation, reward, success, diverged)
 
     def _has_diverged(self) -> NDArray[np.bool_]:
-        """Which simulations MuJoCo has given up since the last call, (N,)."""
+        """Which simulations MuJoCo has given up since the last reset or step, (N,)."""
+        before, self._warnings = self._warnings, self._count_warnings()
+        return np.asarray(self._warnings > before)
+
+    def _count_warnings(self) -> NDArray[np.int64]:
+        """How often MuJoCo has given each simulation up, (N,)."""
         # The last axis of `Batch.warning` is (last info, number).
-        warnings = self._task.batch.warning[:, _DIVERGENCE, 1].sum(axis=1)
-        diverged = warnings > self._warnings
-        self._warnings = warnings
-        return np.asarray(diverged)
+        return np.asarray(self._task.batch.warning[:, _DIVERGENCE, 1].sum(axis=1))
 
     def _restart(self, diverged: NDArray[np.bool_]) -> None:
         ids = np.flatnonzero(diverged)
@@ -255,6 +258,7 @@ class Simulation:
             ids.tolist(),
         )
         self._goals[ids] = self._task.reset(ids, [self._generator(i) for i in ids.tolist()])
+        self._warnings = self._count_warnings()
 
     def _observe(self) -> Observation:
         observation, achieved = self._task.observe()
@@ -269,6 +273,8 @@ class Simulation:
         shape = (self.num_envs, self.spec.robot.action_size)
         if array.shape != shape:
             raise ValueError(f'{name} of {self.spec.name} have shape {shape}, not {array.shape}')
+        if array.dtype.kind not in 'iuf':
+            raise ValueError(f'{name} are numbers, not of type {array.dtype}')
         if array.dtype not in (np.float32, np.float64):
             array = array.astype(np.float64)
         if not np.isfinite(array).all():

@@ -1,0 +1,263 @@
+"""The batched simulation: reproducible to the bit, deaf to bad input, robust to divergence."""
+
+from __future__ import annotations
+
+import logging
+import resource
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.commands import command_from_action
+from msgs_spec.rotations import quaternion_from_axis_angle, quaternion_multiply
+from msgs_spec.tasks import TASKS
+
+
+def actions(simulation: Simulation, steps: int, seed: int = 0) -> np.ndarray:
+    """Random actions (steps, N, action size)."""
+    shape = (steps, simulation.num_envs, simulation.spec.robot.action_size)
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
+
+
+def play(simulation: Simulation, played: np.ndarray) -> np.ndarray:
+    """Everything the steps say, (steps, N, values)."""
+    rows = []
+    for action in played:
+        result = simulation.step(action)
+        parts = [*result.observation.values(), result.reward[:, None], result.success[:, None]]
+        rows.append(np.concatenate(parts, axis=1))
+    return np.array(rows)
+
+
+def state_of(simulation: Simulation) -> bytes:
+    """All bits that decide what happens next, generators and goals included."""
+    generators = [
+        generator and generator.bit_generator.state for generator in simulation._generators
+    ]
+    state = simulation._task.batch.state.tobytes() + simulation._goals.tobytes()
+    return state + repr(generators).encode()
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_the_nth_episode_of_a_seed_equals_the_first(task):
+    simulation = Simulation(task, num_envs=2, num_threads=1)
+    played = actions(simulation, 12)
+    first_observation = simulation.reset(seed=[5, 6])
+    first_state = state_of(simulation)
+    first = play(simulation, played)
+    simulation.reset()
+    play(simulation, actions(simulation, 12, seed=1))
+    observation = simulation.reset(seed=[5, 6])
+    for name, values in observation.items():
+        assert values.tobytes() == first_observation[name].tobytes(), name
+    assert state_of(simulation) == first_state
+    assert play(simulation, played).tobytes() == first.tobytes()
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_neither_neighbours_nor_threads_change_a_bit(task):
+    batch = Simulation(task, num_envs=64, num_threads=1)
+    threaded = Simulation(task, num_envs=64, num_threads=3)
+    single = Simulation(task, num_envs=1)
+    played = actions(batch, 6)
+    for simulation in (batch, threaded):
+        simulation.reset(seed=100)
+    single.reset(seed=137)
+    expected = play(batch, played)
+    assert play(threaded, played).tobytes() == expected.tobytes()
+    assert play(single, played[:, 37:38]).tobytes() == expected[:, 37:38].tobytes()
+
+
+@pytest.mark.parametrize('task', ['FetchPush', 'HandManipulatePenFull'])
+def test_a_partial_reset_leaves_the_others_alone(task):
+    simulation = Simulation(task, num_envs=5)
+    simulation.reset(seed=0)
+    play(simulation, actions(simulation, 3))
+    before = simulation._task.batch.state.copy()
+    expected = Simulation(task, num_envs=1).reset(seed=[77])
+    observation = simulation.reset(seed=[77], ids=[3])
+    after = simulation._task.batch.state
+    others = [0, 1, 2, 4]
+    assert after[others].tobytes() == before[others].tobytes()
+    for name, values in expected.items():
+        assert observation[name][3].tobytes() == values[0].tobytes()
+
+
+def test_without_a_seed_the_generators_go_on():
+    simulation = Simulation('FetchPush', num_envs=2)
+    goals = [simulation.reset(seed=0)['desired_goal'], simulation.reset()['desired_goal']]
+    again = [simulation.reset(seed=0)['desired_goal'], simulation.reset()['desired_goal']]
+    assert not np.array_equal(goals[0], goals[1])
+    assert np.array_equal(goals, again)
+
+
+def test_returned_arrays_are_copies():
+    simulation = Simulation('HandManipulateEggFull')
+    simulation.reset(seed=[0])
+    before = state_of(simulation)
+    for values in simulation.observe().values():
+        values[:] = 7.0
+    assert state_of(simulation) == before
+
+
+def test_commands_in_radians_equal_normalised_actions():
+    by_action, by_command = (Simulation('HandReach', num_envs=2) for _ in range(2))
+    for simulation in (by_action, by_command):
+        simulation.reset(seed=0)
+    action = actions(by_action, 1)[0]
+    expected = by_action.step(action).observation['observation']
+    result = by_command.step_commands(command_from_action(by_command.spec.robot, action))
+    assert result.observation['observation'].tobytes() == expected.tobytes()
+
+
+def with_value(value: float) -> np.ndarray:
+    action = np.zeros((2, 4))
+    action[1, 2] = value
+    return action
+
+
+BAD_ACTIONS = {
+    'shape': (np.zeros((2, 3)), r'actions of FetchPush have shape \(2, 4\), not \(2, 3\)'),
+    'one row': (np.zeros(4), r'shape \(2, 4\), not \(4,\)'),
+    'NaN': (with_value(np.nan), r'must be finite; actions\[1, 2\] is nan'),
+    'infinite': (with_value(-np.inf), r'must be finite; actions\[1, 2\] is -inf'),
+    'range': (with_value(1.5), r'\[-1, 1\]; actions\[1, 2\] is 1\.5'),
+    'text': (np.full((2, 4), 'left'), 'actions are numbers'),
+}
+
+
+@pytest.mark.parametrize('bad', BAD_ACTIONS)
+def test_bad_actions_move_nothing(bad):
+    values, message = BAD_ACTIONS[bad]
+    simulation = Simulation('FetchPush', num_envs=2)
+    simulation.reset(seed=0)
+    before = state_of(simulation)
+    with pytest.raises(ValueError, match=message):
+        simulation.step(values)
+    assert state_of(simulation) == before
+
+
+BAD_RESETS = {
+    'negative seed': ({'seed': -1}, ValueError, 'a seed must not be negative, but -1 is'),
+    'one negative seed': ({'seed': [3, -2]}, ValueError, 'must not be negative, but -2 is'),
+    'text as seed': ({'seed': 'one'}, TypeError, "not 'one'"),
+    'fraction as seed': ({'seed': [0, 0.5]}, TypeError, 'a seed is an integer, not 0.5'),
+    'too many seeds': ({'seed': [1, 2, 3]}, ValueError, '2 simulations start again but 3 seeds'),
+    'index out of range': ({'ids': [2]}, ValueError, r'in \[0, 2\)'),
+    'index twice': ({'ids': [1, 1]}, ValueError, 'distinct'),
+    'fraction as index': ({'ids': [0.5]}, ValueError, 'indices below 2 or a boolean mask'),
+}
+
+
+@pytest.mark.parametrize('bad', BAD_RESETS)
+def test_bad_resets_move_nothing(bad):
+    arguments, error, message = BAD_RESETS[bad]
+    simulation = Simulation('FetchPush', num_envs=2)
+    simulation.reset(seed=0)
+    before = state_of(simulation)
+    with pytest.raises(error, match=message):
+        simulation.reset(**arguments)
+    assert state_of(simulation) == before
+
+
+BAD_SIMULATIONS = {
+    'task': ({'task': 'FetchJump'}, "unknown task 'FetchJump'; allowed: FetchReach, "),
+    'number': ({'num_envs': 0}, 'num_envs must be at least 1, not 0'),
+    'threads': ({'num_threads': -1}, 'num_threads must be 0'),
+    'reward': ({'reward_type': 'shaped'}, "reward_type 'shaped' is not known; allowed: sparse"),
+    'rule': ({'success_rule': 'mine'}, "success_rule 'mine' is not known; allowed: gymnasium"),
+    'rate': ({'control_hz': 30}, 'control_hz 30 .* nearest: 29.4117647 and 31.25'),
+    'low rate': ({'control_hz': 1}, 'nearest: 12.5'),
+    'negative rate': ({'control_hz': -25}, 'nearest: 12.5'),
+    'no rate': ({'control_hz': float('nan')}, 'control_hz nan'),
+}
+
+
+@pytest.mark.parametrize('bad', BAD_SIMULATIONS)
+def test_bad_simulations_are_refused(bad):
+    arguments, message = BAD_SIMULATIONS[bad]
+    with pytest.raises(ValueError, match=message):
+        Simulation(**({'task': 'FetchReach'} | arguments))
+
+
+@pytest.mark.parametrize('substeps', [1, 4, 40])
+def test_the_control_rate_sets_the_simulated_time_of_a_tick(substeps):
+    simulation = Simulation('FetchReach', control_hz=500 / substeps)
+    simulation.reset(seed=[0])
+    start = simulation.data(0).time
+    simulation.step(np.zeros((1, 4)))
+    assert simulation.data(0).time - start == pytest.approx(0.002 * substeps)
+
+
+@pytest.mark.parametrize('task', ['FetchPush', 'HandReach', 'HandManipulateBlockFull'])
+def test_a_diverged_simulation_starts_again_and_the_others_go_on(
+    task, caplog, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    simulation = Simulation(task, num_envs=4, num_threads=2)
+    undisturbed = Simulation(task, num_envs=4, num_threads=2)
+    for each in (simulation, undisturbed):
+        each.reset(seed=0)
+    simulation._task.batch.bind('qvel')[2, 3] = np.nan
+    action = actions(simulation, 1)[0]
+    with caplog.at_level(logging.WARNING):
+        result = simulation.step(action)
+    expected = undisturbed.step(action)
+    assert result.diverged.tolist() == [False, False, True, False]
+    assert simulation.divergences == 1
+    assert f'{task}: MuJoCo reports simulations [2] as diverged' in caplog.text
+    others = [0, 1, 3]
+    for name, values in result.observation.items():
+        assert values[others].tobytes() == expected.observation[name][others].tobytes()
+    # Its new episode is what its generator gives next.
+    fresh = undisturbed.reset(ids=[2])
+    for name, values in result.observation.items():
+        assert values[2].tobytes() == fresh[name][2].tobytes()
+    assert not simulation.step(action).diverged.any()
+    assert not list(tmp_path.iterdir()), 'MuJoCo wrote a file into the working directory'
+
+
+def test_a_goal_is_taken_in_the_hemisphere_of_the_object():
+    simulation = Simulation('HandManipulateBlockFull')
+    pose = simulation.reset(seed=[0])['achieved_goal'][0]
+    turn = quaternion_from_axis_angle([0.0, 0.0, 1.0], 0.05)
+    quaternion = quaternion_multiply(turn, pose[3:])
+    for sign in (1.0, -3.0):
+        simulation.set_goal([[*pose[:3], *(sign * quaternion)]])
+        observation = simulation.observe()
+        assert observation['desired_goal'][0, 3:] == pytest.approx(quaternion)
+        achieved, desired = observation['achieved_goal'], observation['desired_goal']
+        assert simulation.compute_success(achieved, desired).all()
+
+
+@pytest.mark.parametrize(
+    ('goal', 'message'),
+    [
+        (np.zeros((1, 3)), r'shape \(1, 7\), not \(1, 3\)'),
+        (np.full((1, 7), np.nan), 'must be finite'),
+        (np.zeros((1, 7)), 'quaternion must not be zero'),
+    ],
+)
+def test_bad_goals_change_nothing(goal, message):
+    simulation = Simulation('HandManipulateBlockFull')
+    simulation.reset(seed=[0])
+    before = state_of(simulation)
+    with pytest.raises(ValueError, match=message):
+        simulation.set_goal(goal)
+    assert state_of(simulation) == before
+
+
+@pytest.mark.parametrize('task', ['FetchPush', 'HandReach'])
+def test_memory_does_not_grow_with_episodes(task):
+    simulation = Simulation(task, num_envs=8)
+    played = actions(simulation, 2)
+
+    def run_episodes() -> int:
+        for _ in range(150):
+            simulation.reset()
+            play(simulation, played)
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+    before = run_episodes()
+    assert run_episodes() - before < 4096, 'kilobytes that 150 more episodes took'
