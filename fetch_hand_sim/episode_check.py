@@ -189,7 +189,9 @@ def _result_difference(
     last: LoggedTick, status: EpisodeStatus, runner: EpisodeRunner, episode: Episode
 ) -> Difference | None:
     """Whether the record `episode_result` says something else than the last tick."""
-    expected = {**episode_result(status), 'complete': str(runner.is_between_episodes).lower()}
+    expected = episode_result(status)
+    if not runner.is_between_episodes:
+        expected['complete'] = 'false'
     for name, simulated in expected.items():
         recorded = episode.result.get(name, simulated)
         if recorded != simulated:

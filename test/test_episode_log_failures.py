@@ -32,6 +32,7 @@ from fetch_hand_sim.episode_log import (
     read_episode,
     recover_episode,
 )
+from msgs_spec.schemas import deserialize
 
 RECORDER_SCRIPT = Path(__file__).with_name('episode_recorder.py')
 NOBODY = 65534
@@ -170,7 +171,18 @@ def test_recovery_makes_a_bag_of_what_reached_the_disk(killed, tmp_path):
     twin = Recorder('FetchReach')
     whole = [twin.record(EpisodeDirectory(tmp_path / 'twin')) for _ in range(3)][-1]
     recovered, original = read_episode(path), read_episode(whole)
-    assert recovered.result == {'complete': 'false', 'reason': 'cut off, recovered later'}
+    steps = len(recovered.topics['/applied_command'].messages)
+    rewards = [
+        deserialize('std_msgs/msg/Float64', message.data).data
+        for message in original.topics['/reward'].messages
+    ]
+    assert recovered.result == {
+        'complete': 'false',
+        'reason': 'cut off, recovered later',
+        'steps': str(steps),
+        'return': str(sum(rewards[:steps])),
+        'success': 'false',
+    }
     assert recovered.metadata == original.metadata
     assert len(recovered.topics['/joint_states'].messages) > 25
     for name, topic in recovered.topics.items():

@@ -138,6 +138,7 @@ class _Decoder:
         success = self._rows('is_success')
         # Of an episode that was cut off, the last tick may be there in part.
         ticks = min(len(rows.data) for rows in (*states.values(), success))
+        ticks = min(ticks, 1 + self._file.count(self._name('applied_command')))
         stamps, vectors = self._states(states, ticks)
         rewards = self._steps('reward', stamps)[:, 0]
         commands = self._steps('applied_command', stamps)
@@ -160,7 +161,11 @@ class _Decoder:
         )
 
     def _rows(self, name: str) -> MessageRows:
-        return self._file.rows(self._resolved.get(name, name))
+        return self._file.rows(self._name(name))
+
+    def _name(self, name: str) -> str:
+        """The name of a topic in the file."""
+        return self._resolved.get(name, name)
 
     def _states(
         self, rows: dict[str, MessageRows], ticks: int

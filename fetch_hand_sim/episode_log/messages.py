@@ -62,6 +62,10 @@ class MessageFile:
     offsets: dict[str, list[int]] = field(default_factory=dict)
     sizes: dict[str, list[int]] = field(default_factory=dict)
 
+    def count(self, topic: str) -> int:
+        """Returns the number of messages of a topic."""
+        return len(self.sizes.get(topic, ()))
+
     def rows(self, topic: str) -> MessageRows:
         """Returns the messages of a topic in the order of the file.
 

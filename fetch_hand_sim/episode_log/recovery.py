@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from mcap import records
 
@@ -16,6 +16,7 @@ from fetch_hand_sim.episode_log.errors import EpisodeLogError, EpisodeReadError
 from fetch_hand_sim.episode_log.reader import DAMAGED, read_episode
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from fetch_hand_sim.episode_log.untrusted import read_records
+from msgs_spec.schemas import deserialize
 
 
 @dataclass(slots=True)
@@ -34,7 +35,30 @@ class _Remains:
         """How the episode ended; only a file that is whole knows."""
         if self.is_whole and EPISODE_RESULT in self.metadata:
             return self.metadata[EPISODE_RESULT]
-        return {'complete': 'false', 'reason': 'cut off, recovered later'}
+        return {**self._outcome(), 'complete': 'false', 'reason': 'cut off, recovered later'}
+
+    def _outcome(self) -> dict[str, str]:
+        """Steps, return and success up to the last whole tick."""
+        # Of the topics with a number per tick, `applied_command` comes last.
+        steps = len(self._values('applied_command'))
+        rewards, successes = self._values('reward'), self._values('is_success')
+        if len(rewards) < steps or len(successes) <= steps:
+            return {}
+        return {
+            'steps': str(steps),
+            'return': repr(float(sum(rewards[:steps]))),
+            'success': str(bool(successes[steps])).lower(),
+        }
+
+    def _values(self, name: str) -> list[Any]:
+        """The `data` of all messages of a topic of std_msgs."""
+        types = {
+            id: self.schemas[channel.schema_id].name
+            for id, channel in self.channels.items()
+            if channel.topic.rpartition('/')[2] == name
+        }
+        found = [m for m in self.messages if m.channel_id in types]
+        return [deserialize(types[m.channel_id], m.data).data for m in found]
 
 
 def recover_episode(leftover: Path) -> Path:
