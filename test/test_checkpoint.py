@@ -139,9 +139,7 @@ def test_missing_or_broken_metadata_are_refused(saved: Path) -> None:
         ('task', '"FetchFly"', "was trained on unknown task 'FetchFly'"),
     ],
 )
-def test_sizes_of_another_task_are_refused(
-    saved: Path, field: str, value: str, match: str
-) -> None:
+def test_sizes_of_another_task_are_refused(saved: Path, field: str, value: str, match: str) -> None:
     rewrite(saved, **{field: value})
     assert_refused(saved, match)
 

@@ -21,7 +21,8 @@ from policy_node.training.config import (
 
 
 def test_the_paper_recipe_is_appendix_b() -> None:
-    push, block = recipe_config('FetchPush', 'paper'), recipe_config('HandManipulateBlockFull', 'paper')
+    push = recipe_config('FetchPush', 'paper')
+    block = recipe_config('HandManipulateBlockFull', 'paper')
     assert push.hidden_sizes == (256, 256, 256) and not push.layer_norm
     assert push.learning_rate == 1e-3
     assert (push.strategy, push.hindsight_k, push.reward_type) == ('future', 4, 'sparse')

@@ -68,6 +68,11 @@ class TrainConfig:
     """LayerNorm in hidden layers of actor and critic."""
     learning_rate: float = 1e-3
     """Adam step size of actor and critic."""
+    final_learning_rate: float = 1.0
+    """Share of `learning_rate` left at `total_steps`, falling linearly; 1 keeps it constant."""
+    actor_average: float = 0.0
+    """Share of an average of actor weights kept each cycle; the average is what is evaluated and
+    saved as best. 0 evaluates the actor itself."""
     gamma: float = 0.98
     """Discount; targets are clipped to [-1/(1-gamma), 0]."""
     action_l2: float = 1.0
@@ -92,9 +97,9 @@ class TrainConfig:
     overlap: bool = True
     """Collect with the actor of one cycle ago while learning; False alternates strictly."""
     simulation_threads: int = 0
-    """Threads that step simulations; 0 is one per core."""
+    """Threads that step simulations; 0 is half of the cores, all of them without `overlap`."""
     torch_threads: int = 0
-    """Threads of one tensor operation; 0 is torch's choice."""
+    """Threads of one tensor operation; 0 likewise."""
     precision: str = 'auto'
     """`float32`, `bfloat16` (autocast), or `auto`: bfloat16 where the processor has it."""
     device: str = 'auto'
@@ -138,6 +143,8 @@ _RANGES = (
     ('learning_starts', 0, _INFINITY),
     ('future_only_steps', 0, _INFINITY),
     ('learning_rate', 0, 1),
+    ('final_learning_rate', 0, 1),
+    ('actor_average', 0, 1 - 1e-6),
     ('gamma', 0, 1 - 1e-6),
     ('action_l2', 0, _INFINITY),
     ('polyak', 0, 1),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -54,6 +55,7 @@ class DDPG:
         workers.broadcast([*self._actor_parameters, *self._critic_parameters])
         self.target_actor = copy.deepcopy(self.actor.network)
         self.target_critic = copy.deepcopy(self.critic)
+        self.average_actor = copy.deepcopy(self.actor.network)
         self.actor_optimizer = self._adam(self._actor_parameters)
         self.critic_optimizer = self._adam(self._critic_parameters)
         self._bfloat16 = uses_bfloat16(config.precision, device)
@@ -76,14 +78,15 @@ class DDPG:
         return Losses(critic_loss.detach(), actor_loss.detach(), value.detach())
 
     def targets(self, reward: Tensor, next_features: Tensor) -> Tensor:
-        """Clipped one-step targets (batch,): no reward exceeds 0 and none is below -1.
+        """One-step targets (batch,), clipped to the range of returns of rewards in [-1, 0].
 
         Episodes are cut, never terminated, so every next state is bootstrapped from.
         """
         next_action = torch.tanh(self.target_actor(next_features))
         value = self.target_critic(next_features, next_action)
         lowest = -1.0 / (1.0 - self.config.gamma)
-        return (reward + self.config.gamma * value).clamp(lowest, 0.0)
+        target: Tensor = reward + self.config.gamma * value
+        return target.clamp(lowest, 0.0)
 
     def _update_critic(
         self, features: Tensor, action: Tensor, reward: Tensor, next_features: Tensor
@@ -91,7 +94,8 @@ class DDPG:
         with self._precision():
             with torch.no_grad():
                 target = self.targets(reward, next_features)
-            loss = (self.critic(features, action) - target).square().mean()
+            error: Tensor = self.critic(features, action) - target
+            loss = error.square().mean()
         self._step(self.critic_optimizer, loss, self._critic_parameters)
         return loss
 
@@ -115,9 +119,29 @@ class DDPG:
     @torch.no_grad()
     def _move_targets(self) -> None:
         weight = 1.0 - self.config.polyak
-        old = [*self.target_actor.parameters(), *self.target_critic.parameters()]
-        new = [*self._actor_parameters, *self._critic_parameters]
+        old: list[Tensor] = [*self.target_actor.parameters(), *self.target_critic.parameters()]
+        new: list[Tensor] = [*self._actor_parameters, *self._critic_parameters]
         torch._foreach_lerp_(old, new, weight)
+
+    @torch.no_grad()
+    def average(self) -> None:
+        """Moves the averaged actor towards the actor; the trainer calls it once per cycle."""
+        weight = 1.0 - self.config.actor_average
+        averaged: list[Tensor] = list(self.average_actor.parameters())
+        torch._foreach_lerp_(averaged, [*self._actor_parameters], weight)
+
+    def evaluation_actor(self) -> Actor:
+        """A copy, on the CPU, of the actor to evaluate: averaged weights, current normalisers."""
+        actor = copy.deepcopy(self.actor)
+        actor.network.load_state_dict(self.average_actor.state_dict())
+        return actor.cpu().eval()
+
+    def set_progress(self, progress: float) -> None:
+        """Sets the learning rate for a run of which the share `progress` is over."""
+        config, share = self.config, min(max(progress, 0.0), 1.0)
+        rate = config.learning_rate * (1.0 - share * (1.0 - config.final_learning_rate))
+        for optimizer in (self.actor_optimizer, self.critic_optimizer):
+            optimizer.param_groups[0]['lr'] = rate
 
     def _precision(self) -> contextlib.AbstractContextManager[None]:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16)
@@ -131,7 +155,7 @@ def uses_bfloat16(precision: str, device: torch.device) -> bool:
     if precision != 'auto':
         return precision == 'bfloat16'
     if device.type == 'cuda':
-        return torch.cuda.is_bf16_supported()
+        return bool(torch.cuda.is_bf16_supported())
     return bool(torch.cpu._is_avx512_bf16_supported())
 
 
@@ -145,6 +169,4 @@ def choose_device(name: str) -> torch.device:
         raise ValueError('device cuda: torch sees no GPU; allowed: auto, cpu')
     if name == 'cpu' or not torch.cuda.is_available():
         return torch.device('cpu')
-    import os
-
     return torch.device('cuda', int(os.environ.get('LOCAL_RANK', '0')))

@@ -100,7 +100,7 @@ def _stable_baselines3(actor: str) -> Policy:
     if algorithm is None or not hasattr(algorithm, 'load'):
         raise ValueError(f'stable_baselines3 has no algorithm {parts[1]!r}')
     # A replay buffer for hindsight would ask for its environment; predicting needs neither.
-    replay = {'replay_buffer_class': None, 'replay_buffer_kwargs': {}}
+    replay: dict[str, Any] = {'replay_buffer_class': None, 'replay_buffer_kwargs': {}}
     policy: Policy = algorithm.load(parts[2], device='cpu', custom_objects=replay)
     return policy
 

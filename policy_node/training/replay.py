@@ -35,7 +35,7 @@ class Episodes:
     @property
     def ticks(self) -> int:
         """Steps per episode."""
-        return self.action.shape[1]
+        return int(self.action.shape[1])
 
     def select(self, rows: NDArray[np.bool_]) -> Episodes:
         """Returns the episodes whose row is True."""

@@ -114,7 +114,7 @@ def _tensorboard(output: Path) -> Any:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         return None
-    return SummaryWriter(str(output / 'tensorboard'))  # type: ignore[no-untyped-call]
+    return SummaryWriter(str(output / 'tensorboard'))
 
 
 def read_progress(path: str | Path) -> list[dict[str, float]]:

@@ -34,7 +34,12 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--recipe', choices=RECIPES, default='best', help='default: best')
     add('--seed', type=int)
     add('--num-envs', type=int, help='simulations, of all workers')
-    add('--threads', type=int, dest='simulation_threads', help='simulation threads; 0: all cores')
+    add(
+        '--threads',
+        type=int,
+        dest='simulation_threads',
+        help='simulation threads; default: half of the cores',
+    )
     add('--torch-threads', type=int, help='threads of one tensor operation')
     add('--steps', type=int, dest='total_steps', help='environment steps of the run')
     add('--time-limit', type=float, help='seconds')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import os
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -36,6 +37,16 @@ LATEST_FILE = 'latest.safetensors'
 BEST_FILE = 'best.safetensors'
 
 
+def split_threads(config: TrainConfig) -> tuple[int, int]:
+    """Threads for simulations and for tensors; those left open share this worker's cores.
+
+    Both work at the same time when they overlap: more threads than cores would wait for each other.
+    """
+    cores = len(os.sched_getaffinity(0)) // int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
+    share = max(cores // 2 if config.overlap else cores, 1)
+    return config.simulation_threads or share, config.torch_threads or share
+
+
 class TrainingError(RuntimeError):
     """Training cannot go on; the message names the step and the cause."""
 
@@ -47,7 +58,7 @@ class Collected:
     episodes: Episodes
     train_success: float
     evaluation: EpisodeOutcomes | None
-    actor: Actor
+    evaluated: Actor | None
 
 
 class Trainer:
@@ -76,8 +87,8 @@ class Trainer:
         self._command = command
         self._source_revision = source_revision
         self.device = choose_device(config.device)
-        if config.torch_threads:
-            torch.set_num_threads(config.torch_threads)
+        self._simulation_threads, torch_threads = split_threads(config)
+        torch.set_num_threads(torch_threads)
         torch.manual_seed(config.seed)
         self._build_simulations()
         self._build_learner()
@@ -90,7 +101,7 @@ class Trainer:
     def _build_simulations(self) -> None:
         config, share = self.config, self.workers.share
         options: dict[str, Any] = {
-            'num_threads': config.simulation_threads,
+            'num_threads': self._simulation_threads,
             'reward_type': config.reward_type,
             'success_rule': config.success_rule,
             'control_hz': config.control_hz,
@@ -186,19 +197,20 @@ class Trainer:
                 if reason:
                     return reason
 
-    def _request(self) -> tuple[Actor, bool, bool]:
-        """What to collect next: the actor of now, whether at random, and whether to evaluate."""
+    def _request(self) -> tuple[Actor, bool, Actor | None]:
+        """What to collect next: with which actor, whether at random, and which to evaluate."""
         steps = self.counters.env_steps
-        evaluation_due = steps >= max(self._next_evaluation, 1) and self.counters.updates > 0
-        if evaluation_due:
+        actor, evaluated = copy.deepcopy(self.learner.actor).cpu().eval(), None
+        if steps >= self._next_evaluation and self.counters.updates > 0:
             self._next_evaluation = steps + self.config.evaluate_every
-        actor = copy.deepcopy(self.learner.actor).cpu().eval()
-        return actor, steps < self.config.random_steps, evaluation_due
+            if self.workers.is_first:
+                evaluated = self.learner.evaluation_actor()
+        return actor, steps < self.config.random_steps, evaluated
 
-    def _collect(self, actor: Actor, random: bool, evaluation_due: bool) -> Collected:
-        outcomes = self._evaluate(actor) if evaluation_due and self.workers.is_first else None
+    def _collect(self, actor: Actor, random: bool, evaluated: Actor | None) -> Collected:
+        outcomes = None if evaluated is None else self._evaluate(evaluated)
         episodes, success = self.collector.collect(actor, random)
-        return Collected(episodes, success, outcomes, actor)
+        return Collected(episodes, success, outcomes, evaluated)
 
     def _evaluate(self, actor: Actor) -> EpisodeOutcomes:
         def hopeless(outcomes: EpisodeOutcomes) -> bool:
@@ -234,7 +246,7 @@ class Trainer:
     def _update_normalizers(self, episodes: Episodes) -> None:
         """Adds the new episodes, goals relabelled as the networks will see them."""
         observation = episodes.observation[:, :-1]
-        goal = np.zeros((0, self.spec.goal.size))
+        goal = episodes.desired_goal
         if len(episodes):
             row = np.repeat(np.arange(len(episodes)), episodes.ticks)
             goal = sample_transitions(
@@ -258,6 +270,7 @@ class Trainer:
         held = len(self.replay) * self.spec.episode_ticks
         if self.workers.any(held < max(self.workers.share(self._learning_starts), 1)):
             return []
+        self.learner.set_progress(self.counters.env_steps / self.config.total_steps)
         mixture, episodes = self._mixture(), self.replay.episodes
         losses = []
         for _ in range(self.config.updates_per_cycle):
@@ -269,6 +282,7 @@ class Trainer:
                 self._generator,
             )
             losses.append(self.learner.update(batch))
+        self.learner.average()
         self.counters.updates = self.learner.updates
         return losses
 
@@ -286,13 +300,15 @@ class Trainer:
                 )
 
     def _keep_best(self, collected: Collected) -> None:
-        outcomes = collected.evaluation
-        if outcomes is None or len(outcomes) < self.config.evaluation_episodes:
+        """Saves the evaluated actor if it succeeds more often, or as often and sooner."""
+        outcomes, actor, counters = collected.evaluation, collected.evaluated, self.counters
+        if outcomes is None or actor is None or len(outcomes) < self.config.evaluation_episodes:
             return
         success = float(self._successes(outcomes).mean())
-        if success > self.counters.best_success:
-            self.counters.best_success = success
-            self._save_actor(BEST_FILE, collected.actor, outcomes)
+        mean_return = float(outcomes.episode_return.mean())
+        if (success, mean_return) > (counters.best_success, counters.best_return):
+            counters.best_success, counters.best_return = success, mean_return
+            self._save_actor(BEST_FILE, actor, outcomes)
 
     def _reason_to_stop(self, collected: Collected) -> str:
         config, reason = self.config, self._stop_reason

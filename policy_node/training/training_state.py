@@ -28,6 +28,7 @@ class Counters:
         updates: Gradient updates.
         seconds: Time spent, over all parts of a resumed run.
         best_success: Best evaluated success so far; -1 before the first evaluation.
+        best_return: Mean return of that evaluation.
     """
 
     env_steps: int = 0
@@ -35,6 +36,7 @@ class Counters:
     updates: int = 0
     seconds: float = 0.0
     best_success: float = -1.0
+    best_return: float = -1e9
 
 
 def save_state(
@@ -87,6 +89,10 @@ def load_state(path: Path, learner: DDPG, statistics: dict[str, RunningStatistic
         ValueError: If the file is no training state or its tensors do not fit.
     """
     tensors, metadata = _read(path)
+    if not _part(tensors, 'average_actor'):
+        # States from before there was an average start it at the actor.
+        network = _part(_part(tensors, 'actor'), 'network')
+        tensors |= {f'average_actor.{name}': value for name, value in network.items()}
     torch.set_rng_state(tensors.pop('torch_generator'))
     try:
         for part, module in _modules(learner).items():
@@ -117,6 +123,7 @@ def _modules(learner: DDPG) -> dict[str, torch.nn.Module]:
         'critic': learner.critic,
         'target_actor': learner.target_actor,
         'target_critic': learner.target_critic,
+        'average_actor': learner.average_actor,
     }
 
 
