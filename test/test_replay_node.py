@@ -31,7 +31,7 @@ from policy_node.training import generate_episodes
 REPLAY_NODE = (*SIM_NODE[:2], 'fetch_hand_sim.replay_node')
 REACH = task_spec('FetchReach')
 # Real time: a slow machine may fall 0.4 s behind, ten messages, before one is lost.
-SLOW = 1.0
+RATE = 1.0
 
 
 def finish(process, timeout=TIMEOUT):
@@ -107,7 +107,7 @@ def test_actor_on_a_replay_repeats_the_recorded_commands(start_process, tmp_path
     with client(spec) as listener:
         received = collect(listener, 'commands')
         replay = start_process(
-            *REPLAY_NODE, *ros_args(path=path, rate=SLOW, wait_for_commands=True)
+            *REPLAY_NODE, *ros_args(path=path, rate=RATE, wait_for_commands=True)
         )
         start_process(*POLICY_NODE, *ros_args(checkpoint=actor))
         # The policy also answers the last observation, after which the robot took no command.
