@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from rosbags.serde import SerdeError
 
 from fetch_hand_sim.episode_log import Episode, EpisodeReadError, episode_metadata, read_episode
 from fetch_hand_sim.episode_log.model import model_sha256
-from fetch_hand_sim.episode_log.reader import printable
+from fetch_hand_sim.episode_log.reader import UNREADABLE, one_line, printable
 from fetch_hand_sim.episode_log.ticks import LoggedTick, TickMessage, episode_task, split_ticks
 from fetch_hand_sim.episode_recorder import episode_result
 from fetch_hand_sim.episode_runner import Array, EpisodeRunner
@@ -24,8 +23,6 @@ from msgs_spec.codecs import decode
 from msgs_spec.schemas import deserialize
 from msgs_spec.tick import EpisodeStatus, TickEncoder
 from msgs_spec.topics import TopicSpec
-
-_UNREADABLE = (SerdeError, ValueError, AssertionError, IndexError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,9 +102,10 @@ class EpisodeChecker:
             runner = self._runner(episode, ticks)
             result = CheckResult(episode.path, changed=self._changes(episode, runner))
             _compare(runner, ticks, episode, result)
-        except (KeyError, *_UNREADABLE) as error:
-            text = printable(' '.join(str(error).split()) or type(error).__name__)
-            raise EpisodeReadError(f'{episode.path}: cannot be run again ({text})') from error
+        except UNREADABLE as error:
+            raise EpisodeReadError(
+                f'{episode.path}: cannot be run again ({one_line(error)})'
+            ) from error
         return result
 
     def _runner(self, episode: Episode, ticks: list[LoggedTick]) -> EpisodeRunner:
@@ -250,7 +248,7 @@ def _field_difference(topic: TopicSpec, recorded: bytes, simulated: bytes) -> tu
     """The first field in which two messages differ, and its two values."""
     try:
         first, second = (deserialize(topic.type_name, data) for data in (recorded, simulated))
-    except _UNREADABLE:
+    except UNREADABLE:
         return '', f'{len(recorded)} unreadable bytes', f'{len(simulated)} bytes'
     for (where, one), (other_where, other) in zip(_leaves(first), _leaves(second), strict=False):
         # Text shows every bit of a float64, except those of NaN.

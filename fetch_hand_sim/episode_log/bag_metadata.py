@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -57,7 +57,8 @@ class BagInfo:
         return sum(channel.message_count for channel in self.channels)
 
 
-@cache
+# Few texts differ, and those of files are anybody's.
+@lru_cache(maxsize=64)
 def _qos_profiles(text: str) -> Any:
     return yaml.safe_load(text)
 

@@ -13,6 +13,7 @@ from typing import BinaryIO
 import zstandard
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metadata, Schema
+from rosbags.serde import SerdeError
 
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
@@ -36,6 +37,9 @@ DAMAGED = (
     struct.error,
     zstandard.ZstdError,
 )
+
+# What deserialising bytes raises that are no message of their type.
+UNREADABLE = (SerdeError, AssertionError, *DAMAGED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +189,11 @@ def printable(text: str) -> str:
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
+def one_line(error: Exception) -> str:
+    """Returns what an error says in one line of bounded length."""
+    return printable(' '.join(str(error).split()) or type(error).__name__)[:_LONGEST_REASON]
+
+
 @contextmanager
 def one_line_errors(file: Path) -> Iterator[None]:
     """Says in one line what is wrong with a file, whatever noticed it."""
@@ -193,5 +202,6 @@ def one_line_errors(file: Path) -> Iterator[None]:
     except OSError as error:
         raise EpisodeReadError(f'{file}: {error.strerror or error}') from error
     except DAMAGED as error:
-        text = printable(' '.join(str(error).split()) or type(error).__name__)[:_LONGEST_REASON]
-        raise EpisodeReadError(f'{file}: truncated, damaged or no MCAP file ({text})') from error
+        raise EpisodeReadError(
+            f'{file}: truncated, damaged or no MCAP file ({one_line(error)})'
+        ) from error

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import yaml
 from mcap import records
 
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.bag_file import ChannelSpec
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT, begin_bag, complete_bag
-from fetch_hand_sim.episode_log.errors import EpisodeLogError, EpisodeReadError
-from fetch_hand_sim.episode_log.reader import DAMAGED, read_episode
+from fetch_hand_sim.episode_log.errors import EpisodeLogError
+from fetch_hand_sim.episode_log.reader import DAMAGED, UNREADABLE, one_line, read_episode
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from fetch_hand_sim.episode_log.untrusted import read_records
 from msgs_spec.schemas import deserialize
@@ -58,7 +59,10 @@ class _Remains:
             if channel.topic.rpartition('/')[2] == name
         }
         found = [m for m in self.messages if m.channel_id in types]
-        return [deserialize(types[m.channel_id], m.data).data for m in found]
+        try:
+            return [deserialize(types[m.channel_id], m.data).data for m in found]
+        except UNREADABLE:
+            return []
 
 
 def recover_episode(leftover: Path) -> Path:
@@ -89,11 +93,13 @@ def recover_episode(leftover: Path) -> Path:
                 raise EpisodeLogError(f'{leftover} is being written')
             _replace(file, _read(torn))
             durable.publish(leftover, final)
+    except EpisodeLogError:
+        raise
     except OSError as error:
         reason = error.strerror or error
         raise EpisodeLogError(f'cannot recover episode {leftover}: {reason}') from error
-    except EpisodeReadError as error:
-        raise EpisodeLogError(f'cannot recover episode {leftover}: {error}') from error
+    except (*DAMAGED, yaml.YAMLError) as error:
+        raise EpisodeLogError(f'cannot recover episode {leftover}: {one_line(error)}') from error
     return final
 
 
