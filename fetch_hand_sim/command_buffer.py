@@ -20,6 +20,8 @@ from msgs_spec.robots import RobotSpec
 
 Array = NDArray[np.float64]
 Source = Literal['rest', 'command', 'hold']
+# Characters of a received name that an error line repeats.
+_NAME_SHOWN = 40
 
 
 class CommandRejected(ValueError):
@@ -52,6 +54,12 @@ class CommandBuffer:
     """The latest valid command of one robot.
 
     Times are seconds of any steady clock.
+
+    Attributes:
+        timeout: Seconds after which the last command is replaced by holding; 0 never.
+        accepted: Valid commands so far.
+        rejected: Others, by reason.
+        last_rejection: Why the last command was rejected; empty if it was not.
     """
 
     def __init__(self, robot: RobotSpec, timeout: float) -> None:
@@ -66,6 +74,7 @@ class CommandBuffer:
         self.timeout = timeout
         self.accepted = 0
         self.rejected: Counter[str] = Counter()
+        self.last_rejection = ''
         self._resting = np.zeros(robot.action_size)
         self._command: Array | None = None
         self._received_at = 0.0
@@ -108,8 +117,7 @@ class CommandBuffer:
 
         Raises:
             CommandRejected: If names and positions do not match, a name is unknown or given twice,
-            or a
-                value is not finite; the buffer is unchanged.
+                or a value is not finite; the buffer is unchanged.
         """
         values = np.asarray(positions, dtype=np.float64).ravel()
         if len(names) != values.size:
@@ -121,7 +129,7 @@ class CommandBuffer:
         if unknown:
             self._reject(
                 'unknown joint',
-                f'joint command dropped: unknown joint {unknown[0]!r}; allowed: '
+                f'joint command dropped: unknown joint {unknown[0][:_NAME_SHOWN]!r}; allowed: '
                 f'{", ".join(self._names)}',
             )
         if len(set(names)) != len(names):
@@ -160,7 +168,9 @@ class CommandBuffer:
         self._received_at = now
         self._is_fresh = True
         self.accepted += 1
+        self.last_rejection = ''
 
     def _reject(self, reason: str, message: str) -> None:
         self.rejected[reason] += 1
+        self.last_rejection = message
         raise CommandRejected(reason, message)

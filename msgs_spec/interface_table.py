@@ -17,7 +17,7 @@ from msgs_spec.robots import FETCH, FINGERTIPS, SHADOW_HAND, CommandPart
 from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS, GoalKind, TaskSpec, VectorPart
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import TopicSpec, topics
+from msgs_spec.topics import MONITORING, TopicSpec, topics
 
 _PREFIX = 'robot0:'
 START, END = '<!-- interface table -->', '<!-- /interface table -->'
@@ -102,7 +102,9 @@ def _topic_table(direction: str) -> str:
     for task in TASKS.values():
         for spec in topics(task):
             tasks.setdefault(spec, []).append(task)
-    ordered = sorted(tasks, key=lambda spec: _topic_names().index(spec.name))
+    names = _topic_names()
+    ordered = [*sorted(tasks, key=lambda spec: names.index(spec.name)), *MONITORING]
+    tasks |= {spec: list(TASKS.values()) for spec in MONITORING}
     return _table(
         ('topic', 'type', 'tasks', 'values', 'unit', 'frame', 'QoS', 'content'),
         (

@@ -56,6 +56,17 @@ class ParameterSpec:
 
 _LARGEST_SEED = 2**32 - 1
 
+_SMALLEST_FACTOR = 0.01
+
+
+def _check_real_time_factor(value: float) -> None:
+    """Raises ValueError for what is too slow to be told from a robot that hangs."""
+    if 0.0 < value < _SMALLEST_FACTOR:
+        raise ValueError(
+            f'real_time_factor: {value!r} given; allowed: 0 or {_SMALLEST_FACTOR:g} ... 1000'
+        )
+
+
 SIM_NODE = (
     ParameterSpec('task', 'string', 'FetchReach', 'Task to run.', choices=tuple(TASKS)),
     ParameterSpec(
@@ -112,6 +123,7 @@ SIM_NODE = (
         lower=0.0,
         upper=1000.0,
         read_only=False,
+        check=_check_real_time_factor,
     ),
     ParameterSpec(
         'command_timeout',
@@ -127,6 +139,12 @@ SIM_NODE = (
         'bool',
         False,
         'Whether the first episode waits until somebody publishes commands.',
+    ),
+    ParameterSpec(
+        'publish_clock',
+        'bool',
+        True,
+        'Whether to publish /clock; one robot per graph should.',
     ),
     ParameterSpec(
         'episode_dir',
@@ -147,7 +165,7 @@ POLICY_NODE = (
         'checkpoint',
         'string',
         '',
-        'Actor file (.safetensors), random or resting; empty takes the actor shipped for the task.',
+        'Actor file (.safetensors, .onnx, .zip), random or resting; empty takes the shipped actor.',
     ),
     ParameterSpec(
         'task',

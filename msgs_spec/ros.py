@@ -13,9 +13,12 @@ from typing import TYPE_CHECKING, Any
 from msgs_spec.parameters import ParameterSpec, descriptor, validate
 
 if TYPE_CHECKING:
+    from rclpy.executors import Executor
     from rclpy.node import Node
 
 EXIT_SUCCESS, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
+# Seconds between looks at what no callback announces: signals, the graph.
+BEAT = 0.1
 
 
 class UsageError(Exception):
@@ -30,6 +33,56 @@ def ros_message_class(type_name: str) -> Any:
     """Returns rclpy's class of a message type such as `sensor_msgs/msg/JointState`."""
     package, kind, name = type_name.split('/')
     return getattr(import_module(f'{package}.{kind}'), name)
+
+
+def ros_service_class(type_name: str) -> Any:
+    """Returns rclpy's class of a service type such as `std_srvs/srv/Trigger`."""
+    return ros_message_class(type_name)
+
+
+class EventLoop:
+    """Serves the callbacks of one node, from the thread that owns it.
+
+    rclpy's EventsExecutor costs half of the wait-set one per message. It is used through
+    `spin_once` alone, because its `spin` serves nothing in some builds. Releases before 7.1.4 lack
+    it.
+    """
+
+    def __init__(self, node: Node) -> None:
+        """Takes the node."""
+        self._node = node
+        self._executor, self._is_queue = _make_executor()
+        self._executor.add_node(node)
+
+    def wait(self, seconds: float) -> None:
+        """Serves one callback, or none within that time."""
+        self._executor.spin_once(timeout_sec=seconds)
+
+    def serve_pending(self) -> None:
+        """Serves what has been waiting, not what arrives meanwhile."""
+        if not self._is_queue:
+            self._executor.spin_once(timeout_sec=0.0)
+            return
+        # First in, first out: the mark comes last of what is there.
+        reached: list[bool] = []
+        self._executor.create_task(lambda: reached.append(True))
+        while not reached:
+            self._executor.spin_once(timeout_sec=0.0)
+
+    def close(self) -> None:
+        """Gives the node back."""
+        self._executor.remove_node(self._node)
+
+
+def _make_executor() -> tuple[Executor, bool]:
+    """Returns an executor and whether it serves a queue in order."""
+    try:
+        from rclpy.experimental.events_executor import EventsExecutor
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor(), False
+    return EventsExecutor(), True
 
 
 def declare_parameters(node: Node, specs: Sequence[ParameterSpec]) -> dict[str, Any]:
@@ -89,12 +142,13 @@ def run_node(name: str, run: Callable[[StopSignals], None], args: list[str] | No
         0 for a normal end, also by signal; 2 for bad usage; 1 for a failure. Errors of both kinds
         are one line on stderr.
     """
+    # First of all: what follows takes long enough for people to change their mind.
+    stop = StopSignals()
+    keep_discovery_local()
     import rclpy
     from rclpy.exceptions import ROSInterruptException
     from rclpy.signals import SignalHandlerOptions
 
-    keep_discovery_local()
-    stop = StopSignals()
     try:
         _refuse_plain_arguments(sys.argv[1:] if args is None else args)
         _initialise(rclpy.init, args, SignalHandlerOptions.NO)
@@ -108,7 +162,7 @@ def run_node(name: str, run: Callable[[StopSignals], None], args: list[str] | No
     except ROSInterruptException:
         return EXIT_SUCCESS
     finally:
-        rclpy.try_shutdown()  # type: ignore[attr-defined]
+        rclpy.try_shutdown()
     return EXIT_SUCCESS
 
 

@@ -26,7 +26,7 @@ RESET = ServiceSpec(
     '~/reset',
     'std_srvs/srv/Trigger',
     'sim_node',
-    'Ends the running episode and starts the next one.',
+    'Ends the running episode; the next tick starts another.',
 )
 PAUSE = ServiceSpec(
     '~/pause',
@@ -38,6 +38,26 @@ STEP = ServiceSpec(
     '~/step',
     'std_srvs/srv/Trigger',
     'sim_node',
-    'Runs one tick; only while paused.',
+    'Runs one tick now; while paused, or in lockstep.',
 )
-SERVICES = (RESET, PAUSE, STEP)
+STANDARD_SERVICES = (RESET, PAUSE, STEP)
+
+
+def _interface(name: str, type_name: str, description: str) -> ServiceSpec:
+    return ServiceSpec(name, f'simulation_interfaces/srv/{type_name}', 'sim_node', description)
+
+
+# Offered where the package simulation_interfaces is installed; PyPI does not have it.
+GET_FEATURES = _interface(
+    '~/get_simulator_features', 'GetSimulatorFeatures', 'Lists the features below.'
+)
+GET_STATE = _interface('~/get_simulation_state', 'GetSimulationState', 'Playing or paused.')
+SET_STATE = _interface('~/set_simulation_state', 'SetSimulationState', 'As `~/pause`.')
+RESET_SIMULATION = _interface(
+    '~/reset_simulation', 'ResetSimulation', 'As `~/reset`; time is never set back.'
+)
+STEP_SIMULATION = _interface(
+    '~/step_simulation', 'StepSimulation', 'Runs the given number of ticks; while paused.'
+)
+INTERFACE_SERVICES = (GET_FEATURES, GET_STATE, SET_STATE, RESET_SIMULATION, STEP_SIMULATION)
+SERVICES = (*STANDARD_SERVICES, *INTERFACE_SERVICES)

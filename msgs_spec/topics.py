@@ -200,6 +200,21 @@ def _command_topics(task: TaskSpec) -> list[TopicSpec]:
     return specs
 
 
+# Wall-clock content, of both nodes or of `sim_node`: no part of a tick and never logged.
+DIAGNOSTICS = _published(
+    '/diagnostics',
+    'diagnostic_msgs/msg/DiagnosticArray',
+    'Health of `sim_node` and of `policy_node`, 1 Hz wall time; not logged.',
+)
+REAL_TIME_FACTOR = _published(
+    'real_time_factor',
+    'std_msgs/msg/Float64',
+    'Achieved in the last second, 1 Hz wall time; not logged.',
+    (VectorPart('real_time_factor', 1, ''),),
+)
+MONITORING = (DIAGNOSTICS, REAL_TIME_FACTOR)
+
+
 @cache
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Returns all topics of a task.

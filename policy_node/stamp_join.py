@@ -56,6 +56,11 @@ class StampJoin:
             self.dropped += 1
         return None
 
+    def forget(self) -> None:
+        """Begins again: whatever stamp comes next is the first."""
+        self._last = None
+        self._pending.clear()
+
     def _complete(self, stamp: int) -> None:
         self._last = stamp
         incomplete = [other for other in self._pending if other < stamp]
@@ -66,5 +71,4 @@ class StampJoin:
     def _forget_if_restarted(self, stamp: int) -> None:
         """A stamp more than a second back is no late message but a simulation started anew."""
         if self._last is not None and self._last - stamp > 1_000_000_000:
-            self._last = None
-            self._pending.clear()
+            self.forget()

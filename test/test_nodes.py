@@ -291,9 +291,11 @@ def test_pause_step_and_reset(start_process: Start) -> None:
         assert robot.call(Trigger, 'sim_node/step').success
         robot.spin(0.4)
         assert len(robot.received['joint_states']) == count + 1
+        episode = robot.statuses()[-1].episode
         assert robot.call(Trigger, 'sim_node/reset').success
         assert robot.call(SetBool, 'sim_node/pause', data=False).success
-        robot.spin_until(lambda: robot.statuses()[-1].episode == 1, 'the next episode')
+        robot.spin_until(lambda: robot.statuses()[-1].episode > episode, 'the next episode')
+        assert robot.statuses()[-1].tick == 0
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

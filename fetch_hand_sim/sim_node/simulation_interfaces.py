@@ -1,0 +1,91 @@
+"""The services of `simulation_interfaces`, translated to what a `Robot` offers.
+
+That package belongs to ROS and is not on PyPI, so nothing of it is imported: requests and responses
+come from rclpy, and the list of features from its `SimulatorFeatures`. Constants are those of
+release 2.0.0.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fetch_hand_sim.sim_node.robot import Answer, Robot
+
+PLAYING, PAUSED = 1, 2
+SCOPE_DEFAULT, SCOPE_STATE = 0, 2
+FEATURE_UNSUPPORTED, OK, OPERATION_FAILED = 0, 1, 4
+ALREADY_IN_TARGET_STATE = 101
+
+# Older releases lack some of these and number the others differently.
+FEATURES = (
+    'SIMULATION_RESET',
+    'SIMULATION_RESET_STATE',
+    'SIMULATION_STATE_GETTING',
+    'SIMULATION_STATE_SETTING',
+    'SIMULATION_STATE_PAUSE',
+    'STEP_SIMULATION_SINGLE',
+    'STEP_SIMULATION_MULTIPLE',
+)
+
+
+class SimulationInterfaces:
+    """One method per service, with the signature of rclpy's service callbacks."""
+
+    def __init__(self, robot: Robot, simulator_features: Any) -> None:
+        """Connects.
+
+        Args:
+            robot: What is controlled.
+            simulator_features: The class `simulation_interfaces.msg.SimulatorFeatures`.
+        """
+        self._robot = robot
+        found = (getattr(simulator_features, name, None) for name in FEATURES)
+        self._features = [value for value in found if value is not None]
+
+    def get_simulator_features(self, request: Any, response: Any) -> Any:
+        """Lists what is supported."""
+        del request
+        response.features.features = self._features
+        response.features.custom_info = 'One fixed scene; time never goes back, also over resets.'
+        return response
+
+    def get_simulation_state(self, request: Any, response: Any) -> Any:
+        """Playing or paused; a robot in lockstep that waits for a command plays."""
+        del request
+        response.state.state = PAUSED if self._robot.schedule.is_paused else PLAYING
+        return _finish(response, OK, '')
+
+    def set_simulation_state(self, request: Any, response: Any) -> Any:
+        """Pauses or goes on."""
+        target = request.state.state
+        if target not in (PLAYING, PAUSED):
+            line = f'state {target} asked for; allowed: {PLAYING} (playing), {PAUSED} (paused)'
+            return _finish(response, FEATURE_UNSUPPORTED, line)
+        is_there = self._robot.schedule.is_paused == (target == PAUSED)
+        answer = self._robot.pause(target == PAUSED)
+        return _finish(response, ALREADY_IN_TARGET_STATE if is_there else OK, answer.message)
+
+    def reset_simulation(self, request: Any, response: Any) -> Any:
+        """Ends the episode; the scene is the state, and time is never set back."""
+        if request.scope not in (SCOPE_DEFAULT, SCOPE_STATE):
+            line = f'scope {request.scope} asked for; allowed: {SCOPE_DEFAULT} (default), '
+            line += f'{SCOPE_STATE} (state): time never goes back and nothing is spawned'
+            return _finish(response, FEATURE_UNSUPPORTED, line)
+        return _answer(response, self._robot.reset())
+
+    def step_simulation(self, request: Any, response: Any) -> Any:
+        """Runs the given number of ticks, which are control periods, while paused."""
+        if not self._robot.schedule.is_paused:
+            line = 'a simulation is stepped only while it is paused'
+            return _finish(response, OPERATION_FAILED, line)
+        return _answer(response, self._robot.step(int(request.steps)))
+
+
+def _answer(response: Any, answer: Answer) -> Any:
+    return _finish(response, OK if answer.success else OPERATION_FAILED, answer.message)
+
+
+def _finish(response: Any, result: int, message: str) -> Any:
+    response.result.result = result
+    response.result.error_message = message
+    return response

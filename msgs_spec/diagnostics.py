@@ -1,0 +1,123 @@
+"""What nodes say about themselves on `/diagnostics`, and the statistics behind it.
+
+Wall-clock content: it is never logged with an episode, whose bytes depend on seed and commands
+only.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+
+from msgs_spec.schemas import message_class, serialize
+from msgs_spec.topics import DIAGNOSTICS
+
+REPORT_PERIOD = 1.0
+
+
+class Level(IntEnum):
+    """The levels of `diagnostic_msgs/DiagnosticStatus`."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass(slots=True)
+class Report:
+    """One status: facts as key/value pairs, and what is wrong among them.
+
+    Attributes:
+        name: Who reports, fully qualified.
+        hardware_id: What is reported on.
+        values: The facts.
+        summary: The message where nothing is wrong.
+    """
+
+    name: str
+    hardware_id: str
+    values: Mapping[str, str]
+    summary: str
+    problems: list[tuple[Level, str]] = field(default_factory=list)
+
+    def warn(self, problem: str) -> None:
+        """Adds what hinders but does not stop."""
+        self.problems.append((Level.WARN, problem))
+
+    def fail(self, problem: str) -> None:
+        """Adds what makes the results wrong or lost."""
+        self.problems.append((Level.ERROR, problem))
+
+    @property
+    def level(self) -> Level:
+        """The worst of the problems."""
+        return max((level for level, _ in self.problems), default=Level.OK)
+
+    @property
+    def message(self) -> str:
+        """All problems, the worst first, or the summary."""
+        ranked = sorted(self.problems, key=lambda problem: -problem[0])
+        return '; '.join(text for _, text in ranked) or self.summary
+
+
+def encode_reports(stamp_ns: int, reports: Sequence[Report]) -> bytes:
+    """Returns the CDR bytes of a DiagnosticArray.
+
+    Args:
+        stamp_ns: Wall time, nanoseconds, as REP 107 has it.
+        reports: Its statuses.
+    """
+    pair = message_class('diagnostic_msgs/msg/KeyValue')
+    status = message_class('diagnostic_msgs/msg/DiagnosticStatus')
+    seconds, nanoseconds = divmod(stamp_ns, 10**9)
+    stamp = message_class('builtin_interfaces/msg/Time')(sec=seconds, nanosec=nanoseconds)
+    statuses = [
+        status(
+            level=int(report.level),
+            name=report.name,
+            message=report.message,
+            hardware_id=report.hardware_id,
+            values=[pair(key=key, value=value) for key, value in report.values.items()],
+        )
+        for report in reports
+    ]
+    header = message_class('std_msgs/msg/Header')(stamp=stamp, frame_id='')
+    array = message_class(DIAGNOSTICS.type_name)(header=header, status=statuses)
+    return serialize(DIAGNOSTICS.type_name, array)
+
+
+class Durations:
+    """The latest durations of something that happens again and again."""
+
+    def __init__(self, size: int = 1000) -> None:
+        """Keeps the last `size` of them."""
+        self._values: deque[float] = deque(maxlen=size)
+
+    def add(self, seconds: float) -> None:
+        """Notes one."""
+        self._values.append(seconds)
+
+    def milliseconds(self) -> dict[str, str]:
+        """Returns median, 99th percentile and maximum as text; `-` while there are none."""
+        names = ('p50', 'p99', 'max')
+        if not self._values:
+            return dict.fromkeys(names, '-')
+        figures = 1e3 * np.percentile(self._values, (50.0, 99.0, 100.0))
+        return {name: f'{figure:.3f}' for name, figure in zip(names, figures, strict=True)}
+
+
+class Increase:
+    """How much a counter has grown between two looks."""
+
+    def __init__(self) -> None:
+        """Starts at zero."""
+        self._before = 0.0
+
+    def since(self, value: float) -> float:
+        """Returns the growth since the last call."""
+        grown, self._before = value - self._before, value
+        return grown

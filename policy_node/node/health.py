@@ -1,0 +1,95 @@
+"""What `policy_node` reports about itself once a second."""
+
+from __future__ import annotations
+
+from msgs_spec.diagnostics import Increase, Report
+from msgs_spec.tick import EpisodeStatus
+from policy_node.commander import Commander
+from policy_node.node.responder import Responder
+
+# Seconds without a complete observation after which the report says so.
+_SILENCE = 1.0
+
+
+class Health:
+    """Turns the counters of a responder into reports."""
+
+    def __init__(self, name: str) -> None:
+        """Starts without a robot.
+
+        Args:
+            name: Fully qualified name of the node.
+        """
+        self._name = name
+        self._commander: Commander | None = None
+        self._responder: Responder | None = None
+        self._tick_duration = 0.0
+        self._answered, self._dropped, self._unusable = Increase(), Increase(), Increase()
+        self._then: float | None = None
+        self._said: set[str] = set()
+
+    def start(self, commander: Commander, responder: Responder, status: EpisodeStatus) -> None:
+        """Takes the robot that was found."""
+        self._commander, self._responder = commander, responder
+        self._tick_duration = 1.0 / status.control_hz
+
+    def report(self, now: float, robots: int) -> Report:
+        """Closes a period and reports on it.
+
+        Args:
+            now: Seconds of the responder's clock.
+            robots: How many publish `episode_status`.
+        """
+        if self._commander is None or self._responder is None:
+            report = Report(self._name, '', {'robots': str(robots)}, 'waits for a robot')
+        else:
+            report = self._report(self._commander, self._responder, now, robots)
+        if robots > 1:
+            report.warn(f'{robots} robots publish here; give each a namespace')
+        return report
+
+    def news(self, report: Report) -> list[str]:
+        """What the last report found wrong and the one before did not, without figures."""
+        kinds = {text.partition(':')[0]: text for _, text in report.problems}
+        fresh = [text for kind, text in kinds.items() if kind not in self._said]
+        self._said = set(kinds)
+        return fresh
+
+    def _report(
+        self, commander: Commander, responder: Responder, now: float, robots: int
+    ) -> Report:
+        seconds = now - self._then if self._then is not None else 0.0
+        self._then = now
+        answered = self._answered.since(responder.answered)
+        rate = answered / seconds if seconds else 0.0
+        age = None if responder.received_at is None else now - responder.received_at
+        inference = responder.inference.milliseconds()
+        values = {
+            'robots': str(robots),
+            'commander': commander.description,
+            'checkpoint sha256': commander.sha256,
+            'commands': str(responder.answered),
+            'rate (Hz)': f'{rate:.2f}',
+            **{f'inference {name} (ms)': value for name, value in inference.items()},
+            'incomplete ticks dropped': str(responder.join.dropped),
+            'unusable messages': str(responder.unusable),
+            'observation age (s)': '-' if age is None else f'{age:.3f}',
+        }
+        task = commander.spec.name
+        report = Report(self._name, task, values, f'{task}: {rate:.1f} commands per second')
+        dropped = self._dropped.since(responder.join.dropped)
+        if dropped:
+            report.warn(f'incomplete ticks: {dropped:.0f} dropped')
+        unusable = self._unusable.since(responder.unusable)
+        if unusable:
+            report.warn(f'unusable messages: {unusable:.0f}')
+        if inference['p50'] != '-' and float(inference['p50']) > 1e3 * self._tick_duration:
+            report.warn(
+                f'slow inference: {inference["p50"]} ms, a tick is '
+                f'{1e3 * self._tick_duration:.1f} ms; commands come late'
+            )
+        if robots == 0:
+            report.warn('no robot publishes episode_status')
+        elif age is not None and age > _SILENCE:
+            report.warn(f'no state: the last one is {age:.0f} s old')
+        return report
