@@ -31,12 +31,18 @@ def reserve_domain() -> tuple[int, socket.socket]:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds what `make twin` turns up."""
+    """Adds what `make twin` and `make torture` turn up."""
     parser.addoption(
         '--twin-seeds',
         type=int,
         default=2,
         help='seeds per task in the comparison with Gymnasium-Robotics (default: 2)',
+    )
+    parser.addoption(
+        '--hostile-messages',
+        type=int,
+        default=2000,
+        help='random messages per hostile test; `make torture` sends 100,000 (default: 2000)',
     )
 
 
@@ -61,6 +67,12 @@ def pytest_configure(config: pytest.Config) -> None:
 def twin_seeds(pytestconfig: pytest.Config) -> range:
     """The seeds of the comparison with Gymnasium-Robotics."""
     return range(pytestconfig.getoption('--twin-seeds'))
+
+
+@pytest.fixture(scope='session')
+def hostile_count(pytestconfig: pytest.Config) -> int:
+    """How many random messages a hostile test sends."""
+    return int(pytestconfig.getoption('--hostile-messages'))
 
 
 @pytest.fixture

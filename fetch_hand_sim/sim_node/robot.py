@@ -20,6 +20,8 @@ Messages = list[tuple[TopicSpec, bytes]]
 
 # A call that steps blocks the robot; this many ticks take the slowest task a few seconds.
 MAX_STEPS = 1000
+# Goals beyond, in metres, would overflow in distances and rewards sooner or later.
+FARTHEST_GOAL = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +159,7 @@ class Robot:
         try:
             if self.runner.is_between_episodes:
                 raise ValueError('no episode is running')
-            self.runner.set_goal(read())
+            self.runner.set_goal(_within_reach(read()))
         except ValueError:
             self.counters.goals_rejected += 1
             raise
@@ -208,3 +210,11 @@ class Robot:
     def set_real_time_factor(self, factor: float) -> None:
         """Changes the pace from now on."""
         self.schedule.set_real_time_factor(factor, self._clock())
+
+
+def _within_reach(goal: NDArray[np.float64]) -> NDArray[np.float64]:
+    beyond = np.abs(goal) > FARTHEST_GOAL
+    if beyond.any():
+        allowed = f'-{FARTHEST_GOAL:g} ... {FARTHEST_GOAL:g}'
+        raise ValueError(f'{goal[beyond][0]:g} given; allowed: {allowed}')
+    return goal
