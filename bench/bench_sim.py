@@ -1,0 +1,242 @@
+"""Environment steps per second of all thirteen tasks, side by side in one run (`make bench-sim`).
+
+Measured are this project, EnvPool, Gymnasium-Robotics (one process with one environment; or one
+process per environment in an `AsyncVectorEnv`) and, as the limit, MuJoCo's batch alone: on the
+model as published, and as tuned by this project. All play whole episodes of random actions in
+turns, so that a disturbance of the machine hits all alike; ratios are medians over the turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import venv
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from msgs_spec.tasks import TASKS  # noqa: E402
+
+PEERS = ROOT / '.venv-bench'
+RESULTS = ROOT / 'bench' / 'results'
+NUM_ENVS = 64
+OURS = 'this_project'
+IMPLEMENTATIONS = (OURS, 'bare_physics', 'tuned_physics', 'envpool', 'gymnasium_robotics')
+IN_PEERS_ENVIRONMENT = ('envpool', 'gymnasium_robotics')
+COLUMNS = ('task', 'threads', *IMPLEMENTATIONS, *(f'ratio_{name}' for name in IMPLEMENTATIONS[1:]))
+# Steps per second with the resets between the episodes; the physics alone has none.
+RESET_COLUMNS = (f'{OURS}_with_resets', 'envpool_with_resets', 'ratio_envpool_with_resets')
+
+
+def create_peers_environment() -> None:
+    """Installs the peers into an environment of their own."""
+    python = PEERS / 'bin' / 'python'
+    if not python.exists():
+        venv.create(PEERS, with_pip=True)
+    requirements = ROOT / 'bench' / 'requirements.txt'
+    subprocess.run([python, '-m', 'pip', 'install', '-q', '-r', requirements], check=True)
+
+
+class Worker:
+    """A process that plays episodes of one implementation on request."""
+
+    def __init__(self, implementation: str, task: str, threads: int, path: Path) -> None:
+        """Starts the process and waits until it is ready."""
+        python = PEERS / 'bin' / 'python' if implementation in IN_PEERS_ENVIRONMENT else None
+        arguments = [implementation, task, TASKS[task].reference_id, NUM_ENVS, threads, path]
+        # -O: Gymnasium-Robotics 1.4.2 stops at an assertion on this MuJoCo.
+        command = [python or sys.executable, '-O', ROOT / 'bench' / 'sim_worker.py', *arguments]
+        environment = {'PYTHONPATH': str(ROOT)} if python is None else {'PYTHONPATH': ''}
+        self._process = subprocess.Popen(
+            [str(part) for part in command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env=os.environ | environment | {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'},
+        )
+        self._answer()
+
+    def play_episode(self) -> dict[str, float]:
+        """Plays one episode in all simulations."""
+        assert self._process.stdin is not None
+        self._process.stdin.write('\n')
+        self._process.stdin.flush()
+        return self._answer()
+
+    def close(self) -> None:
+        """Ends the process."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _answer(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            arguments = self._process.args
+            raise SystemExit(f'a worker stopped; start it by hand to see why: {arguments}')
+        return json.loads(line)
+
+
+@contextmanager
+def workers_of(task: str, threads: int) -> Iterator[dict[str, Worker]]:
+    """All implementations of a task, ready to play."""
+    with ExitStack() as stack:
+        path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / 'episode.npz'
+        workers = {}
+        for name in IMPLEMENTATIONS:
+            workers[name] = Worker(name, task, threads, path)
+            stack.callback(workers[name].close)
+        yield workers
+
+
+def measure(task: str, threads: int, turns: int) -> dict[str, Any]:
+    """One row of the table."""
+    played: dict[str, list[dict[str, float]]] = {name: [] for name in IMPLEMENTATIONS}
+    with workers_of(task, threads) as workers:
+        for worker in workers.values():
+            worker.play_episode()
+        for _ in range(turns):
+            for name, worker in workers.items():
+                played[name].append(worker.play_episode())
+    speeds = {name: [t['steps'] / t['seconds'] for t in times] for name, times in played.items()}
+    whole = {
+        name: [t['steps'] / (t['seconds'] + t['reset_seconds']) for t in times]
+        for name, times in played.items()
+    }
+    row: dict[str, Any] = {'task': task, 'threads': threads}
+    row |= {name: statistics.median(values) for name, values in speeds.items()}
+    row |= {
+        f'ratio_{name}': _median_ratio(speeds[OURS], speeds[name]) for name in IMPLEMENTATIONS[1:]
+    }
+    row |= {f'{name}_with_resets': statistics.median(whole[name]) for name in (OURS, 'envpool')}
+    row['ratio_envpool_with_resets'] = _median_ratio(whole[OURS], whole['envpool'])
+    return row
+
+
+def _median_ratio(ours: list[float], theirs: list[float]) -> float:
+    return statistics.median(a / b for a, b in zip(ours, theirs, strict=True))
+
+
+def describe_machine() -> str:
+    """What the numbers were measured on, one line."""
+    models = [
+        line.split(':')[1].strip()
+        for line in Path('/proc/cpuinfo').read_text().splitlines()
+        if line.startswith('model name')
+    ]
+    parts = [
+        models[0] if models else platform.machine(),
+        f'{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start',
+        *(f'{name} {importlib.metadata.version(name)}' for name in ('mujoco', 'numpy')),
+        'EnvPool 1.2.5, Gymnasium-Robotics 1.4.2',
+        f'{NUM_ENVS} simulations',
+        f'{datetime.date.today()}',
+    ]
+    return ', '.join(parts)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The results as a Markdown table."""
+    header = (
+        "| task | threads | this project | of the published model's physics | "
+        'of the tuned physics | EnvPool | x | with resets x | Gymnasium-Robotics | x |'
+    )
+    lines = [header, '|---|' + '---:|' * 9]
+    for row in rows:
+        lines.append(
+            f'| {row["task"]} | {row["threads"]} | {row[OURS]:,.0f} | '
+            f'{row["ratio_bare_physics"]:.0%} | {row["ratio_tuned_physics"]:.0%} | '
+            f'{row["envpool"]:,.0f} | {row["ratio_envpool"]:.2f} | '
+            f'{row["ratio_envpool_with_resets"]:.2f} | '
+            f'{row["gymnasium_robotics"]:,.0f} | {row["ratio_gymnasium_robotics"]:.1f} |'
+        )
+    for threads in sorted({row['threads'] for row in rows}):
+        part = [row for row in rows if row['threads'] == threads]
+        means = [
+            statistics.geometric_mean(row[f'ratio_{name}'] for row in part)
+            for name in ('bare_physics', 'tuned_physics', 'envpool', 'envpool_with_resets')
+        ]
+        robotics = statistics.geometric_mean(row['ratio_gymnasium_robotics'] for row in part)
+        lines.append(
+            f'| *geometric mean* | {threads} | | {means[0]:.0%} | {means[1]:.0%} | | '
+            f'{means[2]:.2f} | {means[3]:.2f} | | {robotics:.1f} |'
+        )
+    return '\n'.join(lines)
+
+
+def plot(rows: list[dict[str, Any]], path: Path, title: str) -> None:
+    """Bars per task, one panel per number of threads."""
+    import matplotlib
+
+    matplotlib.use('Agg')
+    from matplotlib import pyplot
+
+    threads = sorted({row['threads'] for row in rows})
+    figure, axes = pyplot.subplots(len(threads), 1, figsize=(12, 4.5 * len(threads)), squeeze=False)
+    for axis, number in zip(axes[:, 0], threads, strict=True):
+        part = [row for row in rows if row['threads'] == number]
+        for index, name in enumerate(IMPLEMENTATIONS):
+            places = [place + 0.16 * (index - 2) for place in range(len(part))]
+            label = name.replace('_', ' ')
+            axis.bar(places, [row[name] for row in part], width=0.16, label=label)
+        labels = [row['task'].replace('HandManipulate', 'Hand ') for row in part]
+        axis.set_xticks(range(len(part)), labels, rotation=25, ha='right')
+        axis.set_ylabel('environment steps per second')
+        axis.set_title(f'{number} thread{"s" if number > 1 else ""}')
+    axes[0, 0].legend()
+    figure.suptitle(title, fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--tasks', nargs='+', choices=list(TASKS), default=list(TASKS))
+    parser.add_argument('--threads', nargs='+', type=int, default=[1, os.cpu_count() or 1])
+    parser.add_argument('--turns', type=int, default=3, help='episodes per implementation')
+    parser.add_argument('--output', type=Path, default=RESULTS, help='directory of CSV and PNG')
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Measures, prints the table, writes CSV and PNG."""
+    arguments = parse_arguments()
+    machine = describe_machine()
+    create_peers_environment()
+    rows = []
+    for threads in dict.fromkeys(arguments.threads):
+        for task in arguments.tasks:
+            rows.append(measure(task, threads, arguments.turns))
+            print(table(rows[-1:]).splitlines()[2], flush=True)
+    print(f'\n{machine}\n\n{table(rows)}')
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    with open(arguments.output / 'bench_sim.csv', 'w', newline='') as file:
+        file.write(f'# {machine}\n')
+        writer = csv.DictWriter(file, [*COLUMNS, *RESET_COLUMNS])
+        writer.writeheader()
+        writer.writerows(rows)
+    plot(rows, arguments.output / 'bench_sim.png', machine)
+
+
+if __name__ == '__main__':
+    main()
