@@ -92,11 +92,3 @@ def test_the_same_seeds_give_the_same_episodes_in_any_thread() -> None:
     with ThreadPoolExecutor(1) as executor:
         there, _ = executor.submit(make_collector().collect, make_actor()).result()
     assert_equal(here, there)
-
-
-def test_state_continues_the_noise() -> None:
-    first, second = make_collector(), make_collector()
-    first.collect(make_actor())
-    second.collect(make_actor(), random=True)
-    second.load_state(first.state())
-    assert_equal(first.collect(make_actor())[0], second.collect(make_actor())[0])

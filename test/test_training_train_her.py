@@ -145,8 +145,11 @@ def test_a_training_state_restores_everything(tmp_path: Path) -> None:
     first = Trainer(config, tmp_path, Workers())
     first.train()
     second = Trainer(dataclasses.replace(config, seed=9), tmp_path, Workers())
+    fresh = second.collector.collect(second.learner.actor)[0]
     second.resume(tmp_path / 'training_state.safetensors')
     assert second.counters == first.counters
+    resumed = second.collector.collect(second.learner.actor)[0]
+    assert (resumed.desired_goal != fresh.desired_goal).all(), 'episodes would come twice'
     second.save()
     tensors = weights(tmp_path / 'training_state.safetensors')
     assert any(name.startswith('critic_optimizer.0.exp_avg') for name in tensors)

@@ -93,11 +93,3 @@ class Collector:
         noisy = np.clip(action + noise, -1.0, 1.0)
         replaced = self._generator.random(shape[0]) < self.random_epsilon
         return np.where(replaced[:, None], uniform, noisy)
-
-    def state(self) -> dict[str, Any]:
-        """Generator state, for a checkpoint."""
-        return dict(self._generator.bit_generator.state)
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Continues from a state that `state` returned."""
-        self._generator.bit_generator.state = state

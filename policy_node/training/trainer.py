@@ -28,7 +28,7 @@ from policy_node.training.hindsight import goal_mixture, sample_transitions
 from policy_node.training.normalizer import RunningStatistics
 from policy_node.training.replay import EpisodeReplay, Episodes
 from policy_node.training.run_log import RunLog
-from policy_node.training.training_state import Counters, load_state, read_extra, save_state
+from policy_node.training.training_state import Counters, load_state, save_state
 
 # Seeds of evaluation episodes start here; those of training runs stay far below.
 EVALUATION_SEED = 1_000_000_000
@@ -112,11 +112,18 @@ class Trainer:
         count = min(num_envs, config.evaluation_episodes)
         self._evaluation = Simulation(config.task, num_envs=count, **options)
         self.spec = self.simulation.spec
-        seeds = np.random.SeedSequence([config.seed, self.workers.rank])
+        self._seed(env_steps=0)
+
+    def _seed(self, env_steps: int) -> None:
+        """Seeds resets, exploration and sampling of this worker from `env_steps` on."""
+        config = self.config
+        seeds = np.random.SeedSequence([config.seed, self.workers.rank, env_steps])
         collector_seeds, sampler_seed = seeds.spawn(2)
+        # Below the seeds of evaluation, whose episodes must stay unseen.
+        resets = collector_seeds.generate_state(self.simulation.num_envs) >> 2
         self.collector = Collector(
             self.simulation,
-            [int(seed) >> 2 for seed in collector_seeds.generate_state(num_envs)],
+            [int(seed) % EVALUATION_SEED for seed in resets],
             config.noise_std,
             config.random_epsilon,
         )
@@ -156,11 +163,9 @@ class Trainer:
         Raises:
             ValueError: If the file does not fit the configuration.
         """
-        extra = read_extra(path)
         self.counters = load_state(path, self.learner, self.statistics)
-        if self.workers.world_size == 1:
-            self.collector.load_state(extra['collector_generator'])
-            self._generator.bit_generator.state = extra['sampler_generator']
+        # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
+        self._seed(self.counters.env_steps)
         refill = min(self.counters.env_steps, self.config.replay_transitions, 100_000)
         self._learning_starts = max(self._learning_starts, refill)
         self._next_evaluation = self.counters.env_steps + self.config.evaluate_every
@@ -331,11 +336,7 @@ class Trainer:
         if not self.workers.is_first:
             return
         self._save_actor(LATEST_FILE, self.learner.actor, None)
-        extra = {
-            'config': dataclasses.asdict(self.config),
-            'collector_generator': self.collector.state(),
-            'sampler_generator': self._generator.bit_generator.state,
-        }
+        extra = {'config': dataclasses.asdict(self.config)}
         path = self.output / STATE_FILE
         save_state(path, self.learner, self.statistics, self.counters, extra)
 
