@@ -28,7 +28,8 @@ class QosSpec:
 # reliable one serves both kinds.
 STATE = QosSpec(depth=10, reliability='reliable', durability='volatile')
 LATCHED = QosSpec(depth=1, reliability='reliable', durability='transient_local')
-COMMAND = QosSpec(depth=1, reliability='reliable', durability='volatile')
+# Named joint commands add up, and a rejected one is to be counted, so none may push another out.
+COMMAND = QosSpec(depth=10, reliability='reliable', durability='volatile')
 CLOCK = QosSpec(depth=1, reliability='reliable', durability='volatile')
 
 

@@ -17,7 +17,7 @@ from msgs_spec.qos import rclpy_profile
 from msgs_spec.ros import ros_message_class
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import topic, topics
+from msgs_spec.topics import MONITORING, TopicSpec, topic, topics
 
 SIM_NODE = (sys.executable, '-m', 'fetch_hand_sim.sim_node')
 POLICY_NODE = (sys.executable, '-m', 'policy_node.node')
@@ -47,7 +47,7 @@ class Client:
 
     def subscribe(self, *names: str) -> None:
         for name in names or [s.name for s in topics(self.spec) if s.direction == 'published']:
-            source = topic(self.spec, name)
+            source = self._topic(name)
             self.node.create_subscription(
                 ros_message_class(source.type_name),
                 name,
@@ -98,6 +98,10 @@ class Client:
     def close(self) -> None:
         self._executor.remove_node(self.node)
         self.node.destroy_node()
+
+    def _topic(self, name: str) -> TopicSpec:
+        monitoring = {spec.name: spec for spec in MONITORING}
+        return monitoring[name] if name in monitoring else topic(self.spec, name)
 
     def _collector(self, name: str) -> Callable[[Any], None]:
         def collect(message: Any) -> None:
