@@ -25,9 +25,9 @@ Array = NDArray[np.float64]
 
 def _norm(difference: Array) -> Array:
     """Euclidean norm over the last axis, summed in a fixed order whatever the memory layout."""
-    parts = np.ascontiguousarray(np.moveaxis(difference, -1, 0))
-    total = np.zeros(parts.shape[1:])
-    for part in parts:
+    total = np.zeros(difference.shape[:-1])
+    for index in range(difference.shape[-1]):
+        part = difference[..., index]
         total = total + part * part
     return np.asarray(np.sqrt(total))
 

@@ -31,11 +31,11 @@ Seeds = int | Sequence[Seed] | None
 
 _LOGGER = logging.getLogger(__name__)
 # MuJoCo warnings after which it has thrown the state away.
-_DIVERGENCE = [
+_DIVERGENCE = (
     mjtWarning.mjWARN_BADQPOS.value,
     mjtWarning.mjWARN_BADQVEL.value,
     mjtWarning.mjWARN_BADQACC.value,
-]
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +247,8 @@ class Simulation:
     def _count_warnings(self) -> NDArray[np.int64]:
         """How often MuJoCo has given each simulation up, (N,)."""
         # The last axis of `Batch.warning` is (last info, number).
-        return np.asarray(self._task.batch.warning[:, _DIVERGENCE, 1].sum(axis=1))
+        first, second, third = (self._task.batch.warning[:, kind, 1] for kind in _DIVERGENCE)
+        return np.asarray(first + second + third)
 
     def _restart(self, diverged: NDArray[np.bool_]) -> None:
         ids = np.flatnonzero(diverged)

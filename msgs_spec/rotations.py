@@ -30,8 +30,8 @@ def xyzw_to_wxyz(quaternion: ArrayLike) -> Array:
 
 def _parts(array: ArrayLike) -> list[Any]:
     """The components along the last axis, each a contiguous array."""
-    values = np.moveaxis(np.asarray(array, dtype=np.float64), -1, 0)
-    return [np.array(part, order='C') for part in values]
+    values = np.asarray(array, dtype=np.float64)
+    return [np.array(values[..., index], order='C') for index in range(values.shape[-1])]
 
 
 def quaternion_multiply(first: ArrayLike, second: ArrayLike) -> Array:

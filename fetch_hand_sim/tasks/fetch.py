@@ -216,11 +216,14 @@ class FetchTask(Task):
         return controls
 
     def step(self) -> None:
-        """Advances one tick; a blocked gripper is shut again, with a forward pass."""
+        """Advances one tick; a blocked gripper is shut again, with a forward pass.
+
+        Of the pass only positions are ever read; these models have no actuators, so no efforts.
+        """
         super().step()
         if self.config.block_gripper:
             self._qpos[:, self._fingers] = 0.0
-            self.batch.forward()
+            self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
 
     def observe(self) -> tuple[Array, Array]:
         """Returns the observations (N, 10 or 25) and achieved goals (N, 3)."""
@@ -306,7 +309,14 @@ class _SiteReader:
         """
         spatial = (self._cdof[:, self._dofs] * self._qvel[:, self._dofs, None]).sum(axis=1)
         angular, linear = spatial[:, :3], spatial[:, 3:]
-        return linear + np.cross(angular, self._position - self._center), angular
+        return linear + _cross(angular, self._position - self._center), angular
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """`np.cross` of (N, 3) arrays with the same bits, in a fraction of its time."""
+    product = first[:, [1, 2, 0]] * second[:, [2, 0, 1]]
+    product -= first[:, [2, 0, 1]] * second[:, [1, 2, 0]]
+    return product
 
 
 def _chain_dofs(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
