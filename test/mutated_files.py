@@ -97,7 +97,7 @@ class Mutator:
     def oversize_a_record(self) -> bytes:
         data = bytearray(self.whole)
         offset = int(self.random.choice(self.records))
-        struct.pack_into('<Q', data, offset + 1, int(self.random.choice(LENGTHS, 1)[0]))
+        struct.pack_into('<Q', data, offset + 1, LENGTHS[int(self.random.integers(len(LENGTHS)))])
         return bytes(data)
 
     def oversize_inside(self) -> bytes:

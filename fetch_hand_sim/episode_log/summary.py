@@ -132,8 +132,10 @@ def expand_episodes(path: Path) -> list[Path]:
     """Returns the path itself if it is an episode or no directory, else the episodes in it.
 
     Raises:
-        EpisodeReadError: If it is a directory that cannot be read.
+        EpisodeReadError: If it does not exist, or is a directory that cannot be read.
     """
+    if not path.exists():
+        raise EpisodeReadError(f'{path}: No such file or directory')
     if not path.is_dir() or (path / 'metadata.yaml').exists():
         return [path]
     return find_episodes(path)
