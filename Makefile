@@ -5,7 +5,7 @@ TASK ?= FetchReach
 EPISODES ?= 5
 
 PACKAGES := msgs_spec fetch_hand_sim policy_node
-PYTHON_FILES := $(PACKAGES) test tools setup.py
+PYTHON_FILES := $(PACKAGES) bench test tools setup.py
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.complete
 
@@ -52,7 +52,7 @@ twin: env
 	$(BIN)/python -m pytest --twin-seeds 20 --timeout 0 test/test_twin.py
 
 bench-sim: env
-	$(BIN)/python -m fetch_hand_sim.benchmark
+	$(BIN)/python bench/bench_sim.py
 
 bench-her: env
 	$(BIN)/python -m policy_node.training.benchmark_stable_baselines3
