@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from policy_node.training.config import (
     parse_assignment,
     recipe_config,
 )
+from policy_node.training.trainer import split_threads
 
 
 def test_the_paper_recipe_is_appendix_b() -> None:
@@ -102,3 +104,14 @@ def test_an_unknown_recipe_or_stored_field_is_refused() -> None:
     stored = dataclasses.asdict(recipe_config('FetchPush', 'best'))
     with pytest.raises(ValueError, match='unknown configuration fields: colour'):
         config_from_dict({**stored, 'colour': 1})
+
+
+def test_threads_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda _: set(range(8)), raising=False)
+    small = recipe_config('FetchPush', 'best', batch_size=1024)
+    assert split_threads(small) == (7, 1)
+    assert split_threads(dataclasses.replace(small, batch_size=4096)) == (4, 4)
+    assert split_threads(dataclasses.replace(small, overlap=False)) == (8, 1)
+    assert split_threads(dataclasses.replace(small, simulation_threads=2)) == (2, 1)
+    monkeypatch.setenv('LOCAL_WORLD_SIZE', '16')
+    assert split_threads(small) == (1, 1)

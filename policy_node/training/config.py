@@ -97,9 +97,9 @@ class TrainConfig:
     overlap: bool = True
     """Collect with the actor of one cycle ago while learning; False alternates strictly."""
     simulation_threads: int = 0
-    """Threads that step simulations; 0 is half of the cores, all of them without `overlap`."""
+    """Threads that step simulations; 0 is the cores that tensors leave."""
     torch_threads: int = 0
-    """Threads of one tensor operation; 0 likewise."""
+    """Threads of one tensor operation; 0 is 1 up to batches of 1024, then half of the cores."""
     precision: str = 'auto'
     """`float32`, `bfloat16` (autocast), or `auto`: bfloat16 where the processor has it."""
     device: str = 'auto'

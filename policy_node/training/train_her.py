@@ -38,7 +38,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         '--threads',
         type=int,
         dest='simulation_threads',
-        help='simulation threads; default: half of the cores',
+        help='simulation threads; default: what tensors leave',
     )
     add('--torch-threads', type=int, help='threads of one tensor operation')
     add('--steps', type=int, dest='total_steps', help='environment steps of the run')
