@@ -3,6 +3,7 @@
 VENV ?= .venv
 TASK ?= FetchReach
 EPISODES ?= 5
+SECONDS ?= 60
 
 PACKAGES := msgs_spec fetch_hand_sim policy_node
 PYTHON_FILES := $(PACKAGES) bench test tools setup.py
@@ -13,7 +14,7 @@ STAMP := $(VENV)/.complete
 # not leak in.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo test lint format twin bench-sim bench-her clean distclean
+.PHONY: help env demo test lint format twin bench-sim bench-her bench-lockstep bench-rate torture clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -23,6 +24,9 @@ help:
 	@echo 'make twin       the long comparison with Gymnasium-Robotics, 20 seeds per task'
 	@echo 'make bench-sim  simulation speed against its peers'
 	@echo 'make bench-her  training speed against Stable-Baselines3'
+	@echo 'make bench-lockstep  ticks per second of two nodes against the limit of the middleware'
+	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
+	@echo 'make torture    100,000 hostile messages per test, and an hour of memory at 20x'
 	@echo 'make env        only create $(VENV)'
 	@echo 'make clean      remove build products; distclean removes $(VENV) too'
 
@@ -56,6 +60,16 @@ bench-sim: env
 
 bench-her: env
 	$(BIN)/python -m policy_node.training.benchmark_stable_baselines3
+
+bench-lockstep: env
+	$(BIN)/python bench/bench_lockstep.py
+
+bench-rate: env
+	$(BIN)/python bench/bench_rate.py --seconds $(SECONDS)
+
+torture: env
+	$(BIN)/python -m pytest --hostile-messages 100000 --soak-seconds 3600 --timeout 0 \
+		test/test_robot.py test/test_responder.py test/test_nodes_hostile.py
 
 clean:
 	rm -rf build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache

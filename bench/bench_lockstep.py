@@ -1,0 +1,222 @@
+"""Lockstep ticks per second of two processes, beside the limit of the middleware.
+
+`make bench-lockstep` starts `sim_node` and `policy_node` in lockstep and reads their tick counter
+from `/diagnostics`. In turns with them it runs a bare ping-pong in two processes: one steps MuJoCo
+20 times and publishes the bytes of the same topics, the other answers the last of them with the
+bytes of a command. Both use raw messages and rclpy's EventsExecutor, so nothing in rclpy is faster.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+import rclpy  # noqa: E402
+
+from fetch_hand_sim.episode_runner import EpisodeRunner  # noqa: E402
+from fetch_hand_sim.simulation import Simulation  # noqa: E402
+from msgs_spec.cdr import TopicEncoder  # noqa: E402
+from msgs_spec.codecs import decode_status  # noqa: E402
+from msgs_spec.observations import ObservationAssembler  # noqa: E402
+from msgs_spec.qos import STATE, rclpy_profile  # noqa: E402
+from msgs_spec.ros import EventLoop, keep_discovery_local, ros_message_class  # noqa: E402
+from msgs_spec.tasks import TASKS, TaskSpec, task_spec  # noqa: E402
+from msgs_spec.tick import TickEncoder  # noqa: E402
+from msgs_spec.topics import DIAGNOSTICS, topic, topics  # noqa: E402
+
+SUBSTEPS = 20
+TIMEOUT = 60.0
+
+
+def observed(spec: TaskSpec) -> list[str]:
+    """The topics a policy needs, in the order they are published."""
+    names = {source.name for source in ObservationAssembler(spec, 25.0).topics}
+    return [source.name for source in topics(spec) if source.name in names]
+
+
+def echo(spec: TaskSpec) -> None:
+    """The other half of the ping-pong: answers the last topic of each tick; runs until killed."""
+    rclpy.init()
+    node = rclpy.create_node('echo')
+    commands = topic(spec, 'commands')
+    publisher = node.create_publisher(
+        ros_message_class(commands.type_name), 'commands', rclpy_profile(commands.qos)
+    )
+    command = TopicEncoder(commands).encode(0, np.zeros(commands.size))
+    *others, last = observed(spec)
+    for name in (*others, last):
+        node.create_subscription(
+            ros_message_class(topic(spec, name).type_name),
+            name,
+            (lambda data: publisher.publish(command)) if name == last else (lambda data: None),
+            rclpy_profile(STATE),
+            raw=True,
+        )
+    loop = EventLoop(node)
+    while True:
+        loop.wait(1.0)
+
+
+def start(*command: object) -> subprocess.Popen[bytes]:
+    """Starts Python with these arguments."""
+    return subprocess.Popen([sys.executable, *map(str, command)], cwd=ROOT)
+
+
+def wait_until(loop: EventLoop, condition: Any, what: str) -> None:
+    """Serves callbacks until a condition holds."""
+    end = time.monotonic() + TIMEOUT
+    while not condition():
+        if time.monotonic() > end:
+            raise SystemExit(f'bench_lockstep: no {what} within {TIMEOUT:g} s')
+        loop.wait(0.05)
+
+
+class Limit:
+    """The ping-pong: ticks per second of `mj_step` and messages alone."""
+
+    def __init__(self, spec: TaskSpec) -> None:
+        simulation = Simulation(spec.name, num_threads=1)
+        runner = EpisodeRunner(simulation)
+        runner.advance(runner.resting_command())
+        self._spec = spec
+        self._messages = TickEncoder(spec).encode(runner.advance(runner.resting_command()))
+        self._model, self._data = simulation.model, mujoco.MjData(simulation.model)
+        mujoco.mj_step(self._model, self._data, 500)
+
+    def measure(self, seconds: float) -> float:
+        """Ticks per second of one run."""
+        node = rclpy.create_node('ping')
+        loop = EventLoop(node)
+        answers = [0]
+
+        def on_command(data: bytes) -> None:
+            answers[0] += 1
+
+        commands = topic(self._spec, 'commands')
+        node.create_subscription(
+            ros_message_class(commands.type_name),
+            'commands',
+            on_command,
+            rclpy_profile(commands.qos),
+            raw=True,
+        )
+        publishers = {
+            source.name: node.create_publisher(
+                ros_message_class(source.type_name), source.name, rclpy_profile(source.qos)
+            )
+            for source, _ in self._messages
+        }
+        other = start(Path(__file__), '--task', self._spec.name, '--echo')
+        try:
+            needed = [publishers[name] for name in observed(self._spec)]
+            wait_until(loop, lambda: all(p.get_subscription_count() for p in needed), 'echo')
+            wait_until(loop, lambda: node.count_publishers('commands') > 0, 'echo')
+            time.sleep(0.5)
+            return self._ping(loop, publishers, answers, seconds)
+        finally:
+            other.kill()
+            other.wait()
+            loop.close()
+            node.destroy_node()
+
+    def _ping(
+        self, loop: EventLoop, publishers: dict[str, Any], answers: list[int], seconds: float
+    ) -> float:
+        began, ticks = time.perf_counter(), 0
+        while (elapsed := time.perf_counter() - began) < seconds:
+            mujoco.mj_step(self._model, self._data, SUBSTEPS)
+            for source, data in self._messages:
+                publishers[source.name].publish(data)
+            ticks += 1
+            while answers[0] < ticks:
+                loop.wait(1.0)
+        return ticks / elapsed
+
+
+def measure_nodes(spec: TaskSpec, checkpoint: str, seconds: float) -> float:
+    """Ticks per second of the two nodes, from the tick counter they publish."""
+    node = rclpy.create_node('watcher')
+    loop = EventLoop(node)
+    counts: list[tuple[float, int]] = []
+
+    def on_report(message: Any) -> None:
+        values = decode_status(message)
+        if 'ticks' in values:
+            counts.append((time.perf_counter(), int(values['ticks'])))
+
+    node.create_subscription(
+        ros_message_class(DIAGNOSTICS.type_name),
+        DIAGNOSTICS.name,
+        on_report,
+        rclpy_profile(DIAGNOSTICS.qos),
+    )
+    sim = ['-p', f'task:={spec.name}', '-p', 'mode:=lockstep', '-p', 'wait_for_commands:=true']
+    policy = ['--ros-args', '-p', f'checkpoint:={checkpoint}'] if checkpoint else []
+    processes = [
+        start('-m', 'fetch_hand_sim.sim_node', '--ros-args', *sim),
+        start('-m', 'policy_node.node', *policy),
+    ]
+    try:
+        wait_until(loop, lambda: counts and counts[-1][1] > 100, 'ticks')
+        counts.clear()
+        end = time.perf_counter() + seconds + 1.0
+        while time.perf_counter() < end:
+            loop.wait(0.1)
+    finally:
+        for process in processes:
+            process.send_signal(signal.SIGINT)
+        for process in processes:
+            process.wait()
+        loop.close()
+        node.destroy_node()
+    (began, first), (ended, last) = counts[0], counts[-1]
+    return (last - first) / (ended - began)
+
+
+def main() -> int:
+    """Measures in turns and prints the medians."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--task', default='FetchPush', choices=tuple(TASKS))
+    parser.add_argument('--checkpoint', default='', help="actor, 'random'; default: the shipped")
+    parser.add_argument('--seconds', type=float, default=5.0, help='per measurement')
+    parser.add_argument('--turns', type=int, default=3)
+    parser.add_argument('--echo', action='store_true', help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    spec = task_spec(options.task)
+    keep_discovery_local()
+    if options.echo:
+        echo(spec)
+    rclpy.init()
+    load = os.getloadavg()[0]
+    limit = Limit(spec)
+    nodes, limits = [], []
+    for _ in range(options.turns):
+        limits.append(limit.measure(options.seconds))
+        nodes.append(measure_nodes(spec, options.checkpoint, options.seconds))
+        print(f'nodes {nodes[-1]:.0f}, limit {limits[-1]:.0f} ticks per second', flush=True)
+    rclpy.shutdown()
+    ours, bare = statistics.median(nodes), statistics.median(limits)
+    print(
+        f'{spec.name}, {options.checkpoint or "shipped actor"}: {ours:.0f} ticks per second, '
+        f'{ours / 25.0:.1f} x real time, {ours / bare:.0%} of the limit {bare:.0f} '
+        f'(goals: 12 x, 70 %); {platform.machine()}, {os.cpu_count()} CPUs, '
+        f'load average {load:.1f} before'
+    )
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""The rate of `joint_states` in real time, as an independent subscriber sees it (`make bench-rate`).
+
+Measured on the machine as it is, then with every CPU kept busy by a process of its own. Late ticks
+are those `sim_node` counts itself, read from `/diagnostics`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import numpy as np  # noqa: E402
+import rclpy  # noqa: E402
+
+from msgs_spec.codecs import decode_status  # noqa: E402
+from msgs_spec.qos import rclpy_profile  # noqa: E402
+from msgs_spec.ros import EventLoop, keep_discovery_local, ros_message_class  # noqa: E402
+from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
+from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic  # noqa: E402
+
+
+class Watcher:
+    """Notes when joint states arrive and what the robot says of missed ticks."""
+
+    def __init__(self, joint_states: TopicSpec) -> None:
+        self.times: list[float] = []
+        self.missed = 0
+        self._node = rclpy.create_node('watcher')
+        for spec, callback in ((joint_states, self._on_state), (DIAGNOSTICS, self._on_report)):
+            self._node.create_subscription(
+                ros_message_class(spec.type_name),
+                spec.name,
+                callback,
+                rclpy_profile(spec.qos),
+                raw=spec is joint_states,
+            )
+        self._loop = EventLoop(self._node)
+
+    def watch(self, seconds: float) -> None:
+        """Serves callbacks for this long."""
+        end = time.perf_counter() + seconds
+        while (left := end - time.perf_counter()) > 0.0:
+            self._loop.wait(min(left, 0.1))
+
+    def wait_for_ticks(self, timeout: float = 60.0) -> None:
+        """Waits until the robot is heard."""
+        end = time.perf_counter() + timeout
+        while len(self.times) < 25:
+            if time.perf_counter() > end:
+                raise SystemExit(f'bench_rate: no joint_states within {timeout:g} s')
+            self._loop.wait(0.1)
+
+    def _on_state(self, data: bytes) -> None:
+        self.times.append(time.perf_counter())
+
+    def _on_report(self, message: Any) -> None:
+        self.missed = int(decode_status(message).get('missed ticks', self.missed))
+
+
+def report(label: str, times: list[float], missed: int, factor: float) -> None:
+    """Prints the figures of one measurement."""
+    periods = 1e3 * np.diff(times)
+    wanted = 40.0 / factor
+    late = np.abs(periods - wanted)
+    print(
+        f'{label}: {len(periods)} periods, {1e3 / periods.mean():.3f} Hz, std '
+        f'{periods.std():.3f} ms, |period - {wanted:g} ms| median {np.median(late):.3f}, p99 '
+        f'{np.percentile(late, 99):.3f}, max {late.max():.3f} ms; {missed} ticks missed; '
+        f'load average {os.getloadavg()[0]:.1f}',
+        flush=True,
+    )
+
+
+def main() -> int:
+    """Measures twice and prints both."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--task', default='FetchPush', choices=tuple(TASKS))
+    parser.add_argument('--seconds', type=float, default=60.0, help='per measurement')
+    parser.add_argument('--real-time-factor', type=float, default=1.0)
+    parser.add_argument('--busy', type=int, default=os.cpu_count(), help='busy processes; 0: none')
+    options = parser.parse_args()
+    keep_discovery_local()
+    rclpy.init()
+    watcher = Watcher(topic(task_spec(options.task), 'joint_states'))
+    parameters = [f'task:={options.task}', f'real_time_factor:={options.real_time_factor}']
+    words = [word for parameter in parameters for word in ('-p', parameter)]
+    command = [sys.executable, '-m', 'fetch_hand_sim.sim_node', '--ros-args', *words]
+    sim = subprocess.Popen(command, cwd=ROOT)
+    busy: list[subprocess.Popen[bytes]] = []
+    print(f'{options.task} on {platform.machine()}, {os.cpu_count()} CPUs')
+    try:
+        watcher.wait_for_ticks()
+        for count in (0, options.busy) if options.busy else (0,):
+            busy += [
+                subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(count)
+            ]
+            watcher.watch(2.0)
+            watcher.times.clear()
+            before = watcher.missed
+            watcher.watch(options.seconds)
+            label = f'{count} busy processes' if count else 'machine as it is'
+            times, missed = list(watcher.times), watcher.missed - before
+            report(label, times, missed, options.real_time_factor)
+    finally:
+        for process in busy:
+            process.kill()
+        sim.send_signal(signal.SIGINT)
+        code = sim.wait()
+    rclpy.shutdown()
+    return code
+
+
+if __name__ == '__main__':
+    sys.exit(main())
