@@ -14,7 +14,7 @@ STAMP := $(VENV)/.complete
 # not leak in.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo test lint format twin bench-sim bench-her bench-lockstep bench-rate torture clean distclean
+.PHONY: help env demo test lint format twin bench-sim bench-her bench-lockstep bench-rate torture clean distclean torture bench-episodes
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -27,6 +27,8 @@ help:
 	@echo 'make bench-lockstep  ticks per second of two nodes against the limit of the middleware'
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
 	@echo 'make torture    100,000 hostile messages per test, and an hour of memory at 20x'
+	@echo 'make torture    200 killed writers and 10,000 damaged episode files'
+	@echo 'make bench-episodes  what logging costs and how fast logs load'
 	@echo 'make env        only create $(VENV)'
 	@echo 'make clean      remove build products; distclean removes $(VENV) too'
 
@@ -59,7 +61,8 @@ bench-sim: env
 	$(BIN)/python bench/bench_sim.py
 
 bench-her: env
-	$(BIN)/python -m policy_node.training.benchmark_stable_baselines3
+	$(BIN)/python -m pip install -q -r bench/requirements_her.txt
+	$(BIN)/python bench/bench_her.py
 
 bench-lockstep: env
 	$(BIN)/python bench/bench_lockstep.py
@@ -70,6 +73,14 @@ bench-rate: env
 torture: env
 	$(BIN)/python -m pytest --hostile-messages 100000 --soak-seconds 3600 --timeout 0 \
 		test/test_robot.py test/test_responder.py test/test_nodes_hostile.py
+
+torture: env
+	EPISODE_KILLS=200 EPISODE_MUTATIONS=10000 $(BIN)/python -m pytest --timeout 0 -s \
+	    test/test_episode_endings.py test/test_episode_untrusted.py
+
+bench-episodes: env
+	$(BIN)/python bench/bench_load.py
+	$(BIN)/python bench/bench_episode_log.py
 
 clean:
 	rm -rf build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache
