@@ -218,6 +218,9 @@ def _best(task: str) -> dict[str, Any]:
         'total_steps': 1_500_000,
         'replay_transitions': 3_000_000,
     }
+    if task == 'FetchPush':
+        push = {'gamma': 0.98, 'batch_size': 512, 'updates_per_cycle': 160, 'action_l2': 0.5}
+        return values | push
     if task == 'FetchSlide':
         # The object is out of reach after the hit: a longer horizon and goals as they are set.
         slide = {'strategy': 'futureactual', 'gamma': 0.98, 'batch_size': 1024, 'action_l2': 0.1}

@@ -41,7 +41,7 @@ def split_threads(config: TrainConfig) -> tuple[int, int]:
     """Threads for simulations and for tensors; those left open are chosen from this worker's cores.
 
     Both work at the same time when they overlap: more threads than cores would wait for each other.
-    A second tensor thread gains 5 % at 3 x 256 and batch 1024, and 80 % at 4096 (measured, 4 cores).
+    A second tensor thread gains 5 % at 3 x 256 and batch 1024, 80 % at 4096 (measured, 4 cores).
     """
     local_workers = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
     cores = max(len(os.sched_getaffinity(0)) // local_workers, 1)
