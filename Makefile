@@ -14,7 +14,7 @@ STAMP := $(VENV)/.complete
 # not leak in.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo test lint format twin bench-sim bench-her bench-lockstep bench-rate torture clean distclean torture bench-episodes
+.PHONY: help env demo test lint format twin bench-sim bench-her bench-lockstep bench-rate bench-episodes torture clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -26,8 +26,8 @@ help:
 	@echo 'make bench-her  training speed against Stable-Baselines3'
 	@echo 'make bench-lockstep  ticks per second of two nodes against the limit of the middleware'
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
-	@echo 'make torture    100,000 hostile messages per test, and an hour of memory at 20x'
-	@echo 'make torture    200 killed writers and 10,000 damaged episode files'
+	@echo 'make torture    100,000 hostile messages per test, an hour of memory at 20x, 200 killed'
+	@echo '                writers and 10,000 damaged episode files'
 	@echo 'make bench-episodes  what logging costs and how fast logs load'
 	@echo 'make env        only create $(VENV)'
 	@echo 'make clean      remove build products; distclean removes $(VENV) too'
@@ -73,10 +73,8 @@ bench-rate: env
 torture: env
 	$(BIN)/python -m pytest --hostile-messages 100000 --soak-seconds 3600 --timeout 0 \
 		test/test_robot.py test/test_responder.py test/test_nodes_hostile.py
-
-torture: env
 	EPISODE_KILLS=200 EPISODE_MUTATIONS=10000 $(BIN)/python -m pytest --timeout 0 -s \
-	    test/test_episode_endings.py test/test_episode_untrusted.py
+		test/test_episode_endings.py test/test_episode_untrusted.py
 
 bench-episodes: env
 	$(BIN)/python bench/bench_load.py

@@ -43,6 +43,7 @@ setup(
     install_requires=[
         'gymnasium>=1.0',
         'gymnasium-robotics~=1.4.2',
+        'lz4>=4',
         'mcap>=1.5',
         'mujoco~=4.0',
         'numpy>=1.26',
@@ -57,8 +58,10 @@ setup(
         # ROS 2 Jazzy itself, for a machine without it.
         'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
         'train': ['matplotlib', 'tensorboard'],
+        # `export_episodes`.
+        'export': ['minari>=0.5.3', 'pyarrow>=18'],
         'test': TEST,
-        'dev': [*TEST, 'mypy', 'ruff', 'types-PyYAML'],
+        'dev': [*TEST, 'mypy', 'pymcap-cli', 'ruff', 'types-PyYAML'],
     },
     entry_points={
         'console_scripts': [

@@ -20,8 +20,8 @@ from fetch_hand_sim.episode_recorder import LoggedEpisode, episode_result
 from fetch_hand_sim.episode_runner import FIRST_STAMP_NS, robot_readings
 from fetch_hand_sim.recording_context import RecordingContext
 from fetch_hand_sim.simulation import Observation, Simulation
+from msgs_spec.cdr import TopicEncoder
 from msgs_spec.commands import clip_command, command_from_action
-from msgs_spec.schemas import message_class, serialize
 from msgs_spec.tick import EpisodeStatus, Phase, Tick, TickEncoder
 from msgs_spec.topics import topic
 
@@ -68,6 +68,7 @@ class EpisodeGenerator:
         self._context = context
         self._encoder = TickEncoder(simulation.spec)
         self._commands = topic(simulation.spec, 'commands')
+        self._command_encoder = TopicEncoder(self._commands)
         self._period_ns = round(simulation.tick_duration * 1e9)
 
     def generate(self, episodes: int, first_seed: int = 0) -> Iterator[LoggedEpisode]:
@@ -153,13 +154,10 @@ class EpisodeGenerator:
 
     def _receive(self, robots: Sequence[_Robot], commands: Array) -> None:
         """Notes the command that each robot got after its last tick, as `policy_node` sends it."""
-        layout = message_class('std_msgs/msg/MultiArrayLayout')(dim=[], data_offset=0)
         for robot, command in zip(robots, commands, strict=False):
             if not robot.is_finished:
-                message = message_class(self._commands.type_name)(layout=layout, data=command)
                 stamp_ns, messages, _ = robot.messages[-1]
-                data = serialize(self._commands.type_name, message)
-                robot.messages[-1] = (stamp_ns, messages, data)
+                robot.messages[-1] = (stamp_ns, messages, self._command_encoder.encode(0, command))
 
     def _status(self, robot: _Robot, phase: Phase, is_success: bool) -> EpisodeStatus:
         metric = self._simulation.metric

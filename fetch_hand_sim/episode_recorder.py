@@ -1,22 +1,28 @@
 """Logs the ticks of a running robot, episode by episode, without holding the robot up.
 
-The messages of a tick are written as they come, microseconds each. Completing a file waits for the
-disk, so that is done by a worker thread while the next episode runs. A disk that fails stops
-logging, never the robot.
+The messages of a tick are written as they come, microseconds each. Beginning a file takes
+milliseconds and completing one waits for the disk, so both are done by a worker thread. A disk that
+fails stops logging, never the robot.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Semaphore
 
 from fetch_hand_sim.episode_log import Attachment, EpisodeDirectory, EpisodeLogError, EpisodeWriter
 from msgs_spec.tick import EpisodeStatus, Tick
 from msgs_spec.topics import TopicSpec
 
 Messages = Sequence[tuple[TopicSpec, bytes]]
+
+# Files that may wait for the disk, minutes of a robot in real time.
+_MAX_UNFINISHED = 64
+# Seconds after which a disk with so many files waiting counts as dead.
+_LONGEST_STALL = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +38,33 @@ class LoggedEpisode:
     status: EpisodeStatus
     path: Path
     is_complete: bool
+
+
+class _EpisodeInProgress:
+    """An episode whose file is being opened by the worker, or is open."""
+
+    def __init__(self, opening: Future[EpisodeWriter]) -> None:
+        self.status: EpisodeStatus | None = None
+        self._opening = opening
+        self._waiting: list[Callable[[EpisodeWriter], object]] = []
+
+    def write(self, write: Callable[[EpisodeWriter], object]) -> None:
+        """Writes now if the file is open, else as soon as it is.
+
+        Raises:
+            EpisodeLogError: If it could not be opened, or at the first error of the disk.
+        """
+        self._waiting.append(write)
+        if self._opening.done():
+            self.opened()
+
+    def opened(self) -> EpisodeWriter:
+        """Waits for the file, writes what waited for it and returns it; likewise."""
+        writer = self._opening.result()
+        waiting, self._waiting = self._waiting, []
+        for write in waiting:
+            write(writer)
+        return writer
 
 
 class EpisodeRecorder:
@@ -53,10 +86,10 @@ class EpisodeRecorder:
             directory: Where episodes are collected.
             namespace: ROS namespace of relative topic names.
             attachments: Files stored with every episode.
-            metadata: Makes the metadata of an episode from the status of its first tick.
-            on_error: Called once, with one line, when the disk fails; may be called by the worker
-            thread.
-            on_logged: Called for every completed file, likewise.
+            metadata: Makes the metadata of an episode from the status of its first tick; called by
+                the worker.
+            on_error: Called once, with one line, when the disk fails; may be called by the worker.
+            on_logged: Called by the worker for every completed file.
         """
         self._episodes = EpisodeDirectory(directory, namespace=namespace)
         self._attachments = attachments
@@ -64,24 +97,24 @@ class EpisodeRecorder:
         self._on_error = on_error
         self._on_logged = on_logged
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix='episode_log')
-        self._writer: EpisodeWriter | None = None
-        self._status: EpisodeStatus | None = None
+        self._room = Semaphore(_MAX_UNFINISHED)
+        self._current: _EpisodeInProgress | None = None
         self.has_failed = False
 
     def record(self, tick: Tick, messages: Messages) -> None:
         """Writes a tick: a reset begins a file, a finished episode completes it."""
-        status = tick.status
-        if status.phase == 'reset':
+        if tick.status.phase == 'reset':
             self.interrupt('reset before the end')
-            self._begin(status)
-        self._status = status
-        self._guarded(lambda writer: writer.write_tick(tick.stamp_ns, messages))
-        if status.phase == 'finished':
+            self._begin(tick.status)
+        if self._current is not None:
+            self._current.status = tick.status
+        self._write(lambda writer: writer.write_tick(tick.stamp_ns, messages))
+        if tick.status.phase == 'finished':
             self._complete(lambda writer, result: writer.finish(result), is_complete=True)
 
     def record_received(self, topic: TopicSpec, data: bytes) -> None:
         """Writes a message received since the last tick; between episodes there is no file."""
-        self._guarded(lambda writer: writer.write_received(topic, data))
+        self._write(lambda writer: writer.write_received(topic, data))
 
     def interrupt(self, reason: str) -> None:
         """Completes the running episode, if there is one, marked as cut short."""
@@ -93,20 +126,28 @@ class EpisodeRecorder:
         self._worker.shutdown(wait=True)
 
     def _begin(self, status: EpisodeStatus) -> None:
+        """Lets the worker open the file of an episode.
+
+        A robot that runs as fast as possible can outrun a disk, and goes as fast as the disk then.
+        """
         if self.has_failed:
             return
-        try:
-            self._writer = self._episodes.begin(
-                status.task, status.seed, self._metadata(status), self._attachments
+        if not self._room.acquire(timeout=_LONGEST_STALL):
+            self._fail(EpisodeLogError(f'episode log stopped: {_MAX_UNFINISHED} files wait'))
+            return
+        self._current = _EpisodeInProgress(
+            self._worker.submit(
+                lambda: self._episodes.begin(
+                    status.task, status.seed, self._metadata(status), self._attachments
+                )
             )
-        except EpisodeLogError as error:
-            self._fail(error)
+        )
 
-    def _guarded(self, write: Callable[[EpisodeWriter], object]) -> None:
-        if self._writer is None:
+    def _write(self, write: Callable[[EpisodeWriter], object]) -> None:
+        if self._current is None:
             return
         try:
-            write(self._writer)
+            self._current.write(write)
         except EpisodeLogError as error:
             self._fail(error)
 
@@ -116,23 +157,26 @@ class EpisodeRecorder:
         *,
         is_complete: bool,
     ) -> None:
-        writer, status, self._writer = self._writer, self._status, None
-        if writer is None or status is None:
+        episode, self._current = self._current, None
+        if episode is None or episode.status is None:
             return
+        status = episode.status
 
         def work() -> None:
             try:
-                path = complete(writer, episode_result(status))
+                path = complete(episode.opened(), episode_result(status))
             except EpisodeLogError as error:
                 self._fail(error)
             else:
                 if path is not None:
                     self._on_logged(LoggedEpisode(status, path, is_complete))
+            finally:
+                self._room.release()
 
         self._worker.submit(work)
 
     def _fail(self, error: EpisodeLogError) -> None:
-        self._writer = None
+        self._current = None
         if not self.has_failed:
             self.has_failed = True
             self._on_error(str(error))

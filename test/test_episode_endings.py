@@ -199,8 +199,9 @@ def test_a_terminated_robot_completes_its_episode(start_process, tmp_path):
         robot.terminate()
         code, output = finish(robot)
     assert code == 0, output
-    (path,) = find_episodes(tmp_path)
-    assert read_episode(path).result['reason'] == 'SIGTERM'
+    *whole, last = map(read_episode, find_episodes(tmp_path))
+    assert all(episode.is_complete for episode in whole)
+    assert last.result['reason'] == 'SIGTERM'
     assert find_leftovers(tmp_path) == []
 
 
