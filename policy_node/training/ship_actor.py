@@ -57,12 +57,13 @@ def ship(options: argparse.Namespace) -> int:
         print(f'ship_actor: the actor in {options.actors} is at least as good; nothing changed')
         return 1
     target = options.actors / f'{info.task}.safetensors'
-    checkpoint.save(target, actor, replace(info, success=summary))
+    command = run_command(options.run) or info.command
+    checkpoint.save(target, actor, replace(info, success=summary, command=command))
     report = {
         'actor': info.task,
         'sha256': checkpoint.checkpoint_hash(target),
         'env_steps': info.env_steps,
-        'command': info.command,
+        'command': command,
         'source_revision': info.source_revision,
         **summary,
     }
@@ -70,6 +71,12 @@ def ship(options: argparse.Namespace) -> int:
     title = f'{info.task}, {info.config["recipe"]} recipe, seed {info.seed}'
     draw_curve(read_progress(options.run / 'progress.csv'), title, target.with_suffix('.png'))
     return 0
+
+
+def run_command(run: Path) -> str:
+    """Every command of a run in order, the first and those that resumed it; '' if unknown."""
+    path = run / 'command.txt'
+    return ' && '.join(path.read_text().splitlines()) if path.is_file() else ''
 
 
 def is_better(new: dict[str, Any], old: dict[str, Any]) -> bool:

@@ -1,0 +1,94 @@
+"""`evaluate_reference`: success of an actor in Gymnasium-Robotics itself, by its own `is_success`.
+
+On MuJoCo >= 3.17 that package stops at an `assert` that compares an enum with a NumPy integer, so
+this has to run without asserts: `python -O -m policy_node.training.evaluate_reference`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from msgs_spec.tasks import task_spec
+from policy_node import checkpoint
+from policy_node.actor import actor_path
+from policy_node.training.evaluate import wilson_interval
+from policy_node.training.evaluate_policy import FIRST_SEED
+
+
+def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Parses the command line."""
+    parser = argparse.ArgumentParser(prog='evaluate_reference', description=__doc__)
+    add = parser.add_argument
+    add('--actor', required=True, help='shipped actor or checkpoint file')
+    add('--episodes', type=int, default=1000, help='default: 1000')
+    add('--first-seed', type=int, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
+    add('--json', type=Path, help='add the result to this JSON file')
+    return parser.parse_args(arguments)
+
+
+def success_in_reference(actor: Any, reference_id: str, ticks: int, seeds: Sequence[int]) -> int:
+    """Counts the episodes that end in success.
+
+    Args:
+        actor: Anything with Stable-Baselines3's `predict`.
+        reference_id: Environment of Gymnasium-Robotics, for example `FetchPush-v4`.
+        ticks: Steps per episode.
+        seeds: Seed of each episode; each gets a fresh environment, because the reference's hand
+            tasks carry state from one episode to the next.
+    """
+    warnings.filterwarnings('ignore')
+    import gymnasium
+    import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    successes = 0
+    env = gymnasium.make(reference_id)
+    for seed in seeds:
+        if reference_id.startswith('HandManipulate'):
+            env = gymnasium.make(reference_id)
+        observation, _ = env.reset(seed=seed)
+        info: dict[str, Any] = {}
+        for _ in range(ticks):
+            action, _ = actor.predict(observation, deterministic=True)
+            observation, _, _, _, info = env.step(action)
+        successes += bool(info['is_success'])
+    return successes
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit status."""
+    options = parse_arguments(arguments)
+    if __debug__:
+        print('evaluate_reference: asserts are on; start it with python -O', file=sys.stderr)
+        return 2
+    try:
+        actor, info = checkpoint.load(actor_path(options.actor))
+    except ValueError as error:
+        print(f'evaluate_reference: {error}', file=sys.stderr)
+        return 2
+    spec = task_spec(info.task)
+    seeds = range(options.first_seed, options.first_seed + options.episodes)
+    successes = success_in_reference(actor, spec.reference_id, spec.episode_ticks, seeds)
+    lower, upper = wilson_interval(successes, options.episodes)
+    result = {
+        'environment': spec.reference_id,
+        'episodes': options.episodes,
+        'first_seed': options.first_seed,
+        'success': successes / options.episodes,
+        'interval_95': [lower, upper],
+    }
+    print(f'{spec.reference_id}: {result["success"]:.4f} ({lower:.4f} ... {upper:.4f})')
+    if options.json is not None:
+        report = json.loads(options.json.read_text()) if options.json.is_file() else {}
+        options.json.write_text(json.dumps({**report, 'reference': result}, indent=2) + '\n')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
