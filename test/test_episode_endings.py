@@ -17,6 +17,7 @@ from graph import SIM_NODE, TIMEOUT, client, ros_args
 
 from fetch_hand_sim.episode_log import (
     EpisodeLogError,
+    LogSettings,
     find_episodes,
     find_leftovers,
     read_episode,
@@ -28,7 +29,7 @@ from msgs_spec.tasks import task_spec
 KILLS = int(os.environ.get('EPISODE_KILLS', '20'))
 SCRIPT = Path(__file__).with_name('killed_writer.py')
 TICK_NS = 40_000_000
-HALF_SECOND_NS = 500_000_000
+FLUSH_PERIOD_NS = LogSettings().flush_period_ns
 REACH = task_spec('FetchReach')
 MIB = 1024 * 1024
 
@@ -69,14 +70,14 @@ def check_killed(directory, first, last):
     try:
         recovered = recover_episode(leftovers[0].path)
     except EpisodeLogError as error:
-        # Less than half a second had been written of it, or nothing but the file had been made.
+        # Less than one flush had been written of it, or nothing but the file had been made.
         assert 'nothing to recover' in str(error) or 'No such file' in str(error)
-        assert last - first <= HALF_SECOND_NS + TICK_NS or last - first >= 50 * TICK_NS
+        assert last - first <= FLUSH_PERIOD_NS + TICK_NS or last - first >= 50 * TICK_NS
         return 'too short'
     episode = read_episode(recovered)
     times = [m.log_time_ns for t in episode.topics.values() for m in t.messages]
     assert min(times) == first
-    assert max(times) >= last - HALF_SECOND_NS - TICK_NS
+    assert max(times) >= last - FLUSH_PERIOD_NS - TICK_NS
     assert find_leftovers(path) == []
     if not episode.is_complete:
         assert episode.result['reason'] == 'cut off, recovered later'

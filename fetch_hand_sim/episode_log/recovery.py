@@ -68,7 +68,7 @@ class _Remains:
 def recover_episode(leftover: Path) -> Path:
     """Completes an episode that a crash cut off.
 
-    All whole chunks become a bag under the name of the episode; at most the last half second of
+    All whole chunks become a bag under the name of the episode; at most the last quarter second of
     simulated time is missing. The torn file is replaced when the new one has been read back.
 
     Args:

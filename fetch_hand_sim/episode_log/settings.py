@@ -30,7 +30,7 @@ class LogSettings:
         chunk_size: Bytes of messages per chunk; small chunks keep the longest write short.
         compression: Of the chunks: 'none', 'lz4' or 'zstd'.
         flush_period_ns: Simulated time after which messages are handed to the operating system:
-            what a killed process loses at most, in nanoseconds.
+            what a killed process loses at most, in nanoseconds. Longer ones make longer ticks.
         minimum_free_bytes: No episode is begun with less than this left on the disk.
 
     Raises:
@@ -39,7 +39,7 @@ class LogSettings:
 
     chunk_size: int = 128 * 1024
     compression: Compression = 'lz4'
-    flush_period_ns: int = 500_000_000
+    flush_period_ns: int = 250_000_000
     minimum_free_bytes: int = 64 * 1024 * 1024
 
     def __post_init__(self) -> None:
