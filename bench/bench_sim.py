@@ -2,8 +2,9 @@
 
 Measured are this project, EnvPool, Gymnasium-Robotics (one process with one environment; or one
 process per environment in an `AsyncVectorEnv`) and, as the limit, MuJoCo's batch alone: on the
-model as published, and as tuned by this project. All play whole episodes of random actions in
-turns, so that a disturbance of the machine hits all alike; ratios are medians over the turns.
+model as published, and as tuned by this project. All play whole episodes of random actions, ten
+steps each in turn, so that a disturbance of the machine hits all alike; ratios are medians over
+these turns.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from msgs_spec.tasks import TASKS  # noqa: E402
 PEERS = ROOT / '.venv-bench'
 RESULTS = ROOT / 'bench' / 'results'
 NUM_ENVS = 64
+STEPS_PER_TURN = 10
 OURS = 'this_project'
 IMPLEMENTATIONS = (OURS, 'bare_physics', 'tuned_physics', 'envpool', 'gymnasium_robotics')
 IN_PEERS_ENVIRONMENT = ('envpool', 'gymnasium_robotics')
@@ -70,10 +72,10 @@ class Worker:
         )
         self._answer()
 
-    def play_episode(self) -> dict[str, float]:
-        """Plays one episode in all simulations."""
+    def play(self, steps: int) -> dict[str, float]:
+        """Plays a number of steps in all simulations."""
         assert self._process.stdin is not None
-        self._process.stdin.write('\n')
+        self._process.stdin.write(f'{steps}\n')
         self._process.stdin.flush()
         return self._answer()
 
@@ -108,28 +110,36 @@ def workers_of(task: str, threads: int) -> Iterator[dict[str, Worker]]:
         yield workers
 
 
-def measure(task: str, threads: int, turns: int) -> dict[str, Any]:
+def measure(task: str, threads: int, episodes: int) -> dict[str, Any]:
     """One row of the table."""
     played: dict[str, list[dict[str, float]]] = {name: [] for name in IMPLEMENTATIONS}
+    turns = TASKS[task].episode_ticks // STEPS_PER_TURN
     with workers_of(task, threads) as workers:
-        for worker in workers.values():
-            worker.play_episode()
-        for _ in range(turns):
+        # The episode that warms everything up does not count.
+        for _ in range((1 + episodes) * turns):
             for name, worker in workers.items():
-                played[name].append(worker.play_episode())
-    speeds = {name: [t['steps'] / t['seconds'] for t in times] for name, times in played.items()}
-    whole = {
-        name: [t['steps'] / (t['seconds'] + t['reset_seconds']) for t in times]
-        for name, times in played.items()
-    }
+                played[name].append(worker.play(STEPS_PER_TURN))
+    counted = {name: times[turns:] for name, times in played.items()}
+    speeds = {name: [t['steps'] / t['seconds'] for t in times] for name, times in counted.items()}
     row: dict[str, Any] = {'task': task, 'threads': threads}
     row |= {name: statistics.median(values) for name, values in speeds.items()}
     row |= {
         f'ratio_{name}': _median_ratio(speeds[OURS], speeds[name]) for name in IMPLEMENTATIONS[1:]
     }
-    row |= {f'{name}_with_resets': statistics.median(whole[name]) for name in (OURS, 'envpool')}
+    whole = {name: _speed_with_resets(counted[name], turns) for name in (OURS, 'envpool')}
+    row |= {f'{name}_with_resets': statistics.median(values) for name, values in whole.items()}
     row['ratio_envpool_with_resets'] = _median_ratio(whole[OURS], whole['envpool'])
     return row
+
+
+def _speed_with_resets(times: list[dict[str, float]], turns: int) -> list[float]:
+    """Steps per second of each episode with the reset after it."""
+    speeds = []
+    for first in range(0, len(times), turns):
+        episode = times[first : first + turns]
+        seconds = sum(part['seconds'] + part['reset_seconds'] for part in episode)
+        speeds.append(sum(part['steps'] for part in episode) / seconds)
+    return speeds
 
 
 def _median_ratio(ours: list[float], theirs: list[float]) -> float:
@@ -213,7 +223,7 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--tasks', nargs='+', choices=list(TASKS), default=list(TASKS))
     parser.add_argument('--threads', nargs='+', type=int, default=[1, os.cpu_count() or 1])
-    parser.add_argument('--turns', type=int, default=3, help='episodes per implementation')
+    parser.add_argument('--episodes', type=int, default=3, help='per implementation; default 3')
     parser.add_argument('--output', type=Path, default=RESULTS, help='directory of CSV and PNG')
     return parser.parse_args()
 
@@ -226,7 +236,7 @@ def main() -> None:
     rows = []
     for threads in dict.fromkeys(arguments.threads):
         for task in arguments.tasks:
-            rows.append(measure(task, threads, arguments.turns))
+            rows.append(measure(task, threads, arguments.episodes))
             print(table(rows[-1:]).splitlines()[2], flush=True)
     print(f'\n{machine}\n\n{table(rows)}')
     arguments.output.mkdir(parents=True, exist_ok=True)

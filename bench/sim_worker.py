@@ -1,7 +1,7 @@
-"""Plays whole episodes of random actions in one implementation, and takes the time.
+"""Plays episodes of random actions in one implementation, block by block, and takes the time.
 
 Started by `bench_sim.py`, in the environment that has the implementation. Every line on standard
-input asks for episodes; the answer is one line of JSON.
+input is a number of steps to play; the answer is one line of JSON.
 
 Usage: python sim_worker.py <implementation> <task> <reference id> <simulations> <threads> <file>
 """
@@ -30,27 +30,29 @@ class VectorWorker:
     The step that ends an episode is followed by one that only resets; the two are timed apart.
     """
 
-    def __init__(self, env: Any, num_envs: int) -> None:
+    def __init__(self, env: Any, num_envs: int, repeats: int = 1) -> None:
         self._env = env
         self._num_envs = num_envs
+        self._repeats = repeats
         env.reset(seed=list(range(num_envs)))
         size = env.action_space.shape[-1]
         generator = np.random.default_rng(0)
         shape = (ACTION_BATCHES, num_envs, size)
         self._actions = generator.uniform(-1.0, 1.0, shape).astype(np.float32)
 
-    def play_episode(self) -> Times:
-        """One episode and the reset after it."""
-        steps, ended = 0, False
-        start = time.perf_counter()
-        while not ended:
-            action = self._actions[steps % ACTION_BATCHES]
-            ended = bool(np.all(self._env.step(action)[3]))
-            steps += 1
-        end = time.perf_counter()
-        self._env.step(self._actions[0])
-        reset = time.perf_counter() - end
-        return {'steps': steps * self._num_envs, 'seconds': end - start, 'reset_seconds': reset}
+    def play(self, steps: int) -> Times:
+        """Plays a block of steps, and the resets after the episodes that end in it."""
+        seconds = reset_seconds = 0.0
+        for step in range(steps * self._repeats):
+            start = time.perf_counter()
+            ended = np.all(self._env.step(self._actions[step % ACTION_BATCHES])[3])
+            end = time.perf_counter()
+            seconds += end - start
+            if ended:
+                self._env.step(self._actions[0])
+                reset_seconds += time.perf_counter() - end
+        played = steps * self._repeats * self._num_envs
+        return {'steps': played, 'seconds': seconds, 'reset_seconds': reset_seconds}
 
 
 class PhysicsWorker:
@@ -59,17 +61,19 @@ class PhysicsWorker:
     def __init__(self, batch: Any, states: np.ndarray) -> None:
         self._batch = batch
         self._states = states
+        self._next = 0
 
-    def play_episode(self) -> Times:
-        """The physics of one episode; there is no reset."""
+    def play(self, steps: int) -> Times:
+        """The physics of a block of steps; there are no resets."""
         seconds = 0.0
-        for state in self._states:
-            self._batch.state[:] = state
+        for _ in range(steps):
+            self._batch.state[:] = self._states[self._next]
+            self._next = (self._next + 1) % len(self._states)
             start = time.perf_counter()
             self._batch.step(nstep=20)
             seconds += time.perf_counter() - start
-        steps = self._states.shape[0] * self._states.shape[1]
-        return {'steps': steps, 'seconds': seconds, 'reset_seconds': 0.0}
+        played = steps * self._states.shape[1]
+        return {'steps': played, 'seconds': seconds, 'reset_seconds': 0.0}
 
 
 def record_episode(task: str, num_envs: int) -> tuple[np.ndarray, Any]:
@@ -148,7 +152,7 @@ def gymnasium_robotics(task: str, reference_id: str, num_envs: int, threads: int
     gymnasium.register_envs(peer)
     if threads == 1:
         env = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make(reference_id)])
-        return VectorWorker(env, 1)
+        return VectorWorker(env, 1, repeats=8)
     env = gymnasium.vector.AsyncVectorEnv([lambda: gymnasium.make(reference_id)] * num_envs)
     return VectorWorker(env, num_envs)
 
@@ -167,8 +171,8 @@ def main() -> None:
     implementation, task, reference_id, num_envs, threads, path = sys.argv[1:]
     worker = WORKERS[implementation](task, reference_id, int(num_envs), int(threads), path)
     print(json.dumps({'ready': implementation}), file=answers, flush=True)
-    for _ in sys.stdin:
-        print(json.dumps(worker.play_episode()), file=answers, flush=True)
+    for request in sys.stdin:
+        print(json.dumps(worker.play(int(request))), file=answers, flush=True)
 
 
 if __name__ == '__main__':
