@@ -6,12 +6,16 @@ from setuptools import find_packages, setup
 
 PACKAGE = 'fetch_hand_sim'
 
+# To write ONNX actors; onnxruntime alone runs them.
+ONNX = ['onnx>=1.17', 'onnxruntime>=1.20', 'onnxscript>=0.3']
+
 # What test/ needs beyond the package itself. An extra called `test` makes `colcon test` use pytest.
 TEST = [
     'colcon-core',
     'colcon-python-setup-py',
     'colcon-ros',
     'mcap-ros2-support',
+    *ONNX,
     'pytest',
     'pytest-timeout',
     'setuptools',
@@ -58,8 +62,11 @@ setup(
         # ROS 2 Jazzy itself, for a machine without it.
         'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
         'train': ['matplotlib', 'tensorboard'],
+        'cluster': ['matplotlib', 'ray>=2.10'],
         # `export_episodes`.
         'export': ['minari>=0.5.3', 'pyarrow>=18'],
+        'onnx': ONNX,
+        'stable_baselines3': ['stable-baselines3>=2.4'],
         'test': TEST,
         'dev': [*TEST, 'mypy', 'pymcap-cli', 'ruff', 'types-PyYAML'],
     },
@@ -67,6 +74,8 @@ setup(
         'console_scripts': [
             'sim_node = fetch_hand_sim.sim_node:main',
             'policy_node = policy_node.node:main',
+            'export_actor = policy_node.export_actor:main',
+            'benchmark = policy_node.training.benchmark:main',
             'train_her = policy_node.training.train_her:main',
             'evaluate_policy = policy_node.training.evaluate_policy:main',
             'replay_node = fetch_hand_sim.replay_node:main',

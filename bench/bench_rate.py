@@ -1,6 +1,6 @@
-"""The rate of `joint_states` in real time, as an independent subscriber sees it (`make bench-rate`).
+"""The rate of `joint_states` in real time, as an independent subscriber sees it.
 
-Measured on the machine as it is, then with every CPU kept busy by a process of its own. Late ticks
+`make bench-rate` runs it. Measured on the machine as it is, then with every CPU kept busy by a process of its own. Late ticks
 are those `sim_node` counts itself, read from `/diagnostics`.
 """
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import zlib
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,37 +71,24 @@ class RestingCommander:
 
 
 class ActorCommander:
-    """A trained actor on one thread, warmed up."""
+    """An actor of this project, on one thread."""
 
-    def __init__(self, name_or_path: str, status: EpisodeStatus) -> None:
+    def __init__(self, path: Path, spec: TaskSpec, sha256: str) -> None:
         """Loads a checkpoint.
 
         Raises:
-            ValueError: If it does not fit the robot's task or rate.
+            ValueError: If it was trained on another task or cannot be read.
         """
         import torch
 
         from policy_node import checkpoint
-        from policy_node.actor import actor_path
 
         torch.set_num_threads(1)
-        path = actor_path(name_or_path)
-        self._actor, info = checkpoint.load(path, status.task)
-        if info.control_hz != status.control_hz:
-            raise ValueError(
-                f'{path.name} was trained at {info.control_hz:g} Hz; the robot runs at '
-                f'{status.control_hz:g} Hz'
-            )
-        self.spec = task_spec(info.task)
+        self._actor, info = checkpoint.load(path, spec.name)
+        self.control_hz: float | None = info.control_hz
+        self.spec = spec
         self.description = f'actor {path.name}'
-        self.sha256 = checkpoint.checkpoint_hash(path)
-        for _ in range(_WARM_UP_CALLS):
-            self.command(
-                {
-                    'observation': np.zeros(self.spec.observation_size),
-                    'desired_goal': np.zeros(self.spec.goal.size),
-                }
-            )
+        self.sha256 = sha256
 
     def command(self, observation: Observation) -> NDArray[np.float64]:
         """Returns the actor's command."""
@@ -111,9 +100,9 @@ def make_commander(checkpoint: str, status: EpisodeStatus) -> Commander:
     """Makes the commander that a robot gets.
 
     Args:
-        checkpoint: Name of a shipped actor, path of a checkpoint, `random`, `resting`, or '' for
-        the
-            shipped actor of the robot's task.
+        checkpoint: Name of a shipped actor; path of a checkpoint of this project, of an ONNX file
+            or of a .zip of Stable-Baselines3; `random`, `resting`; or '' for the shipped actor of
+            the robot's task.
         status: What the robot said of itself.
 
     Raises:
@@ -126,7 +115,7 @@ def make_commander(checkpoint: str, status: EpisodeStatus) -> Commander:
         return RestingCommander(spec)
     if not checkpoint:
         return _shipped_commander(status)
-    return ActorCommander(checkpoint, status)
+    return _load_commander(checkpoint, status)
 
 
 def _shipped_commander(status: EpisodeStatus) -> Commander:
@@ -138,4 +127,52 @@ def _shipped_commander(status: EpisodeStatus) -> Commander:
             f'no actor is shipped for {status.task} (shipped: {", ".join(shipped) or "none"}); '
             f'give a checkpoint, or {RANDOM!r} or {RESTING!r}'
         )
-    return ActorCommander(status.task, status)
+    return _load_commander(status.task, status)
+
+
+def _load_commander(name_or_path: str, status: EpisodeStatus) -> Commander:
+    """Loads an actor by the ending of its file, checks its rate and warms it up."""
+    path = _actor_path(name_or_path)
+    spec = task_spec(status.task)
+    commander: Any = _commander_class(path)(path, spec, _sha256(path))
+    if commander.control_hz not in (None, status.control_hz):
+        raise ValueError(
+            f'{path.name} was trained at {commander.control_hz:g} Hz; the robot runs at '
+            f'{status.control_hz:g} Hz'
+        )
+    zeros = {
+        'observation': np.zeros(spec.observation_size),
+        'achieved_goal': np.zeros(spec.goal.size),
+        'desired_goal': np.zeros(spec.goal.size),
+    }
+    for _ in range(_WARM_UP_CALLS):
+        commander.command(zeros)
+    loaded: Commander = commander
+    return loaded
+
+
+def _actor_path(name_or_path: str) -> Path:
+    """Does without torch for a file that does."""
+    path = Path(name_or_path)
+    if path.suffix == '.onnx' and path.is_file():
+        return path
+    from policy_node.actor import actor_path
+
+    return actor_path(name_or_path)
+
+
+def _commander_class(path: Path) -> Any:
+    if path.suffix == '.onnx':
+        from policy_node.onnx_actor import OnnxCommander
+
+        return OnnxCommander
+    if path.suffix == '.zip':
+        from policy_node.stable_baselines3_actor import StableBaselines3Commander
+
+        return StableBaselines3Commander
+    return ActorCommander
+
+
+def _sha256(path: Path) -> str:
+    with path.open('rb') as file:
+        return hashlib.file_digest(file, 'sha256').hexdigest()
