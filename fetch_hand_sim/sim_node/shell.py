@@ -222,7 +222,7 @@ class SimNode(Node):
             self._recorder.close(stop.received or 'end of the run')
         deadline = time.monotonic() + _LAST_WORDS_TIMEOUT
         for publisher in self._outputs.values():
-            # A subscriber that was killed never acknowledges: together, not each, they get a second.
+            # A killed subscriber never acknowledges: together, not each, they get a second.
             left = max(0.0, deadline - time.monotonic())
             publisher.wait_for_all_acked(Duration(seconds=left))
 
