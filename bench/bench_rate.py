@@ -1,7 +1,7 @@
 """The rate of `joint_states` in real time, as an independent subscriber sees it.
 
-`make bench-rate` runs it. Measured on the machine as it is, then with every CPU kept busy by a process of its own. Late ticks
-are those `sim_node` counts itself, read from `/diagnostics`.
+`make bench-rate` runs it: on the machine as it is, then with every CPU kept busy by a process of
+its own. Late ticks are those `sim_node` counts itself, read from `/diagnostics`.
 """
 
 from __future__ import annotations

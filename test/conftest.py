@@ -44,6 +44,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=2000,
         help='random messages per hostile test; `make torture` sends 100,000 (default: 2000)',
     )
+    parser.addoption(
+        '--soak-seconds',
+        type=float,
+        default=6.0,
+        help='how long memory is watched at 20x; `make torture` takes an hour (default: 6)',
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -73,6 +79,12 @@ def twin_seeds(pytestconfig: pytest.Config) -> range:
 def hostile_count(pytestconfig: pytest.Config) -> int:
     """How many random messages a hostile test sends."""
     return int(pytestconfig.getoption('--hostile-messages'))
+
+
+@pytest.fixture(scope='session')
+def soak_seconds(pytestconfig: pytest.Config) -> float:
+    """How long memory is watched."""
+    return float(pytestconfig.getoption('--soak-seconds'))
 
 
 @pytest.fixture

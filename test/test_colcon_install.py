@@ -169,7 +169,7 @@ def test_installed_sim_node_runs_an_episode(prefix, in_install, start_process, t
     line = (
         f'{prefix}/lib/{PACKAGE}/sim_node --ros-args '
         f'--params-file {prefix}/share/{PACKAGE}/config/sim_node.yaml '
-        '-p task:=FetchReach -p episodes:=1 -p real_time_factor:=0.0'
+        '-p task:=FetchReach -p episodes:=1 -p real_time_factor:=0.0 -p episode_dir:=episodes'
     )
     node = start_process(*in_install(line), cwd=tmp_path)
     output, errors = node.communicate(timeout=60)
