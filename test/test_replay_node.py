@@ -129,7 +129,8 @@ def test_generated_episodes_equal_those_of_the_nodes(start_process, tmp_path):
     assert batch.topics == node.topics
     assert batch.result == node.result
     assert batch.attachments == node.attachments
-    same = [key for key in node.metadata if key != 'started']
+    # Somebody may commit between the two runs.
+    same = [key for key in node.metadata if key not in ('started', 'source_revision')]
     assert list(batch.metadata) == list(node.metadata)
     assert [batch.metadata[key] for key in same] == [node.metadata[key] for key in same]
 
@@ -180,7 +181,7 @@ def test_late_subscribers_get_the_latched_topics_of_an_offset(start_process, epi
 
 
 def test_rate_loop_and_pause(start_process, episode):
-    start_process(*REPLAY_NODE, *ros_args(path=episode, rate=4.0, loop=True))
+    start_process(*REPLAY_NODE, *ros_args(path=episode, rate=2.0, loop=True))
     with client(REACH) as listener:
         listener.subscribe('joint_states', '/clock')
         stamps = []
@@ -191,7 +192,7 @@ def test_rate_loop_and_pause(start_process, episode):
 
         listener.spin_until(has_looped, 'a second round')
         times = np.array(listener.received_at['joint_states'][: len(stamps)])
-        assert np.median(np.diff(times)) == pytest.approx(0.01, abs=0.003)
+        assert np.median(np.diff(times)) == pytest.approx(0.02, abs=0.005)
         assert 1_000_000_000 in stamps
         assert listener.call(SetBool, 'replay_node/pause', data=True).message == 'paused'
         listener.spin(0.2)
