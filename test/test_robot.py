@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
+import sys
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,12 +17,14 @@ from fetch_hand_sim.sim_node.health import Health, Surroundings
 from fetch_hand_sim.sim_node.receivers import Receivers
 from fetch_hand_sim.sim_node.robot import MAX_STEPS, Robot
 from fetch_hand_sim.sim_node.schedule import TickSchedule
+from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.sim_node.simulation_interfaces import SimulationInterfaces
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.cdr_decoder import TopicDecoder
 from msgs_spec.codecs import build_message, decode_status
 from msgs_spec.diagnostics import Level, encode_reports
 from msgs_spec.schemas import deserialize, message_class
+from msgs_spec.services import INTERFACE_SERVICES, SERVICES, STANDARD_SERVICES
 from msgs_spec.topics import DIAGNOSTICS, topic, topics
 
 
@@ -360,6 +363,29 @@ def test_simulation_interfaces_list_only_features_the_release_knows(make):
     older = SimpleNamespace(SIMULATION_RESET=10, STEP_SIMULATION_SINGLE=15)
     services = SimulationInterfaces(make().robot, older)
     assert services.get_simulator_features(None, response()).features.features == [10, 15]
+
+
+def test_services_open_with_and_without_simulation_interfaces(make, monkeypatch):
+    """Stand-in modules: the real ones need type support that no wheel has."""
+    case = make()
+    opened = {}
+    node = SimpleNamespace(create_service=lambda type_, name, call: opened.update({name: call}))
+    open_services(node, case.robot)
+    assert set(opened) == {spec.name for spec in STANDARD_SERVICES}
+    answer = opened['~/step'](None, SimpleNamespace(success=None, message=None))
+    assert (answer.success, 'pause it first' in answer.message) == (False, True)
+
+    types = {spec.type_name.rpartition('/')[2]: object for spec in INTERFACE_SERVICES}
+    package = 'simulation_interfaces'
+    monkeypatch.setitem(sys.modules, package, ModuleType(package))
+    for name, content in (('msg', {'SimulatorFeatures': Features}), ('srv', types)):
+        module = ModuleType(f'{package}.{name}')
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, f'{package}.{name}', module)
+    open_services(node, case.robot)
+    assert set(opened) == {spec.name for spec in SERVICES}
+    assert call(opened['~/set_simulation_state'], state=state(2))[0] == 1
+    assert case.robot.schedule.is_paused
 
 
 # What comes over the network

@@ -1,0 +1,87 @@
+"""The loop both nodes run in, with and without rclpy's EventsExecutor."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import pytest
+import rclpy
+from std_msgs.msg import Float64
+
+from msgs_spec.ros import EventLoop
+
+
+@pytest.fixture
+def node():
+    rclpy.init()
+    node = rclpy.create_node('loop')
+    yield node
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def collect(node) -> tuple[list[float], object]:
+    received: list[float] = []
+    node.create_subscription(Float64, 'numbers', lambda m: received.append(m.data), 10)
+    publisher = node.create_publisher(Float64, 'numbers', 10)
+    deadline = time.monotonic() + 10.0
+    while not publisher.get_subscription_count():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return received, publisher
+
+
+def test_everything_that_waits_is_served_in_order(node):
+    received, publisher = collect(node)
+    loop = EventLoop(node)
+    loop.wait(0.1)  # takes the node's entities in
+    loop.wait(0.1)
+    for number in range(5):
+        publisher.publish(Float64(data=float(number)))
+    time.sleep(0.2)
+    loop.serve_pending()
+    assert received == [0.0, 1.0, 2.0, 3.0, 4.0]
+    loop.close()
+
+
+def test_wait_ends_in_time_without_anything_to_serve(node):
+    loop = EventLoop(node)
+    for _ in range(20):
+        loop.wait(0.0)
+    began = time.monotonic()
+    loop.wait(0.1)
+    assert 0.05 < time.monotonic() - began < 1.0
+    loop.close()
+
+
+def test_older_rclpy_without_events_executor(node, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'rclpy.experimental.events_executor', None)
+    received, publisher = collect(node)
+    loop = EventLoop(node)
+    publisher.publish(Float64(data=7.0))
+    deadline = time.monotonic() + 5.0
+    while not received and time.monotonic() < deadline:
+        loop.serve_pending()
+        loop.wait(0.01)
+    assert received == [7.0]
+    loop.close()
+
+
+def test_an_error_in_a_callback_is_not_swallowed(node):
+    loop = EventLoop(node)
+    publisher = node.create_publisher(Float64, 'numbers', 10)
+
+    def fail(message):
+        raise RuntimeError('from the callback')
+
+    node.create_subscription(Float64, 'numbers', fail, 10)
+    deadline = time.monotonic() + 10.0
+    while not publisher.get_subscription_count():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    publisher.publish(Float64())
+    with pytest.raises(RuntimeError, match='from the callback'):
+        while time.monotonic() < deadline:
+            loop.wait(0.05)
+    loop.close()
