@@ -14,7 +14,7 @@ STAMP := $(VENV)/.complete
 # not leak in.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo test lint format twin bench-sim bench-her bench-lockstep bench-rate bench-episodes torture clean distclean
+.PHONY: help env demo test lint format twin bench-sim bench-her bench-paper bench-lockstep bench-rate bench-episodes torture clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -24,6 +24,7 @@ help:
 	@echo 'make twin       the long comparison with Gymnasium-Robotics, 20 seeds per task'
 	@echo 'make bench-sim  simulation speed against its peers'
 	@echo 'make bench-her  training speed against Stable-Baselines3'
+	@echo 'make bench-paper [TASK=$(TASK)]  four arms x five seeds, as in the figures of the paper'
 	@echo 'make bench-lockstep  ticks per second of two nodes against the limit of the middleware'
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
 	@echo 'make torture    100,000 hostile messages per test, an hour of memory at 20x, 200 killed'
@@ -63,6 +64,9 @@ bench-sim: env
 bench-her: env
 	$(BIN)/python -m pip install -q -r bench/requirements_her.txt
 	$(BIN)/python bench/bench_her.py
+
+bench-paper: env
+	$(BIN)/python -m policy_node.training.benchmark --tasks $(TASK)
 
 bench-lockstep: env
 	$(BIN)/python bench/bench_lockstep.py

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import platform
@@ -121,7 +122,7 @@ def summarize(task: str, arm: str, curves: Sequence[Curve]) -> dict[str, Any]:
 
 
 def write_report(jobs: Iterable[Job], output: Path, command: str) -> None:
-    """Writes figure (PNG), curves (CSV) and table (CSV, JSON), and prints the table.
+    """Writes figure (PNG), curves (CSV) and table (text, CSV, JSON), and prints the table.
 
     Args:
         jobs: Finished jobs.
@@ -145,7 +146,9 @@ def write_report(jobs: Iterable[Job], output: Path, command: str) -> None:
     (output / 'benchmark.json').write_text(json.dumps({**about, 'results': table}, indent=2) + '\n')
     bands = {t: {a: aggregate(curves) for a, curves in arms.items()} for t, arms in groups.items()}
     draw(bands, output / 'benchmark.png')
-    print_table(table)
+    text = format_table(table)
+    (output / 'benchmark.txt').write_text(text)
+    print(text, end='')
     print(f'figure and tables in {output}')
 
 
@@ -157,25 +160,28 @@ def machine() -> str:
     return f'{models[0] if models else platform.machine()}, {os.cpu_count()} cores'
 
 
-def print_table(table: Sequence[dict[str, Any]]) -> None:
-    """Prints the rows beside the published numbers."""
-    columns = ('task', 'arm', 'seeds', 'steps', 'median', 'quartiles', 'steps to 0.95', 'published')
-    text = Table(*columns, title='success at the last step', show_lines=True)
+def format_table(table: Sequence[dict[str, Any]]) -> str:
+    """The results as text, and below them the published numbers with their kind and source."""
+    columns = ('task', 'arm', 'seeds', 'steps', 'median', 'quartiles', 'steps to 0.95')
+    results = Table(*columns, title='success at the last step, over seeds')
+    published = Table('task', 'arm', 'published success (kind; source)')
     for row in table:
-        quartiles = f'{row["final_lower_quartile"]:.3f} ... {row["final_upper_quartile"]:.3f}'
-        fast = row['median_steps_to_0.95']
-        rerun, best = row['published_rerun'] or 'none', row['published_best'] or 'none'
-        text.add_row(
+        fast, label = row['median_steps_to_0.95'], ARMS[row['arm']].label
+        results.add_row(
             row['task'],
-            ARMS[row['arm']].label,
+            label,
             str(row['seeds']),
             f'{row["env_steps"]:,}',
             f'{row["final_median"]:.3f}',
-            quartiles,
+            f'{row["final_lower_quartile"]:.3f} ... {row["final_upper_quartile"]:.3f}',
             'not reached' if fast is None else f'{fast:,}',
-            f'this arm: {rerun}\nbest of any method: {best}',
         )
-    Console().print(text)
+        published.add_row(row['task'], label, row['published_rerun'] or 'none')
+    for row in {row['task']: row for row in table}.values():
+        published.add_row(row['task'], 'best of any method', row['published_best'] or 'none')
+    console = Console(file=io.StringIO(), width=110)
+    console.print(results, published)
+    return str(console.file.getvalue())  # type: ignore[attr-defined]
 
 
 def draw(bands: dict[str, dict[str, Band]], path: Path) -> None:
