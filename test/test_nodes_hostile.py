@@ -232,6 +232,7 @@ def test_memory_stays_flat_at_twenty_times_real_time(
             ),
             'commands',
         )
+        robot.spin_until(lambda: bool(reports(robot)), 'a report')
         robot.spin(2.0)
         before = [resident_kilobytes(process) for process in (sim, policy)]
         ticks = int(reports(robot)[-1]['ticks'])
