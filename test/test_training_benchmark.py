@@ -171,6 +171,7 @@ def test_a_benchmark_runs_reports_and_is_not_run_again(
     assert (report / 'benchmark.txt').read_text() in printed
     stored = json.loads((report / 'benchmark.json').read_text())
     assert stored['command'].startswith('benchmark --seeds 0 --steps 1200')
+    assert len(stored['source_revisions']) == 1 and stored['machine']
     assert [row['arm'] for row in stored['results']] == ['her_sparse', 'ddpg_dense']
     assert {row['env_steps'] for row in stored['results']} == {1200}
     assert len(list(csv.DictReader((report / 'benchmark.csv').open()))) == 2

@@ -18,10 +18,11 @@ from rich.console import Console
 from rich.table import Table
 
 from msgs_spec.tasks import task_spec
+from policy_node.checkpoint import read_info
 from policy_node.training.benchmark_jobs import ARMS, PROGRESS_FILE, Job
 from policy_node.training.benchmark_published import BEST, RERUN
 from policy_node.training.run_log import read_progress
-from policy_node.training.train_her import source_revision
+from policy_node.training.trainer import LATEST_FILE
 
 # An epoch of the paper: 50 cycles of 2 episodes on each of 19 workers.
 EPISODES_PER_EPOCH = 1900
@@ -131,7 +132,9 @@ def write_report(jobs: Iterable[Job], output: Path, command: str) -> None:
     """
     groups: dict[str, dict[str, list[Curve]]] = {}
     rows: list[tuple[str, str, int, Curve]] = []
+    revisions: set[str] = set()
     for job in jobs:
+        revisions.add(read_info(job.folder / LATEST_FILE).source_revision)
         curve, task, arm = read_curve(job.folder / PROGRESS_FILE), job.config.task, job.arm.name
         groups.setdefault(task, {}).setdefault(arm, []).append(curve)
         rows.append((task, arm, job.config.seed, curve))
@@ -142,7 +145,7 @@ def write_report(jobs: Iterable[Job], output: Path, command: str) -> None:
         writer = csv.DictWriter(file, list(table[0]))
         writer.writeheader()
         writer.writerows(table)
-    about = {'command': command, 'source_revision': source_revision(), 'machine': machine()}
+    about = {'command': command, 'source_revisions': sorted(revisions), 'machine': machine()}
     (output / 'benchmark.json').write_text(json.dumps({**about, 'results': table}, indent=2) + '\n')
     bands = {t: {a: aggregate(curves) for a, curves in arms.items()} for t, arms in groups.items()}
     draw(bands, output / 'benchmark.png')
