@@ -76,15 +76,17 @@ def test_jobs_come_seed_by_seed_with_all_arms(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('recipe', ['paper', 'best'])
 @pytest.mark.parametrize('task', TASKS)
-def test_the_command_line_of_a_job_stands_for_its_configuration(task: str, recipe: str) -> None:
-    options = parse_arguments(['--tasks', task, '--recipe', recipe, '--set', 'hidden_sizes=64,32'])
-    for job in jobs_from_arguments(options):
+def test_the_command_line_of_a_job_stands_for_its_configuration(
+    task: str, recipe: str, tmp_path: Path
+) -> None:
+    arguments = ['--tasks', task, '--recipe', recipe, '--set', 'hidden_sizes=64,32']
+    for job in jobs_from_arguments(parse_arguments([*arguments, '--output', str(tmp_path)])):
         parsed = train_her.parse_arguments(_start_arguments(job))
         assert train_her.config_from_arguments(parsed) == job.config
 
 
-def test_all_jobs_but_for_arm_and_seed_have_one_configuration() -> None:
-    jobs = jobs_from_arguments(parse_arguments([]))
+def test_all_jobs_but_for_arm_and_seed_have_one_configuration(tmp_path: Path) -> None:
+    jobs = jobs_from_arguments(parse_arguments(['--output', str(tmp_path)]))
     assert len(jobs) == 20
 
     def shared(config: TrainConfig) -> list[object]:
