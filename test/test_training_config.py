@@ -19,7 +19,7 @@ from policy_node.training.config import (
     parse_assignment,
     recipe_config,
 )
-from policy_node.training.trainer import split_threads
+from policy_node.training.threads import split_threads
 
 
 def test_the_paper_recipe_is_appendix_b() -> None:

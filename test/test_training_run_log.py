@@ -14,15 +14,26 @@ def row(steps: int, success: float | None) -> dict[str, float | None]:
     return {**values, 'env_steps': steps, 'eval_success': success, 'train_success': 0.25}
 
 
-def test_rows_come_back_and_a_resumed_run_appends(tmp_path: Path) -> None:
-    for steps in (100, 200):
-        log = RunLog(tmp_path, total_steps=1000, time_limit=0)
-        log.write(row(steps, None if steps == 100 else 0.5))
+def test_a_resumed_run_goes_on_after_its_checkpoint(tmp_path: Path) -> None:
+    for resumed_steps, steps in ((0, (100, 200, 300)), (200, (250,))):
+        log = RunLog(tmp_path, 1000, 0, resumed_steps)
+        for step in steps:
+            log.write(row(step, None if step == 100 else step / 1000))
         log.close()
-    first, second = read_progress(tmp_path / 'progress.csv')
-    assert first['env_steps'] == 100 and 'eval_success' not in first
-    assert second['env_steps'] == 200 and second['eval_success'] == 0.5
-    assert set(second) == set(COLUMNS)
+    rows = read_progress(tmp_path / 'progress.csv')
+    assert [values['env_steps'] for values in rows] == [100, 200, 250]
+    assert 'eval_success' not in rows[0] and rows[2]['eval_success'] == 0.25
+    assert set(rows[1]) == set(COLUMNS)
+
+
+def test_a_line_that_a_killed_run_cut_short_is_dropped_on_resuming(tmp_path: Path) -> None:
+    log = RunLog(tmp_path, 1000, 0)
+    log.write(row(100, 0.5))
+    log.close()
+    with (tmp_path / 'progress.csv').open('a') as file:
+        file.write('1,200,1')
+    RunLog(tmp_path, 1000, 0, resumed_steps=200).close()
+    assert [values['env_steps'] for values in read_progress(tmp_path / 'progress.csv')] == [100]
 
 
 def test_the_live_line_says_where_the_run_is(

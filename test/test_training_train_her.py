@@ -15,10 +15,13 @@ import numpy as np
 import pytest
 import torch
 
+from msgs_spec.tasks import task_spec
 from policy_node import checkpoint
 from policy_node.training.config import TrainConfig, recipe_config
 from policy_node.training.distributed import Workers
 from policy_node.training.evaluate import EpisodeOutcomes
+from policy_node.training.generate_episodes import main as generate_episodes
+from policy_node.training.logged_episodes import read_experience
 from policy_node.training.run_log import read_progress
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
@@ -156,6 +159,69 @@ def test_a_training_state_restores_everything(tmp_path: Path) -> None:
     first.save()
     again = weights(tmp_path / 'training_state.safetensors')
     assert all(torch.equal(tensors[name], again[name]) for name in again)
+
+
+@pytest.fixture(scope='module')
+def logged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve logged FetchReach episodes of random actions and one of another task."""
+    folder = tmp_path_factory.mktemp('logged')
+    for task, count in (('FetchReach', 12), ('FetchPush', 1)):
+        arguments = ['--policy', 'random', '--task', task, '--threads', '1']
+        arguments += ['--episodes', str(count), '--output', str(folder)]
+        assert generate_episodes(arguments) == 0
+    return folder
+
+
+def test_logged_episodes_are_learnt_from_before_any_step(
+    tmp_path: Path, logged: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, extra in (('with', ['--from-episodes', str(logged)]), ('without', [])):
+        waits = ['--set', 'learning_starts=1000', '--output', str(tmp_path / name)]
+        assert main([*SMALL, *waits, *extra]) == 0
+    said = capsys.readouterr().err
+    assert f'12 episodes from {logged}; 1 left out, first: ' in said
+    assert 'FetchPush, not FetchReach' in said
+    with_logs, without = (
+        read_progress(tmp_path / name / 'progress.csv') for name in ('with', 'without')
+    )
+    # 600 transitions of the logs and 400 of the first cycle make the 1,000.
+    assert [row['updates'] for row in with_logs] == [4, 8, 12]
+    assert [row['updates'] for row in without] == [0, 0, 4]
+    assert [row['env_steps'] for row in with_logs] == [400, 800, 1200]
+    state = weights(tmp_path / 'with' / 'training_state.safetensors')
+    assert state['observation_statistics.count'] == 1200 + 600
+
+
+def test_workers_share_logged_episodes_and_a_resumed_run_counts_them_once(
+    tmp_path: Path, logged: Path
+) -> None:
+    episodes, _ = read_experience(logged, task_spec('FetchReach'))
+    trainer = Trainer(small_config(total_steps=400), tmp_path, Workers())
+    trainer.train()
+    before = trainer.experience.statistics['observation_statistics'].state()
+    resumed = Trainer(small_config(), tmp_path, Workers())
+    resumed.resume(tmp_path / 'training_state.safetensors')
+    resumed.workers = dataclasses.replace(resumed.workers, rank=1, world_size=3)
+    resumed.add_experience(episodes)
+    assert len(resumed.experience.replay) == 4
+    held = resumed.experience.replay.episodes
+    np.testing.assert_array_equal(held.action, episodes.action[1::3])
+    after = resumed.experience.statistics['observation_statistics'].state()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_logs_that_cannot_be_learnt_from_are_refused(
+    tmp_path: Path, logged: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = ['--output', str(tmp_path / 'run')]
+    small = ['--from-episodes', str(logged), '--set', 'replay_transitions=500', *output]
+    assert main([*SMALL, *small]) == 2
+    assert 'holds 600 transitions, the replay 500; allow more with' in capsys.readouterr().err
+    assert main([*SMALL, '--from-episodes', str(tmp_path), *output]) == 2
+    assert 'holds no usable episode of FetchReach' in capsys.readouterr().err
+    assert main([*SMALL, '--from-episodes', str(logged), '--set', 'control_hz=50', *output]) == 2
+    assert 'holds no usable episode of FetchReach' in capsys.readouterr().err
+    assert not (tmp_path / 'run').exists(), 'refused before anything was written'
 
 
 def test_an_unfitting_state_is_refused_in_one_line(tmp_path: Path) -> None:

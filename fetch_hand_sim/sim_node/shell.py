@@ -44,6 +44,8 @@ from msgs_spec.tick import Tick
 from msgs_spec.topics import DIAGNOSTICS, MONITORING, REAL_TIME_FACTOR, topics
 
 _WARN_PERIOD = 1.0
+# Seconds a beat may take: none begins that close to a tick.
+_BEAT_TIME = 0.01
 # Seconds a robot waits in lockstep before it says so, and between two lines about it.
 _WAITING_PERIOD = 5.0
 _LAST_WORDS_TIMEOUT = 1.0
@@ -173,9 +175,11 @@ class SimNode(Node):
             self._ticked_at = time.monotonic()
 
     def _beat_when_due(self) -> None:
-        """Does what has to happen a few times a second, whatever the robot does."""
+        """Does what has to happen a few times a second; a tick that is near goes first."""
         now = time.monotonic()
-        if now < self._beat_due:
+        if now < self._beat_due or (
+            self._robot.wait() < _BEAT_TIME and now < self._beat_due + BEAT
+        ):
             return
         self._beat_due = now + BEAT
         if now - self._ticked_at >= BEAT:

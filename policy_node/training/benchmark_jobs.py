@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
-import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from policy_node.training import train_her
 from policy_node.training.config import TrainConfig, config_from_dict, recipe_config
+from policy_node.training.run_folder import STATE_FILE
 from policy_node.training.run_log import read_progress
-from policy_node.training.trainer import STATE_FILE
 from policy_node.training.training_state import read_extra
 
 PROGRESS_FILE = 'progress.csv'
@@ -154,9 +152,6 @@ def list_jobs(
 def run_job(job: Job) -> bool:
     """Starts or continues a job in this process; False if a signal ended it early.
 
-    What a killed job logged after its last checkpoint is replaced by what comes now: see
-    `benchmark_results.read_curve`.
-
     Raises:
         JobTakenError: If another process works on it.
         JobError: If training failed; `train_her` has printed why.
@@ -170,8 +165,7 @@ def run_job(job: Job) -> bool:
         if job.is_finished:
             return True
         resume = ['--resume', str(job.folder), *_assignments(job.config, _SPEED_FIELDS)]
-        with _signals_given_back():
-            status = train_her.main(resume if job.has_checkpoint else _start_arguments(job))
+        status = train_her.main(resume if job.has_checkpoint else _start_arguments(job))
         if status != 0:
             raise JobError(f'{job.name} ended with status {status}; see {job.folder}')
         return job.is_finished
@@ -194,14 +188,3 @@ def _assignments(config: TrainConfig, names: Sequence[str]) -> list[str]:
         text = ','.join(map(str, value)) if isinstance(value, tuple) else str(value)
         arguments += ['--set', f'{name}={text}']
     return arguments
-
-
-@contextmanager
-def _signals_given_back() -> Iterator[None]:
-    """Between two jobs a signal must not go to the job before."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)

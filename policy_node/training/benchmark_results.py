@@ -21,8 +21,8 @@ from msgs_spec.tasks import task_spec
 from policy_node.checkpoint import read_info
 from policy_node.training.benchmark_jobs import ARMS, PROGRESS_FILE, Job
 from policy_node.training.benchmark_published import BEST, RERUN
+from policy_node.training.run_folder import LATEST_FILE
 from policy_node.training.run_log import read_progress
-from policy_node.training.trainer import LATEST_FILE
 
 # An epoch of the paper: 50 cycles of 2 episodes on each of 19 workers.
 EPISODES_PER_EPOCH = 1900
@@ -64,18 +64,10 @@ class Band:
 def read_curve(path: Path) -> Curve:
     """Reads the evaluations of a `progress.csv`.
 
-    A run that was killed goes on from its last checkpoint, and its log then steps back: rows
-    beyond that point count no more.
-
     Raises:
         ValueError: If there is no evaluation.
     """
-    kept: list[dict[str, float]] = []
-    for row in read_progress(path):
-        while kept and kept[-1]['env_steps'] >= row['env_steps']:
-            kept.pop()
-        kept.append(row)
-    evaluated = [row for row in kept if 'eval_success' in row]
+    evaluated = [row for row in read_progress(path) if 'eval_success' in row]
     if not evaluated:
         raise ValueError(f'{path} holds no evaluation')
     return Curve(

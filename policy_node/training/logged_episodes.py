@@ -8,16 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from fetch_hand_sim.episode_log import EpisodeArrays, load_episodes
-from msgs_spec.tasks import TaskSpec
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec
 from policy_node.training.replay import Episodes
 
 
-def read_experience(directory: Path, task: TaskSpec) -> tuple[Episodes, list[str]]:
+def read_experience(
+    directory: Path, task: TaskSpec, control_hz: float = DEFAULT_CONTROL_HZ
+) -> tuple[Episodes, list[str]]:
     """Loads the episodes of a task that the trainer can learn from.
 
     Args:
         directory: Where episodes were logged: by `sim_node`, `generate_episodes` or both.
         task: The task; episodes of others are left out.
+        control_hz: Action frequency, Hz; episodes at another are left out.
 
     Returns:
         The episodes, and one line for each that was left out: damaged, of another task or rate,
@@ -30,7 +33,7 @@ def read_experience(directory: Path, task: TaskSpec) -> tuple[Episodes, list[str
     loaded = load_episodes(directory, on_skip=lambda error: skipped.append(str(error)))
     usable = []
     for episode in loaded:
-        reason = why_unusable(episode, task)
+        reason = why_unusable(episode, task, control_hz)
         if reason:
             skipped.append(f'{episode.path}: {reason}')
         else:
@@ -41,7 +44,7 @@ def read_experience(directory: Path, task: TaskSpec) -> tuple[Episodes, list[str
     return to_experience(usable), skipped
 
 
-def why_unusable(episode: EpisodeArrays, task: TaskSpec, control_hz: float = 25.0) -> str:
+def why_unusable(episode: EpisodeArrays, task: TaskSpec, control_hz: float) -> str:
     """Returns why the trainer cannot take an episode, '' if it can."""
     if episode.spec.name != task.name:
         return f'{episode.spec.name}, not {task.name}'

@@ -34,16 +34,27 @@ _PLAIN_INTERVAL = 15.0
 class RunLog:
     """Writes one row per cycle; a resumed run appends to the same file."""
 
-    def __init__(self, output: Path, total_steps: int, time_limit: float) -> None:
+    def __init__(
+        self, output: Path, total_steps: int, time_limit: float, resumed_steps: int = 0
+    ) -> None:
+        """Opens the files.
+
+        Args:
+            output: Folder of the run.
+            total_steps: Environment steps of the whole run, for the ETA.
+            time_limit: Its limit, seconds; 0 is none.
+            resumed_steps: Environment steps of the checkpoint the run goes on from. What was logged
+                after it, and is about to be run again, is removed.
+        """
         self.path = output / 'progress.csv'
         self._total_steps = total_steps
         self._time_limit = time_limit
-        existing = self.path.is_file() and self.path.stat().st_size > 0
-        self._file: IO[str] = self.path.open('a', newline='')
+        kept = _rows_until(self.path, resumed_steps)
+        self._file: IO[str] = self.path.open('w', newline='')
         self._writer = csv.DictWriter(self._file, COLUMNS)
-        if not existing:
-            self._writer.writeheader()
-        self._board = _tensorboard(output)
+        self._writer.writeheader()
+        self._writer.writerows(kept)
+        self._board = _tensorboard(output, resumed_steps)
         self._console = Console(stderr=True)
         self._live = Live(console=self._console, refresh_per_second=4, transient=False)
         self._last_plain = 0.0
@@ -109,12 +120,21 @@ def _clock(seconds: float) -> str:
     return f'{hours}:{minutes:02}:{rest:02}'
 
 
-def _tensorboard(output: Path) -> Any:
+def _rows_until(path: Path, env_steps: int) -> list[dict[str, str]]:
+    """Rows of a log up to `env_steps`; a line cut short by a killed run is left out."""
+    if env_steps == 0 or not path.is_file():
+        return []
+    with path.open(newline='') as file:
+        rows = [row for row in csv.DictReader(file) if None not in row.values()]
+    return [row for row in rows if float(row['env_steps']) <= env_steps]
+
+
+def _tensorboard(output: Path, resumed_steps: int) -> Any:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         return None
-    return SummaryWriter(str(output / 'tensorboard'))
+    return SummaryWriter(str(output / 'tensorboard'), purge_step=resumed_steps + 1)
 
 
 def read_progress(path: str | Path) -> list[dict[str, float]]:

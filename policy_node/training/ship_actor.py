@@ -14,8 +14,8 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node import checkpoint
 from policy_node.training.evaluate import evaluate, summarize
 from policy_node.training.evaluate_policy import FIRST_SEED, print_table
+from policy_node.training.run_folder import BEST_FILE
 from policy_node.training.run_log import draw_curve, read_progress
-from policy_node.training.trainer import BEST_FILE
 
 ACTORS = Path(__file__).parents[1] / 'actors'
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from msgs_spec.tasks import TASKS
+from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.config import (
     RECIPES,
     TrainConfig,
@@ -20,6 +21,10 @@ from policy_node.training.config import (
     parse_assignment,
     recipe_config,
 )
+
+if TYPE_CHECKING:
+    from policy_node.training.replay import Episodes
+    from policy_node.training.trainer import Trainer
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -50,6 +55,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='any field of TrainConfig')
     add('--output', type=Path, help='default: runs/<task>_<recipe>_seed<seed>')
     add('--resume', type=Path, help='folder of a run to continue; its configuration is kept')
+    add('--from-episodes', type=Path, metavar='DIR', help='logged episodes to learn from as well')
     return parser.parse_args(arguments)
 
 
@@ -86,7 +92,7 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
         if options.task is None:
             raise ValueError(f'--task is missing; allowed: {", ".join(TASKS)}')
         return recipe_config(options.task, options.recipe, **overrides)
-    from policy_node.training.trainer import STATE_FILE
+    from policy_node.training.run_folder import STATE_FILE
     from policy_node.training.training_state import read_extra
 
     stored = read_extra(options.resume / STATE_FILE)['config']
@@ -125,26 +131,31 @@ def train(config: TrainConfig, options: argparse.Namespace, arguments: Sequence[
     """Trains as configured and reports how it went."""
     from policy_node.training.ddpg import choose_device
     from policy_node.training.distributed import join_workers, leave_workers
+    from policy_node.training.run_folder import STATE_FILE
     from policy_node.training.run_log import RunLog
-    from policy_node.training.trainer import STATE_FILE, Trainer, TrainingError
+    from policy_node.training.trainer import Trainer, TrainingError
 
     output = options.resume or options.output
     output = output or Path('runs') / f'{config.task}_{config.recipe}_seed{config.seed}'
-    output.mkdir(parents=True, exist_ok=True)
     if options.resume is None and (output / STATE_FILE).exists():
         raise ValueError(f'{output} holds a run; continue it with --resume or choose another')
+    experience = _read_experience(config, options.from_episodes)
+    output.mkdir(parents=True, exist_ok=True)
     workers = join_workers(choose_device(config.device))
     command = shlex.join(['train_her', *arguments])
     trainer = Trainer(config, output, workers, command, source_revision())
     if options.resume is not None:
         trainer.resume(output / STATE_FILE)
-    _stop_on_signals(trainer)
+    if experience is not None:
+        trainer.add_experience(experience)
     log = None
     if workers.is_first:
-        (output / 'command.txt').open('a').write(command + '\n')
-        log = RunLog(output, config.total_steps, config.time_limit)
+        with (output / 'command.txt').open('a') as file:
+            file.write(command + '\n')
+        log = RunLog(output, config.total_steps, config.time_limit, trainer.counters.env_steps)
     try:
-        reason = trainer.train(log)
+        with _stop_on_signals(trainer):
+            reason = trainer.train(log)
     except TrainingError as error:
         print(f'train_her: {error}; the last checkpoint is kept in {output}', file=sys.stderr)
         return 1
@@ -157,7 +168,30 @@ def train(config: TrainConfig, options: argparse.Namespace, arguments: Sequence[
     return 0
 
 
-def _stop_on_signals(trainer: Any) -> None:
+def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | None:
+    """Loads logged episodes and says what was left out; None without a directory.
+
+    Raises:
+        ValueError: If there are none to learn from, or more than the replay holds.
+    """
+    if directory is None:
+        return None
+    from policy_node.training.logged_episodes import read_experience
+
+    episodes, skipped = read_experience(directory, task_spec(config.task), config.control_hz)
+    transitions = len(episodes) * episodes.ticks
+    if transitions > config.replay_transitions:
+        raise ValueError(
+            f'{directory} holds {transitions} transitions, the replay {config.replay_transitions}; '
+            f'allow more with --set replay_transitions={transitions}'
+        )
+    left_out = f'; {len(skipped)} left out, first: {skipped[0]}' if skipped else ''
+    print(f'{len(episodes)} episodes from {directory}{left_out}', file=sys.stderr)
+    return episodes
+
+
+@contextlib.contextmanager
+def _stop_on_signals(trainer: Trainer) -> Iterator[None]:
     """Ctrl-C and SIGTERM end the run after the cycle; a second one ends it at once."""
 
     def handle(number: int, frame: FrameType | None) -> None:
@@ -165,8 +199,13 @@ def _stop_on_signals(trainer: Any) -> None:
         trainer.stop(f'stopped by {signal.Signals(number).name}')
         signal.signal(number, signal.SIG_DFL)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handle)
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _report(config: TrainConfig, output: Path, reason: str, counters: Any) -> None:

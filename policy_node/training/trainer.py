@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
-import os
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,39 +14,19 @@ import numpy as np
 import torch
 
 from fetch_hand_sim.simulation import Simulation
-from policy_node import checkpoint
 from policy_node.actor import Actor, NetworkShape
-from policy_node.checkpoint import ActorInfo
 from policy_node.training.collector import Collector
 from policy_node.training.config import TrainConfig
 from policy_node.training.ddpg import DDPG, Losses, choose_device
 from policy_node.training.distributed import Workers
-from policy_node.training.evaluate import EpisodeOutcomes, evaluate, wilson_interval
-from policy_node.training.hindsight import goal_mixture, sample_transitions
-from policy_node.training.normalizer import RunningStatistics
-from policy_node.training.replay import EpisodeReplay, Episodes
+from policy_node.training.evaluate import EpisodeOutcomes
+from policy_node.training.evaluator import EVALUATION_SEED, Evaluator
+from policy_node.training.experience import Experience
+from policy_node.training.replay import Episodes
+from policy_node.training.run_folder import BEST_FILE, LATEST_FILE, RunFolder
 from policy_node.training.run_log import RunLog
-from policy_node.training.training_state import Counters, load_state, save_state
-
-# Seeds of evaluation episodes start here; those of training runs stay far below.
-EVALUATION_SEED = 1_000_000_000
-STATE_FILE = 'training_state.safetensors'
-LATEST_FILE = 'latest.safetensors'
-BEST_FILE = 'best.safetensors'
-
-
-def split_threads(config: TrainConfig) -> tuple[int, int]:
-    """Threads for simulations and for tensors; those left open are chosen from this worker's cores.
-
-    Both work at the same time when they overlap: more threads than cores would wait for each other.
-    A second tensor thread gains 5 % at 3 x 256 and batch 1024, 80 % at 4096 (measured, 4 cores).
-    """
-    local_workers = int(os.environ.get('LOCAL_WORLD_SIZE', '1'))
-    cores = max(len(os.sched_getaffinity(0)) // local_workers, 1)
-    small = config.batch_size <= 1024
-    tensor_threads = config.torch_threads or (1 if small else max(cores // 2, 1))
-    rest = max(cores - tensor_threads, 1) if config.overlap else cores
-    return config.simulation_threads or rest, tensor_threads
+from policy_node.training.threads import split_threads
+from policy_node.training.training_state import Counters, load_state
 
 
 class TrainingError(RuntimeError):
@@ -86,10 +64,8 @@ class Trainer:
             source_revision: Revision of the source, likewise.
         """
         self.config = config
-        self.output = output
         self.workers = workers
-        self._command = command
-        self._source_revision = source_revision
+        self._folder = RunFolder(output, config, command, source_revision)
         self.device = choose_device(config.device)
         self._simulation_threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
@@ -98,7 +74,6 @@ class Trainer:
         self._build_learner()
         self.counters = Counters()
         self._stop_reason = ''
-        self._next_evaluation = 0
         self._learning_starts = config.learning_starts
         self._last_checkpoint = time.monotonic()
 
@@ -112,14 +87,12 @@ class Trainer:
         }
         num_envs = share(config.num_envs)
         self.simulation = Simulation(config.task, num_envs=num_envs, **options)
-        # Evaluation has its own copies, so that it leaves no trace in the training episodes.
         count = min(num_envs, config.evaluation_episodes)
-        self._evaluation = Simulation(config.task, num_envs=count, **options)
+        self._evaluator = Evaluator(Simulation(config.task, num_envs=count, **options), config)
         self.spec = self.simulation.spec
-        self._seed(env_steps=0)
 
-    def _seed(self, env_steps: int) -> None:
-        """Seeds resets, exploration and sampling of this worker from `env_steps` on."""
+    def _seed(self, env_steps: int) -> np.random.Generator:
+        """Seeds resets and exploration from `env_steps` on; returns the generator of batches."""
         config = self.config
         seeds = np.random.SeedSequence([config.seed, self.workers.rank, env_steps])
         collector_seeds, sampler_seed = seeds.spawn(2)
@@ -131,10 +104,10 @@ class Trainer:
             config.noise_std,
             config.random_epsilon,
         )
-        self._generator = np.random.default_rng(sampler_seed)
+        return np.random.default_rng(sampler_seed)
 
     def _build_learner(self) -> None:
-        config, spec, share = self.config, self.spec, self.workers.share
+        config, spec = self.config, self.spec
         shape = NetworkShape(
             observation_size=spec.observation_size,
             goal_size=spec.goal.size,
@@ -143,19 +116,9 @@ class Trainer:
             layer_norm=config.layer_norm,
         )
         self.learner = DDPG(shape, config, self.device, self.workers)
-        self.statistics = {
-            'observation_statistics': RunningStatistics(spec.observation_size),
-            'goal_statistics': RunningStatistics(spec.goal.size),
-        }
-        capacity = max(share(config.replay_transitions) // spec.episode_ticks, 1)
-        self.replay = EpisodeReplay(
-            max(capacity, self.simulation.num_envs),
-            spec.episode_ticks,
-            spec.observation_size,
-            spec.goal.size,
-            spec.robot.action_size,
-        )
-        self.batch_size = share(config.batch_size)
+        compute_reward = self.simulation.compute_reward
+        generator = self._seed(env_steps=0)
+        self.experience = Experience(config, spec, self.workers, compute_reward, generator)
 
     def stop(self, reason: str) -> None:
         """Asks the run to end after the current cycle, with a checkpoint."""
@@ -167,12 +130,27 @@ class Trainer:
         Raises:
             ValueError: If the file does not fit the configuration.
         """
-        self.counters = load_state(path, self.learner, self.statistics)
+        self.counters = load_state(path, self.learner, self.experience.statistics)
         # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
-        self._seed(self.counters.env_steps)
+        self.experience.generator = self._seed(self.counters.env_steps)
         refill = min(self.counters.env_steps, self.config.replay_transitions, 100_000)
         self._learning_starts = max(self._learning_starts, refill)
-        self._next_evaluation = self.counters.env_steps + self.config.evaluate_every
+        self._evaluator.postpone(self.counters.env_steps)
+
+    def add_experience(self, episodes: Episodes) -> None:
+        """Puts episodes from elsewhere into the replay; each worker takes its share.
+
+        They do not count as environment steps. Normalisers learn from them too, unless the run was
+        resumed and so may have seen them.
+
+        Raises:
+            ValueError: If they do not fit into the replay.
+        """
+        rows = np.arange(len(episodes)) % self.workers.world_size == self.workers.rank
+        share = episodes.select(rows)
+        self.experience.replay.add(share)
+        if self.counters.env_steps == 0:
+            self.experience.normalize(share, self.learner.actor, env_steps=0)
 
     def train(self, log: RunLog | None = None) -> str:
         """Runs until a limit is reached or `stop` is called; returns why it ended.
@@ -210,28 +188,16 @@ class Trainer:
         """What to collect next: with which actor, whether at random, and which to evaluate."""
         steps = self.counters.env_steps
         actor, evaluated = copy.deepcopy(self.learner.actor).cpu().eval(), None
-        if steps >= self._next_evaluation and self.counters.updates > 0:
-            self._next_evaluation = steps + self.config.evaluate_every
-            if self.workers.is_first:
-                evaluated = self.learner.evaluation_actor()
+        if self.counters.updates > 0 and self._evaluator.is_due(steps) and self.workers.is_first:
+            evaluated = self.learner.evaluation_actor()
         return actor, steps < self.config.random_steps, evaluated
 
     def _collect(self, actor: Actor, random: bool, evaluated: Actor | None) -> Collected:
-        outcomes = None if evaluated is None else self._evaluate(evaluated)
+        outcomes = None
+        if evaluated is not None:
+            outcomes = self._evaluator.evaluate(evaluated, self.counters.best_success)
         episodes, success = self.collector.collect(actor, random)
         return Collected(episodes, success, outcomes, evaluated)
-
-    def _evaluate(self, actor: Actor) -> EpisodeOutcomes:
-        def hopeless(outcomes: EpisodeOutcomes) -> bool:
-            successes = int(self._successes(outcomes).sum())
-            return wilson_interval(successes, len(outcomes))[1] < self.counters.best_success
-
-        episodes = self.config.evaluation_episodes
-        return evaluate(self._evaluation, actor, episodes, EVALUATION_SEED, hopeless)
-
-    def _successes(self, outcomes: EpisodeOutcomes) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        paper = self.config.success_rule == 'paper'
-        return outcomes.success_paper if paper else outcomes.success_gymnasium
 
     def _collect_or_explain(self, job: Future[Collected]) -> Collected:
         collected = job.result()
@@ -246,51 +212,22 @@ class Trainer:
         """Puts new episodes into the replay and into the normalisers."""
         episodes = collected.episodes
         if len(episodes):
-            self.replay.add(episodes)
+            self.experience.replay.add(episodes)
         count = self.workers.sum(torch.tensor([len(episodes)])).item()
         self.counters.episodes += int(count)
         self.counters.env_steps += int(count) * self.spec.episode_ticks
-        self._update_normalizers(episodes)
-
-    def _update_normalizers(self, episodes: Episodes) -> None:
-        """Adds the new episodes, goals relabelled as the networks will see them."""
-        observation = episodes.observation[:, :-1]
-        goal = episodes.desired_goal
-        if len(episodes):
-            row = np.repeat(np.arange(len(episodes)), episodes.ticks)
-            goal = sample_transitions(
-                episodes, row, self._mixture(), self.simulation.compute_reward, self._generator
-            ).goal
-        actor = self.learner.actor
-        for name, values, normalizer in (
-            ('observation_statistics', observation, actor.observation_normalizer),
-            ('goal_statistics', goal, actor.goal_normalizer),
-        ):
-            self.statistics[name].update(values, self.workers)
-            self.statistics[name].write(normalizer)
-
-    def _mixture(self) -> dict[str, float]:
-        config = self.config
-        early = self.counters.env_steps < config.future_only_steps
-        strategy = 'future' if early and config.strategy == 'futureactual' else config.strategy
-        return goal_mixture(strategy, config.hindsight_k)
+        self.experience.normalize(episodes, self.learner.actor, self.counters.env_steps)
 
     def _learn(self) -> list[Losses]:
-        held = len(self.replay) * self.spec.episode_ticks
-        if self.workers.any(held < max(self.workers.share(self._learning_starts), 1)):
+        needed = max(self.workers.share(self._learning_starts), 1)
+        if self.workers.any(self.experience.transitions < needed):
             return []
-        self.learner.set_progress(self.counters.env_steps / self.config.total_steps)
-        mixture, episodes = self._mixture(), self.replay.episodes
-        losses = []
-        for _ in range(self.config.updates_per_cycle):
-            batch = sample_transitions(
-                episodes,
-                self.replay.draw(self.batch_size, self.config.moved_share, self._generator),
-                mixture,
-                self.simulation.compute_reward,
-                self._generator,
-            )
-            losses.append(self.learner.update(batch))
+        steps = self.counters.env_steps
+        self.learner.set_progress(steps / self.config.total_steps)
+        losses = [
+            self.learner.update(self.experience.batch(steps))
+            for _ in range(self.config.updates_per_cycle)
+        ]
         self.learner.average()
         self.counters.updates = self.learner.updates
         return losses
@@ -311,13 +248,16 @@ class Trainer:
     def _keep_best(self, collected: Collected) -> None:
         """Saves the evaluated actor if it succeeds more often, or as often and sooner."""
         outcomes, actor, counters = collected.evaluation, collected.evaluated, self.counters
-        if outcomes is None or actor is None or len(outcomes) < self.config.evaluation_episodes:
+        if outcomes is None or actor is None or not self._evaluator.is_complete(outcomes):
             return
-        success = float(self._successes(outcomes).mean())
+        success = self._evaluator.success_rate(outcomes)
         mean_return = float(outcomes.episode_return.mean())
         if (success, mean_return) > (counters.best_success, counters.best_return):
             counters.best_success, counters.best_return = success, mean_return
-            self._save_actor(BEST_FILE, actor, outcomes)
+            if self.workers.is_first:
+                rule = self.config.success_rule
+                measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
+                self._folder.save_actor(BEST_FILE, actor, counters.env_steps, measured)
 
     def _reason_to_stop(self, collected: Collected) -> str:
         config, reason = self.config, self._stop_reason
@@ -337,42 +277,15 @@ class Trainer:
     def save(self) -> None:
         """Writes the latest actor and the training state (worker 0 only)."""
         self._last_checkpoint = time.monotonic()
-        if not self.workers.is_first:
-            return
-        self._save_actor(LATEST_FILE, self.learner.actor, None)
-        extra = {'config': dataclasses.asdict(self.config)}
-        path = self.output / STATE_FILE
-        save_state(path, self.learner, self.statistics, self.counters, extra)
-
-    def _save_actor(self, name: str, actor: Actor, outcomes: EpisodeOutcomes | None) -> None:
-        if not self.workers.is_first:
-            return
-        config, success = self.config, {}
-        if outcomes is not None:
-            rate = float(self._successes(outcomes).mean())
-            success = {'last_step': rate, 'episodes': len(outcomes), 'rule': config.success_rule}
-        info = ActorInfo(
-            task=config.task,
-            observation_layout=checkpoint.observation_layout(self.spec),
-            goal_size=self.spec.goal.size,
-            action_size=self.spec.robot.action_size,
-            hidden_sizes=config.hidden_sizes,
-            layer_norm=config.layer_norm,
-            control_hz=config.control_hz,
-            seed=config.seed,
-            command=self._command,
-            source_revision=self._source_revision,
-            env_steps=self.counters.env_steps,
-            config=dataclasses.asdict(config),
-            success=success,
-        )
-        checkpoint.save(self.output / name, actor, info)
+        if self.workers.is_first:
+            self._folder.save_actor(LATEST_FILE, self.learner.actor, self.counters.env_steps)
+            self._folder.save_state(self.learner, self.experience.statistics, self.counters)
 
     def _row(
         self, collected: Collected, losses: list[Losses], seconds: float
     ) -> dict[str, float | None]:
         counters, outcomes = self.counters, collected.evaluation
-        samples = len(losses) * self.batch_size * self.workers.world_size
+        samples = len(losses) * self.experience.batch_size * self.workers.world_size
         steps = self.simulation.num_envs * self.spec.episode_ticks * self.workers.world_size
 
         def mean(name: str) -> float | None:
@@ -384,7 +297,7 @@ class Trainer:
             'episodes': counters.episodes,
             'updates': counters.updates,
             'train_success': collected.train_success,
-            'eval_success': None if outcomes is None else float(self._successes(outcomes).mean()),
+            'eval_success': None if outcomes is None else self._evaluator.success_rate(outcomes),
             'eval_episodes': None if outcomes is None else len(outcomes),
             'critic_loss': mean('critic'),
             'actor_loss': mean('actor'),
