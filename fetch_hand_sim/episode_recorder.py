@@ -1,24 +1,29 @@
 """Logs the ticks of a running robot, episode by episode, without holding the robot up.
 
 The messages of a tick are written as they come, microseconds each. Beginning a file takes
-milliseconds and completing one waits for the disk, so both are done by a worker thread. A disk that
-fails stops logging, never the robot.
+milliseconds, compressing a quarter of a second a third of one, and completing a file waits for the
+disk: a worker thread does these. A disk that fails stops logging, never the robot.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Semaphore
+from typing import Any
 
 from fetch_hand_sim.episode_log import Attachment, EpisodeDirectory, EpisodeLogError, EpisodeWriter
+from fetch_hand_sim.episode_log.log_times import log_time
 from msgs_spec.tick import EpisodeStatus, Tick
 from msgs_spec.topics import TopicSpec
 
 Messages = Sequence[tuple[TopicSpec, bytes]]
 
+# Writes of a backlog at a time: those of a tick and as many again.
+_MOST_AT_ONCE = 4
 # Files that may wait for the disk, minutes of a robot in real time.
 _MAX_UNFINISHED = 64
 # Seconds after which a disk with so many files waiting counts as dead.
@@ -41,30 +46,44 @@ class LoggedEpisode:
 
 
 class _EpisodeInProgress:
-    """An episode whose file is being opened by the worker, or is open."""
+    """An episode whose file is written here, except while the worker opens or flushes it."""
 
-    def __init__(self, opening: Future[EpisodeWriter]) -> None:
+    def __init__(self, worker: Executor, begin: Callable[[], EpisodeWriter]) -> None:
         self.status: EpisodeStatus | None = None
-        self._opening = opening
-        self._waiting: list[Callable[[EpisodeWriter], object]] = []
+        self._worker = worker
+        self._opening = worker.submit(begin)
+        self._busy: Future[Any] = self._opening
+        self._waiting: deque[Callable[[EpisodeWriter], object]] = deque()
+
+    def write_tick(self, stamp_ns: int, messages: Messages) -> None:
+        """Writes a tick; see `write`."""
+        if self._busy.done() and not self._waiting:
+            self._busy.result()
+            writer, first_ns = self._opening.result(), log_time(stamp_ns, 0)
+            if writer.flush_is_due(first_ns):
+                self._busy = self._worker.submit(writer.flush, first_ns)
+        self.write(lambda writer: writer.write_tick(stamp_ns, messages))
 
     def write(self, write: Callable[[EpisodeWriter], object]) -> None:
-        """Writes now if the file is open, else as soon as it is.
+        """Writes now if the file is free, else later; a backlog is worked off over some ticks.
 
         Raises:
             EpisodeLogError: If it could not be opened, or at the first error of the disk.
         """
         self._waiting.append(write)
-        if self._opening.done():
-            self.opened()
+        if self._busy.done():
+            self._write_waiting(_MOST_AT_ONCE)
 
-    def opened(self) -> EpisodeWriter:
+    def caught_up(self) -> EpisodeWriter:
         """Waits for the file, writes what waited for it and returns it; likewise."""
+        self._write_waiting(len(self._waiting))
+        return self._opening.result()
+
+    def _write_waiting(self, count: int) -> None:
+        self._busy.result()
         writer = self._opening.result()
-        waiting, self._waiting = self._waiting, []
-        for write in waiting:
-            write(writer)
-        return writer
+        for _ in range(min(count, len(self._waiting))):
+            self._waiting.popleft()(writer)
 
 
 class EpisodeRecorder:
@@ -108,13 +127,15 @@ class EpisodeRecorder:
             self._begin(tick.status)
         if self._current is not None:
             self._current.status = tick.status
-        self._write(lambda writer: writer.write_tick(tick.stamp_ns, messages))
+        self._write(lambda episode: episode.write_tick(tick.stamp_ns, messages))
         if tick.status.phase == 'finished':
             self._complete(lambda writer, result: writer.finish(result), is_complete=True)
 
     def record_received(self, topic: TopicSpec, data: bytes) -> None:
         """Writes a message received since the last tick; between episodes there is no file."""
-        self._write(lambda writer: writer.write_received(topic, data))
+        self._write(
+            lambda episode: episode.write(lambda writer: writer.write_received(topic, data))
+        )
 
     def interrupt(self, reason: str) -> None:
         """Completes the running episode, if there is one, marked as cut short."""
@@ -136,18 +157,17 @@ class EpisodeRecorder:
             self._fail(EpisodeLogError(f'episode log stopped: {_MAX_UNFINISHED} files wait'))
             return
         self._current = _EpisodeInProgress(
-            self._worker.submit(
-                lambda: self._episodes.begin(
-                    status.task, status.seed, self._metadata(status), self._attachments
-                )
-            )
+            self._worker,
+            lambda: self._episodes.begin(
+                status.task, status.seed, self._metadata(status), self._attachments
+            ),
         )
 
-    def _write(self, write: Callable[[EpisodeWriter], object]) -> None:
+    def _write(self, write: Callable[[_EpisodeInProgress], None]) -> None:
         if self._current is None:
             return
         try:
-            self._current.write(write)
+            write(self._current)
         except EpisodeLogError as error:
             self._fail(error)
 
@@ -164,7 +184,7 @@ class EpisodeRecorder:
 
         def work() -> None:
             try:
-                path = complete(episode.opened(), episode_result(status))
+                path = complete(episode.caught_up(), episode_result(status))
             except EpisodeLogError as error:
                 self._fail(error)
             else:
