@@ -1,4 +1,4 @@
-"""The README's table of actors says what their evaluation files say."""
+"""The README's tables say what the evaluation files and the benchmark say."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 ACTORS = ROOT / 'policy_node' / 'actors'
-TOOL = runpy.run_path(str(ROOT / 'tools' / 'results_table.py'))
+TOOL = runpy.run_path(str(ROOT / 'tools' / 'readme_tables.py'))
 
 
-def test_readme_has_the_present_table() -> None:
+def test_readme_has_the_present_tables() -> None:
     readme = (ROOT / 'README.md').read_text(encoding='utf-8')
-    assert TOOL['with_table'](readme) == readme, (
-        'run: python tools/results_table.py --write README.md'
+    assert TOOL['with_tables'](readme) == readme, (
+        'run: python tools/readme_tables.py --write README.md'
     )
 
 
 def test_readme_without_markers_is_refused() -> None:
     with pytest.raises(ValueError, match='no <!-- results -->'):
-        TOOL['with_table']('# nothing')
+        TOOL['with_tables']('# nothing')
 
 
 @pytest.mark.parametrize('path', sorted(ACTORS.glob('*.safetensors')), ids=lambda path: path.stem)
