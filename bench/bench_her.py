@@ -13,6 +13,7 @@ import csv
 import datetime
 import importlib.metadata
 import importlib.util
+import itertools
 import json
 import os
 import platform
@@ -86,14 +87,14 @@ class Run:
                 print(self._run['competitor'], self._run['task'], line, end='', flush=True)
 
 
-def measure(task: str, options: argparse.Namespace) -> list[Row]:
-    """Trains all competitors on a task, in turn or side by side.
+def measure(tasks: Sequence[str], options: argparse.Namespace) -> list[Row]:
+    """Trains all competitors on the tasks, in turn or side by side.
 
     Ctrl-C ends it; evaluations until then are returned, with the time they came as the limit.
     """
     runs: list[Run] = []
     try:
-        for competitor in options.competitors:
+        for task, competitor in itertools.product(tasks, options.competitors):
             runs.append(Run(competitor, task, options))
             if not options.side_by_side:
                 runs[-1].wait()
@@ -224,7 +225,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--episodes', type=int, default=100, help='of an evaluation; default: 100')
     add('--evaluate-every', type=int, default=10_000, help='env steps; default: 10000')
     add('--threads', type=int, default=os.cpu_count(), help='of each; default: all cores')
-    add('--side-by-side', action='store_true', help='all competitors of a task at once')
+    add('--side-by-side', action='store_true', help='all competitors, on all tasks, at once')
     add('--seed', type=int, default=0)
     add('--output', type=Path, default=RESULTS, help='folder of CSV, table and PNG')
     options = parser.parse_args(arguments)
@@ -244,7 +245,7 @@ def write_csv(rows: Sequence[Row], columns: Sequence[str], path: Path, machine: 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures task by task; after each the files are written anew. Returns the exit status."""
+    """Measures, and writes the files anew after each task. Returns the exit status."""
     options = parse_arguments(arguments)
     if importlib.util.find_spec('sb3_contrib') is None:
         hint = 'pip install -r bench/requirements_her.txt'
@@ -253,8 +254,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     machine = describe_machine(options)
     options.output.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
-    for task in options.tasks:
-        rows += measure(task, options)
+    for tasks in [options.tasks] if options.side_by_side else [[task] for task in options.tasks]:
+        rows += measure(tasks, options)
         if not rows:
             return 1
         summary = summarize(rows)

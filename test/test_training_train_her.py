@@ -25,7 +25,7 @@ from policy_node.training.logged_episodes import read_experience
 from policy_node.training.run_log import read_progress
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
-from policy_node.training.trainer import Collected, Trainer, TrainingError
+from policy_node.training.trainer import Collected, Trainer, TrainingError, scale_distance
 from policy_node.training.training_state import read_extra
 
 torch.set_num_threads(1)
@@ -222,6 +222,23 @@ def test_logs_that_cannot_be_learnt_from_are_refused(
     assert main([*SMALL, '--from-episodes', str(logged), '--set', 'control_hz=50', *output]) == 2
     assert 'holds no usable episode of FetchReach' in capsys.readouterr().err
     assert not (tmp_path / 'run').exists(), 'refused before anything was written'
+
+
+def test_training_may_ask_for_less_distance_than_the_task(tmp_path: Path) -> None:
+    """FetchReach succeeds within 0.05 m; at half of it a goal 0.03 m away is not reached."""
+    goals = np.zeros((2, 3))
+    achieved = np.array([[0.02, 0.0, 0.0], [0.03, 0.0, 0.0]])
+    trainer = Trainer(small_config(reward_distance=0.5), tmp_path, Workers())
+    closer = scale_distance(trainer.simulation.metric, 0.5)
+    assert closer.reward(achieved, goals).tolist() == [0.0, -1.0]
+    assert trainer.simulation.compute_reward(achieved, goals).tolist() == [0.0, 0.0]
+    trainer.experience.replay.add(trainer.collector.collect(trainer.learner.actor)[0])
+    batch = trainer.experience.batch(env_steps=0)
+    position = batch.next_observation[:, :3].astype(np.float64)
+    distance = np.linalg.norm(position - batch.goal, axis=-1)
+    clear = np.abs(distance - 0.025) > 1e-4
+    np.testing.assert_array_equal(batch.reward[clear] == 0.0, distance[clear] < 0.025)
+    assert ((0.025 < distance) & (distance < 0.05)).any()
 
 
 def test_an_unfitting_state_is_refused_in_one_line(tmp_path: Path) -> None:

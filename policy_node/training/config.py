@@ -33,6 +33,9 @@ class TrainConfig:
     """`sparse` (-1 until success, then 0) or `dense` (negative distance)."""
     success_rule: str = 'gymnasium'
     """Success rule behind the sparse reward: `gymnasium` or `paper`."""
+    reward_distance: float = 1.0
+    """Share of the task's success distance within which the sparse reward of training is 0. Below 1
+    the actor learns to come closer than it has to; evaluation keeps the task's distance."""
     strategy: str = 'future'
     """Hindsight goals: final, future, episode, random, futureactual, or none (no hindsight)."""
     hindsight_k: int = 4
@@ -131,6 +134,7 @@ _INFINITY = float('inf')
 _RANGES = (
     ('seed', 0, 2**31 - 1),
     ('hindsight_k', 1, 1000),
+    ('reward_distance', 1e-3, 1000),
     ('moved_share', 0, 1),
     ('total_steps', 1, _INFINITY),
     ('time_limit', 0, _INFINITY),

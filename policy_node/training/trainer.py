@@ -6,13 +6,14 @@ import copy
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from fetch_hand_sim.rewards import GoalMetric
 from fetch_hand_sim.simulation import Simulation
 from policy_node.actor import Actor, NetworkShape
 from policy_node.training.collector import Collector
@@ -116,7 +117,7 @@ class Trainer:
             layer_norm=config.layer_norm,
         )
         self.learner = DDPG(shape, config, self.device, self.workers)
-        compute_reward = self.simulation.compute_reward
+        compute_reward = scale_distance(self.simulation.metric, config.reward_distance).reward
         generator = self._seed(env_steps=0)
         self.experience = Experience(config, spec, self.workers, compute_reward, generator)
 
@@ -305,6 +306,12 @@ class Trainer:
             'steps_per_second': steps / seconds,
             'samples_per_second': samples / seconds,
         }
+
+
+def scale_distance(metric: GoalMetric, share: float) -> GoalMetric:
+    """A metric whose success distance is that of `metric` times `share`; rotations stay."""
+    distance = metric.spec.distance_threshold * share
+    return replace(metric, spec=replace(metric.spec, distance_threshold=distance))
 
 
 def _run_now(function: Callable[..., Collected], *arguments: Any) -> Future[Collected]:
