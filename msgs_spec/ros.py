@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import FrameType
@@ -58,16 +59,24 @@ class EventLoop:
         """Serves one callback, or none within that time."""
         self._executor.spin_once(timeout_sec=seconds)
 
-    def serve_pending(self) -> None:
-        """Serves what has been waiting, not what arrives meanwhile."""
+    def serve_pending(self, seconds: float) -> None:
+        """Serves what has been waiting, not what arrives meanwhile, at least one callback.
+
+        Args:
+            seconds: No callback begins later than that. What comes in faster than it is served
+                would otherwise never let go.
+        """
         if not self._is_queue:
             self._executor.spin_once(timeout_sec=0.0)
             return
         # First in, first out: the mark comes last of what is there.
         reached: list[bool] = []
         self._executor.create_task(lambda: reached.append(True))
+        end = time.monotonic() + seconds
         while not reached:
             self._executor.spin_once(timeout_sec=0.0)
+            if time.monotonic() >= end:
+                return
 
     def close(self) -> None:
         """Gives the node back."""

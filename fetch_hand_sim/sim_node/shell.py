@@ -46,6 +46,8 @@ from msgs_spec.topics import DIAGNOSTICS, MONITORING, REAL_TIME_FACTOR, topics
 _WARN_PERIOD = 1.0
 # Seconds a beat may take: none begins that close to a tick.
 _BEAT_TIME = 0.01
+# Seconds a due tick waits for messages to be served that came before it.
+_SERVING_TIME = 0.002
 # Seconds a robot waits in lockstep before it says so, and between two lines about it.
 _WAITING_PERIOD = 5.0
 _LAST_WORDS_TIMEOUT = 1.0
@@ -168,7 +170,7 @@ class SimNode(Node):
         if remaining > 0.0:
             loop.wait(min(remaining, BEAT))
             return
-        loop.serve_pending()
+        loop.serve_pending(_SERVING_TIME)
         # A callback may have paused the robot.
         if not stop and self._robot.wait() <= 0.0:
             self._robot.tick_when_due()
