@@ -74,9 +74,11 @@ def report(label: str, times: list[float], missed: int, factor: float) -> None:
     periods = 1e3 * np.diff(times)
     wanted = 40.0 / factor
     late = np.abs(periods - wanted)
+    low, high = np.percentile(periods, (1, 99))
     print(
         f'{label}: {len(periods)} periods, {1e3 / periods.mean():.3f} Hz, std '
-        f'{periods.std():.3f} ms, |period - {wanted:g} ms| median {np.median(late):.3f}, p99 '
+        f'{periods.std():.3f} ms, p1 {low:.3f}, p99 {high:.3f} ms, '
+        f'|period - {wanted:g} ms| median {np.median(late):.3f}, p99 '
         f'{np.percentile(late, 99):.3f}, max {late.max():.3f} ms; {missed} ticks missed; '
         f'load average {os.getloadavg()[0]:.1f}',
         flush=True,
