@@ -27,6 +27,14 @@ PUBLISHED = {
     'FetchSlide': '0.88, 2.5M (`spitis/mrl`, read off a figure)',
     'FetchPickAndPlace': '1.000 of 300 episodes, 5M (SAC+HER, `VladPrytula/robotics_series`)',
     'HandReach': 'about 0.40, 2M (`zzyunzhi/vds`, quoted)',
+    'HandManipulateBlockRotateZ': 'no number found',
+    'HandManipulateBlockRotateParallel': 'no number found',
+    'HandManipulateBlockRotateXYZ': 'no number found',
+    'HandManipulateBlockFull': '0.675, 40M (`spitis/mrl`, read off a figure)',
+    'HandManipulateEggRotate': 'no number found',
+    'HandManipulateEggFull': '0.93, 40M (`spitis/mrl`, read off a figure)',
+    'HandManipulatePenRotate': '0.317, 38M (EBP, arXiv 1810.01363, quoted)',
+    'HandManipulatePenFull': '0.48, 40M (`spitis/mrl`, read off a figure)',
 }
 
 

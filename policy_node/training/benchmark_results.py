@@ -198,7 +198,7 @@ def draw(bands: dict[str, dict[str, Band]], path: Path) -> None:
                 axes.fill_between(band.env_steps, band.lower, band.upper, color=color, alpha=0.2)
                 axes.plot(band.env_steps, band.median, color=color, label=arm.label)
         _label(axes, task)
-    panels[0].legend(loc='lower right', fontsize='small')
+    panels[0].legend(loc='best', fontsize='small')
     figure.savefig(path, dpi=130)
 
 
