@@ -40,26 +40,22 @@ def test_everything_that_waits_is_served_in_order(node):
     for number in range(5):
         publisher.publish(Float64(data=float(number)))
     time.sleep(0.2)
-    loop.serve_pending(1.0)
+    loop.serve_pending(100)
     assert received == [0.0, 1.0, 2.0, 3.0, 4.0]
     loop.close()
 
 
-def test_more_than_can_be_served_in_time_is_left_for_later(node):
+def test_no_more_than_the_limit_is_served_at_once(node):
     received, publisher = collect(node)
     loop = EventLoop(node)
-    node.create_subscription(Float64, 'numbers', lambda m: time.sleep(0.05), 10)
     loop.wait(0.1)
     loop.wait(0.1)
     for number in range(8):
         publisher.publish(Float64(data=float(number)))
     time.sleep(0.2)
-    began = time.monotonic()
-    loop.serve_pending(0.1)
-    assert time.monotonic() - began < 0.3
-    assert 0 < len(received) < 8
-    while len(received) < 8:
-        loop.serve_pending(1.0)
+    loop.serve_pending(5)
+    assert 0 < len(received) <= 5
+    loop.serve_pending(100)
     assert received == [float(number) for number in range(8)]
     loop.close()
 
@@ -81,7 +77,7 @@ def test_older_rclpy_without_events_executor(node, monkeypatch):
     publisher.publish(Float64(data=7.0))
     deadline = time.monotonic() + 5.0
     while not received and time.monotonic() < deadline:
-        loop.serve_pending(1.0)
+        loop.serve_pending(100)
         loop.wait(0.01)
     assert received == [7.0]
     loop.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,10 @@ from msgs_spec.topics import topics
 if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.publisher import Publisher
+
+# Seconds without news after which a node's subscriptions count as known: publishers and
+# subscriptions are discovered apart, in any order.
+_SETTLING_TIME = 0.2
 
 
 class GraphWatch:
@@ -34,19 +39,31 @@ class GraphWatch:
         self.commanders = CommanderWatch(self._topics)
         self.clock_publishers: list[str] = []
         self.has_newcomer = False
+        self._subscribers: list[int] = []
+        self._changed_at = 0.0
 
     def look(self) -> None:
         """Takes in what the graph shows now."""
         found = [endpoint for topic in self._topics for endpoint in self._publishers(topic)]
-        self.has_newcomer |= self.commanders.look(found)
+        if self.commanders.look(found):
+            self.has_newcomer = True
+            self._changed_at = time.monotonic()
         self.clock_publishers = sorted(each.node for each in self._publishers('/clock'))
 
     def is_heard(self, publishers: Mapping[str, Publisher]) -> bool:
-        """Whether everybody seen to subscribe is connected: only then a message reaches them."""
-        return all(
-            publisher.get_subscription_count() >= self._node.count_subscribers(publisher.topic_name)
-            for publisher in publishers.values()
-        )
+        """Whether everybody who subscribes is connected: only then a message reaches them."""
+        known = [self._node.count_subscribers(each.topic_name) for each in publishers.values()]
+        now = time.monotonic()
+        if known != self._subscribers:
+            self._subscribers, self._changed_at = known, now
+        if now - self._changed_at < _SETTLING_TIME:
+            return False
+        connected = (each.get_subscription_count() for each in publishers.values())
+        return all(have >= want for have, want in zip(connected, known, strict=True))
+
+    def will_introduce(self) -> bool:
+        """Whether somebody publishes `policy_status`."""
+        return bool(self._node.count_publishers('policy_status'))
 
     def _publishers(self, topic: str) -> list[Endpoint]:
         return [

@@ -46,8 +46,10 @@ from msgs_spec.topics import DIAGNOSTICS, MONITORING, REAL_TIME_FACTOR, topics
 _WARN_PERIOD = 1.0
 # Seconds a beat may take: none begins that close to a tick.
 _BEAT_TIME = 0.01
-# Seconds a due tick waits for messages to be served that came before it.
-_SERVING_TIME = 0.002
+# Callbacks that are served before a tick which is due: far more than an orderly network leaves.
+_SERVED_FIRST = 100
+# Seconds a robot waits for the name of a commander who is about to give it.
+_INTRODUCTION_TIME = 1.0
 # Seconds a robot waits in lockstep before it says so, and between two lines about it.
 _WAITING_PERIOD = 5.0
 _LAST_WORDS_TIMEOUT = 1.0
@@ -74,6 +76,7 @@ class SimNode(Node):
         self._health = Health(self._robot, self.get_fully_qualified_name(), now)
         self._factor_encoder = TopicEncoder(REAL_TIME_FACTOR)
         self._said: set[str] = set()
+        self._has_introduction = False
         self._beat_due = self._ticked_at = now
         self._report_due = now + REPORT_PERIOD
         self.add_on_set_parameters_callback(set_callback(SIM_NODE))
@@ -163,6 +166,12 @@ class SimNode(Node):
             loop.wait(BEAT)
             watch.look()
             self._beat_when_due()
+        # Latched, so it comes a little after its publisher is seen; the log names who commands.
+        end = time.monotonic() + _INTRODUCTION_TIME
+        while not stop and watch.will_introduce() and not self._has_introduction:
+            if time.monotonic() > end:
+                return
+            loop.wait(BEAT)
 
     def _serve_until_due(self, loop: EventLoop, stop: StopSignals) -> None:
         """Serves one callback, or all that wait and then the tick that is due."""
@@ -170,7 +179,7 @@ class SimNode(Node):
         if remaining > 0.0:
             loop.wait(min(remaining, BEAT))
             return
-        loop.serve_pending(_SERVING_TIME)
+        loop.serve_pending(_SERVED_FIRST)
         # A callback may have paused the robot.
         if not stop and self._robot.wait() <= 0.0:
             self._robot.tick_when_due()
@@ -278,6 +287,7 @@ class SimNode(Node):
         self.get_logger().warning(line, throttle_duration_sec=_WARN_PERIOD)
 
     def _on_commander(self, checkpoint_sha256: str | None) -> None:
+        self._has_introduction = True
         if self._recording_context is not None:
             self._recording_context.checkpoint_sha256 = checkpoint_sha256
 
