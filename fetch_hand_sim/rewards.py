@@ -38,8 +38,6 @@ class GoalMetric:
 
     Attributes:
         spec: The task.
-        uses_position: Whether the position of a pose goal counts (False for the Rotate tasks).
-        ignores_z_rotation: Whether the rotation about the object's own z axis does not count (pen).
         success_rule: `gymnasium` follows the released code (HandReach: norm over all 15
             coordinates; rotations: raw quaternions, so q and -q are 2 pi apart). `paper` follows
             the text of Plappert et al. 2018 (mean fingertip distance; rotation difference).
@@ -47,8 +45,6 @@ class GoalMetric:
     """
 
     spec: TaskSpec
-    uses_position: bool = True
-    ignores_z_rotation: bool = False
     success_rule: SuccessRule = 'gymnasium'
     reward_type: RewardType = 'sparse'
 
@@ -129,13 +125,13 @@ class GoalMetric:
         return values
 
     def _position_distance(self, achieved: Array, desired: Array) -> Array:
-        if not self.uses_position:
+        if not self.spec.position_counts:
             return np.zeros(achieved.shape[:-1])
         return _norm(achieved[..., :3] - desired[..., :3])
 
     def _rotation(self, achieved: Array, desired: Array) -> Array:
         quaternion = achieved[..., 3:]
-        if self.ignores_z_rotation:
+        if self.spec.ignores_z_rotation:
             euler = quaternion_to_euler(quaternion)
             euler[..., 2] = quaternion_to_euler(desired[..., 3:])[..., 2]
             quaternion = euler_to_quaternion(euler)

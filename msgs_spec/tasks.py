@@ -59,6 +59,9 @@ class TaskSpec:
         distance_threshold: Success within this distance, metres.
         rotation_threshold: Success within this rotation, radians; None where there is no rotation.
         reference_id: The environment of Gymnasium-Robotics 1.4.2 that this task equals.
+        achieved_goal: Name of the part of the observation that is the achieved goal.
+        position_counts: Whether the position of a pose goal counts (False for the Rotate tasks).
+        ignores_z_rotation: Whether the rotation about the object's own z axis does not count (pen).
     """
 
     name: str
@@ -70,6 +73,15 @@ class TaskSpec:
     distance_threshold: float
     rotation_threshold: float | None
     reference_id: str
+    achieved_goal: str
+    position_counts: bool = True
+    ignores_z_rotation: bool = False
+
+    @property
+    def achieved_goal_start(self) -> int:
+        """Index at which the achieved goal begins in the observation vector."""
+        names = [part.name for part in self.observation]
+        return sum(part.size for part in self.observation[: names.index(self.achieved_goal)])
 
     @property
     def observation_size(self) -> int:
@@ -127,10 +139,16 @@ def _fetch(name: str, has_object: bool = True) -> TaskSpec:
         distance_threshold=0.05,
         rotation_threshold=None,
         reference_id=f'{name}-v4',
+        achieved_goal='object_position' if has_object else 'end_effector_position',
     )
 
 
-def _hand_manipulate(name: str, distance_threshold: float = 0.01) -> TaskSpec:
+def _hand_manipulate(
+    name: str,
+    distance_threshold: float = 0.01,
+    position_counts: bool = False,
+    ignores_z_rotation: bool = False,
+) -> TaskSpec:
     return TaskSpec(
         name=name,
         robot=SHADOW_HAND,
@@ -141,6 +159,9 @@ def _hand_manipulate(name: str, distance_threshold: float = 0.01) -> TaskSpec:
         distance_threshold=distance_threshold,
         rotation_threshold=0.1,
         reference_id=f'{name}-v1',
+        achieved_goal='object_pose',
+        position_counts=position_counts,
+        ignores_z_rotation=ignores_z_rotation,
     )
 
 
@@ -154,6 +175,7 @@ _HAND_REACH = TaskSpec(
     distance_threshold=0.01,
     rotation_threshold=None,
     reference_id='HandReach-v3',
+    achieved_goal='fingertip_positions',
 )
 
 TASKS: dict[str, TaskSpec] = {
@@ -167,11 +189,11 @@ TASKS: dict[str, TaskSpec] = {
         _hand_manipulate('HandManipulateBlockRotateZ'),
         _hand_manipulate('HandManipulateBlockRotateParallel'),
         _hand_manipulate('HandManipulateBlockRotateXYZ'),
-        _hand_manipulate('HandManipulateBlockFull'),
+        _hand_manipulate('HandManipulateBlockFull', position_counts=True),
         _hand_manipulate('HandManipulateEggRotate'),
-        _hand_manipulate('HandManipulateEggFull'),
-        _hand_manipulate('HandManipulatePenRotate', distance_threshold=0.05),
-        _hand_manipulate('HandManipulatePenFull', distance_threshold=0.05),
+        _hand_manipulate('HandManipulateEggFull', position_counts=True),
+        _hand_manipulate('HandManipulatePenRotate', 0.05, ignores_z_rotation=True),
+        _hand_manipulate('HandManipulatePenFull', 0.05, True, ignores_z_rotation=True),
     )
 }
 

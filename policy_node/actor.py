@@ -12,6 +12,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
+from policy_node.goal_features import RelativeGoal
+
 # Plappert et al. 2018, appendix B.
 INPUT_CLIP = 200.0
 NORMALIZED_CLIP = 5.0
@@ -27,6 +29,7 @@ class NetworkShape:
         action_size: Length of the action.
         hidden_sizes: Width of each hidden layer.
         layer_norm: Whether a LayerNorm precedes each activation.
+        relative_goal: Additional inputs: how far the goal is; None for none.
     """
 
     observation_size: int
@@ -34,11 +37,13 @@ class NetworkShape:
     action_size: int
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     layer_norm: bool = False
+    relative_goal: RelativeGoal | None = None
 
     @property
     def feature_size(self) -> int:
-        """Length of the network input: observation and goal."""
-        return self.observation_size + self.goal_size
+        """Length of the network input: observation, goal and the additional inputs."""
+        relative = 0 if self.relative_goal is None else self.relative_goal.size
+        return self.observation_size + self.goal_size + relative
 
 
 class MLP(nn.Module):
@@ -109,6 +114,8 @@ class Actor(nn.Module):
     def features(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Normalised network input (..., feature_size)."""
         parts = [self.observation_normalizer(observation), self.goal_normalizer(goal)]
+        if self.shape.relative_goal is not None:
+            parts.append(self.shape.relative_goal(observation, goal))
         return torch.cat(parts, dim=-1)
 
     def forward(self, features: Tensor) -> Tensor:

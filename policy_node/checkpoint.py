@@ -14,8 +14,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from msgs_spec.tasks import TASKS, TaskSpec
+from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from policy_node.actor import Actor, NetworkShape
+from policy_node.goal_features import GOAL_FEATURES, relative_goal
 
 FORMAT = 'fetch_hand_actor'
 FORMAT_VERSION = 1
@@ -39,6 +40,7 @@ class ActorInfo:
         env_steps: Environment steps behind the weights.
         config: The training configuration.
         success: Measured success and how it was measured; empty if unmeasured.
+        goal_features: `plain`, or `relative` where the network also sees how far the goal is.
     """
 
     task: str
@@ -54,6 +56,7 @@ class ActorInfo:
     env_steps: int = 0
     config: dict[str, Any] = field(default_factory=dict)
     success: dict[str, Any] = field(default_factory=dict)
+    goal_features: str = 'plain'
 
     @property
     def shape(self) -> NetworkShape:
@@ -64,6 +67,9 @@ class ActorInfo:
             action_size=self.action_size,
             hidden_sizes=self.hidden_sizes,
             layer_norm=self.layer_norm,
+            relative_goal=(
+                relative_goal(task_spec(self.task)) if self.goal_features == 'relative' else None
+            ),
         )
 
 
@@ -149,6 +155,8 @@ def _info(path: str | Path, metadata: dict[str, str]) -> ActorInfo:
     version = metadata.get('format_version')
     if version != str(FORMAT_VERSION):
         raise ValueError(f'{path} has format version {version}; supported: {FORMAT_VERSION}')
+    # Files from before there were goal features have plain ones.
+    metadata = {'goal_features': '"plain"', **metadata}
     names = [item.name for item in dataclasses.fields(ActorInfo)]
     missing = [name for name in names if name not in metadata]
     if missing:
@@ -167,6 +175,9 @@ def _info(path: str | Path, metadata: dict[str, str]) -> ActorInfo:
 def _check_sizes(path: str | Path, info: ActorInfo) -> None:
     if info.task not in TASKS:
         raise ValueError(f'{path} was trained on unknown task {info.task!r}')
+    if info.goal_features not in GOAL_FEATURES:
+        allowed = ', '.join(GOAL_FEATURES)
+        raise ValueError(f'{path} has goal features {info.goal_features!r}; allowed: {allowed}')
     spec = TASKS[info.task]
     expected = (observation_layout(spec), spec.goal.size, spec.robot.action_size)
     found = (info.observation_layout, info.goal_size, info.action_size)

@@ -55,29 +55,25 @@ class ManipulateConfig:
     Attributes:
         asset: MJCF file.
         target_rotation: Which rotations goals have: about z, about z on any face, or any.
-        target_position: Whether goals have a position (`Full`).
         randomizes_rotation: Whether the object starts turned.
-        ignores_z_rotation: Whether the rotation about the object's own z axis does not count.
     """
 
     asset: str
     target_rotation: Literal['z', 'parallel', 'xyz']
-    target_position: bool
     randomizes_rotation: bool = True
-    ignores_z_rotation: bool = False
 
 
 _BLOCK, _EGG, _PEN = (f'hand/manipulate_{name}.xml' for name in ('block', 'egg', 'pen'))
 
 MANIPULATE_CONFIGS = {
-    'HandManipulateBlockRotateZ': ManipulateConfig(_BLOCK, 'z', False),
-    'HandManipulateBlockRotateParallel': ManipulateConfig(_BLOCK, 'parallel', False),
-    'HandManipulateBlockRotateXYZ': ManipulateConfig(_BLOCK, 'xyz', False),
-    'HandManipulateBlockFull': ManipulateConfig(_BLOCK, 'xyz', True),
-    'HandManipulateEggRotate': ManipulateConfig(_EGG, 'xyz', False),
-    'HandManipulateEggFull': ManipulateConfig(_EGG, 'xyz', True),
-    'HandManipulatePenRotate': ManipulateConfig(_PEN, 'xyz', False, False, True),
-    'HandManipulatePenFull': ManipulateConfig(_PEN, 'xyz', True, False, True),
+    'HandManipulateBlockRotateZ': ManipulateConfig(_BLOCK, 'z'),
+    'HandManipulateBlockRotateParallel': ManipulateConfig(_BLOCK, 'parallel'),
+    'HandManipulateBlockRotateXYZ': ManipulateConfig(_BLOCK, 'xyz'),
+    'HandManipulateBlockFull': ManipulateConfig(_BLOCK, 'xyz'),
+    'HandManipulateEggRotate': ManipulateConfig(_EGG, 'xyz'),
+    'HandManipulateEggFull': ManipulateConfig(_EGG, 'xyz'),
+    'HandManipulatePenRotate': ManipulateConfig(_PEN, 'xyz', False),
+    'HandManipulatePenFull': ManipulateConfig(_PEN, 'xyz', False),
 }
 
 
@@ -154,7 +150,7 @@ class HandManipulateTask(HandTask):
 
     def _sample_goal(self, index: int, generator: np.random.Generator) -> Array:
         position = self._object_qpos[index, :3].copy()
-        if self.config.target_position:
+        if self.spec.position_counts:
             position += generator.uniform(_TARGET_RANGE[:, 0], _TARGET_RANGE[:, 1])
         quaternion = self._sample_rotation(generator)
         return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
@@ -189,13 +185,7 @@ class HandManipulateTask(HandTask):
 
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
         """Returns the distance between poses."""
-        return GoalMetric(
-            self.spec,
-            uses_position=self.config.target_position,
-            ignores_z_rotation=self.config.ignores_z_rotation,
-            success_rule=success_rule,
-            reward_type=reward_type,
-        )
+        return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)
 
 
 def _parallel_rotations() -> Array:

@@ -27,6 +27,9 @@ class Collector:
 
     It owns its generator and touches nothing of the learner, so it may run in another thread and
     still gives the same episodes for the same policy.
+
+    Attributes:
+        exploration: Share of `noise_std` and `random_epsilon` that is in force.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class Collector:
         self.simulation = simulation
         self.noise_std = noise_std
         self.random_epsilon = random_epsilon
+        self.exploration = 1.0
         self._generator = np.random.default_rng(seeds[0])
         self._seeds: list[int] | None = seeds
 
@@ -89,7 +93,11 @@ class Collector:
         if random:
             return uniform
         action, _ = policy.predict(observation, deterministic=True)
-        noise = self.noise_std * self._generator.standard_normal(shape, dtype=np.float32)
+        noise = (
+            self.exploration
+            * self.noise_std
+            * self._generator.standard_normal(shape, dtype=np.float32)
+        )
         noisy = np.clip(action + noise, -1.0, 1.0)
-        replaced = self._generator.random(shape[0]) < self.random_epsilon
+        replaced = self._generator.random(shape[0]) < self.exploration * self.random_epsilon
         return np.where(replaced[:, None], uniform, noisy)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
+from policy_node.goal_features import GOAL_FEATURES
 
 RECIPES = ('paper', 'best')
 
@@ -65,6 +66,9 @@ class TrainConfig:
     future_only_steps: int = 0
     """Steps during which futureactual is replaced by future."""
 
+    goal_features: str = 'plain'
+    """Inputs of actor and critic: `plain` (observation and goal) or `relative` (how far
+    the goal is as well)."""
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     """Width of each hidden layer of actor and critic."""
     layer_norm: bool = False
@@ -89,6 +93,9 @@ class TrainConfig:
     """Probability of a uniformly random action."""
     noise_std: float = 0.2
     """Standard deviation of the Gaussian noise on other actions."""
+    final_exploration: float = 1.0
+    """Share of `random_epsilon` and `noise_std` left at `total_steps`; both fall linearly in
+    the last third of the run. 1 keeps them constant."""
 
     evaluate_every: int = 50_000
     """Environment steps between evaluations."""
@@ -127,6 +134,7 @@ _CHOICES = {
     'reward_type': ('sparse', 'dense'),
     'success_rule': ('gymnasium', 'paper'),
     'strategy': ('final', 'future', 'episode', 'random', 'futureactual', 'none'),
+    'goal_features': GOAL_FEATURES,
     'precision': ('auto', 'float32', 'bfloat16'),
     'device': ('auto', 'cpu', 'cuda'),
 }
@@ -155,6 +163,7 @@ _RANGES = (
     ('target_update_interval', 1, _INFINITY),
     ('random_epsilon', 0, 1),
     ('noise_std', 0, _INFINITY),
+    ('final_exploration', 0, 1),
     ('evaluate_every', 1, _INFINITY),
     ('evaluation_episodes', 1, 1_000_000),
     ('checkpoint_seconds', 0, _INFINITY),
@@ -251,9 +260,19 @@ def _best(task: str) -> dict[str, Any]:
             'total_steps': 2_000_000,
             'replay_transitions': 2_000_000,
         }
-    horizon = {'gamma': 0.98, 'strategy': 'futureactual', 'action_l2': 0.1}
-    budget = {'total_steps': 200_000 * ticks, 'replay_transitions': 5_000_000}
-    return {**values, **horizon, **budget, 'evaluate_every': 200_000}
+    # 51 samples per environment step, as the paper has. Nothing stays unmoved in a hand.
+    return values | {
+        'gamma': 0.98,
+        'strategy': 'futureactual',
+        'action_l2': 0.1,
+        'moved_share': 0.0,
+        'goal_features': 'relative',
+        'batch_size': 1024,
+        'final_exploration': 0.25,
+        'total_steps': 80_000 * ticks,
+        'replay_transitions': 5_000_000,
+        'evaluate_every': 200_000,
+    }
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:

@@ -63,6 +63,7 @@ class RunFolder:
             env_steps=env_steps,
             config=dataclasses.asdict(config),
             success=success or {},
+            goal_features=config.goal_features,
         )
         checkpoint.save(self.path / name, actor, info)
 

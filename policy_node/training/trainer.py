@@ -16,6 +16,7 @@ import torch
 from fetch_hand_sim.rewards import GoalMetric
 from fetch_hand_sim.simulation import Simulation
 from policy_node.actor import Actor, NetworkShape
+from policy_node.goal_features import relative_goal
 from policy_node.training.collector import Collector
 from policy_node.training.config import TrainConfig
 from policy_node.training.ddpg import DDPG, Losses, choose_device
@@ -115,6 +116,7 @@ class Trainer:
             action_size=spec.robot.action_size,
             hidden_sizes=config.hidden_sizes,
             layer_norm=config.layer_norm,
+            relative_goal=relative_goal(spec) if config.goal_features == 'relative' else None,
         )
         self.learner = DDPG(shape, config, self.device, self.workers)
         compute_reward = scale_distance(self.simulation.metric, config.reward_distance).reward
@@ -188,6 +190,7 @@ class Trainer:
     def _request(self) -> tuple[Actor, bool, Actor | None]:
         """What to collect next: with which actor, whether at random, and which to evaluate."""
         steps = self.counters.env_steps
+        self.collector.exploration = self._exploration()
         actor, evaluated = copy.deepcopy(self.learner.actor).cpu().eval(), None
         if self.counters.updates > 0 and self._evaluator.is_due(steps) and self.workers.is_first:
             evaluated = self.learner.evaluation_actor()
@@ -199,6 +202,12 @@ class Trainer:
             outcomes = self._evaluator.evaluate(evaluated, self.counters.best_success)
         episodes, success = self.collector.collect(actor, random)
         return Collected(episodes, success, outcomes, evaluated)
+
+    def _exploration(self) -> float:
+        """Share of noise and random actions for a run as far as this one."""
+        left = 3.0 * (1.0 - self.counters.env_steps / self.config.total_steps)
+        final = self.config.final_exploration
+        return final + (1.0 - final) * min(max(left, 0.0), 1.0)
 
     def _collect_or_explain(self, job: Future[Collected]) -> Collected:
         collected = job.result()
