@@ -41,7 +41,7 @@ $(STAMP): setup.py setup.cfg constraints.txt tools/make_environment.sh
 	@touch $@
 
 demo: env
-	@$(BIN)/python -m fetch_hand_sim.demo --task $(TASK) --episodes $(EPISODES)
+	@$(BIN)/python -m fetch_hand_sim.commands.demo --task $(TASK) --episodes $(EPISODES)
 
 test: lint
 	$(BIN)/python -m pytest
@@ -56,7 +56,7 @@ format: env
 	$(BIN)/python -m ruff check --fix $(PYTHON_FILES)
 
 twin: env
-	$(BIN)/python -m pytest --twin-seeds 20 --timeout 0 test/test_twin.py
+	$(BIN)/python -m pytest --twin-seeds 20 --timeout 0 test/fetch_hand_sim/simulation/test_twin.py
 
 bench-sim: env
 	$(BIN)/python bench/bench_sim.py
@@ -76,9 +76,11 @@ bench-rate: env
 
 torture: env
 	$(BIN)/python -m pytest --hostile-messages 100000 --soak-seconds 3600 --timeout 0 \
-		test/test_robot.py test/test_responder.py test/test_nodes_hostile.py
+		test/fetch_hand_sim/sim_node/test_robot.py \
+		test/policy_node/node/test_responder.py test/nodes/test_nodes_hostile.py
 	EPISODE_KILLS=200 EPISODE_MUTATIONS=10000 $(BIN)/python -m pytest --timeout 0 -s \
-		test/test_episode_endings.py test/test_episode_untrusted.py
+		test/fetch_hand_sim/episode_log/test_episode_endings.py \
+		test/fetch_hand_sim/episode_log/test_episode_untrusted.py
 
 bench-episodes: env
 	$(BIN)/python bench/bench_load.py

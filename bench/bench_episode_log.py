@@ -26,9 +26,9 @@ import numpy as np  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from fetch_hand_sim.episode_recorder import EpisodeRecorder  # noqa: E402
-from fetch_hand_sim.episode_runner import EpisodeRunner  # noqa: E402
-from fetch_hand_sim.recording_context import RecordingContext  # noqa: E402
+from fetch_hand_sim.episodes.context import RecordingContext  # noqa: E402
+from fetch_hand_sim.episodes.recorder import EpisodeRecorder  # noqa: E402
+from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
 from msgs_spec.cdr import TopicEncoder  # noqa: E402
 from msgs_spec.tasks import TASKS  # noqa: E402

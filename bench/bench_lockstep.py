@@ -28,7 +28,7 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import rclpy  # noqa: E402
 
-from fetch_hand_sim.episode_runner import EpisodeRunner  # noqa: E402
+from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
 from msgs_spec.cdr import TopicEncoder  # noqa: E402
 from msgs_spec.codecs import decode_status  # noqa: E402

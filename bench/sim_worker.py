@@ -114,9 +114,9 @@ def bare_physics(task: str, reference_id: str, num_envs: int, threads: int, path
     """MuJoCo's batch on the model as published; nothing of this project runs."""
     from mujoco.batch import Batch
 
-    from fetch_hand_sim.assets import load_model
-    from fetch_hand_sim.tasks.fetch import FETCH_CONFIGS
-    from fetch_hand_sim.tasks.hand_manipulate import MANIPULATE_CONFIGS
+    from fetch_hand_sim.simulation.models import load_model
+    from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS
+    from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS
 
     configs: dict[str, Any] = {**FETCH_CONFIGS, **MANIPULATE_CONFIGS}
     model = load_model(configs[task].asset if task in configs else 'hand/reach.xml')

@@ -1,5 +1,5 @@
 """The robots: thirteen tasks on MuJoCo, from one batched simulation, and the ROS node around it."""
 
-from fetch_hand_sim.registration import register_environments
+from fetch_hand_sim.gym_envs.registration import register_environments
 
 register_environments()

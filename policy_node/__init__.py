@@ -8,14 +8,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from policy_node.actor import Actor, load_actor
+    from policy_node.policies.actor import Actor, load_actor
 
 __all__ = ['Actor', 'load_actor']
 
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
-        from policy_node import actor
+        from policy_node.policies import actor
 
         return getattr(actor, name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

@@ -15,7 +15,7 @@ def main(args: list[str] | None = None) -> int:
     """Runs `sim_node`; returns the exit code."""
 
     def run(stop: StopSignals) -> None:
-        from fetch_hand_sim.sim_node.shell import SimNode
+        from fetch_hand_sim.sim_node.node import SimNode
 
         if stop:
             return

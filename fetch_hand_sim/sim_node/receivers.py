@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from fetch_hand_sim.command_buffer import CommandRejected
+from fetch_hand_sim.sim_node.command_buffer import CommandRejected
 from fetch_hand_sim.sim_node.robot import Robot
 from msgs_spec.codecs import decode, decode_status
 from msgs_spec.schemas import from_ros, serialize

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fetch_hand_sim.command_buffer import CommandBuffer
-from fetch_hand_sim.episode_runner import EpisodeRunner
+from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from msgs_spec.diagnostics import Durations
 from msgs_spec.tick import Tick, TickEncoder

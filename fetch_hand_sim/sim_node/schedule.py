@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from fetch_hand_sim.pacing import RealTimePacer
+from fetch_hand_sim.sim_node.pacing import RealTimePacer
 
 Mode = Literal['realtime', 'lockstep']
 

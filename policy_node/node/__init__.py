@@ -16,7 +16,7 @@ def main(args: list[str] | None = None) -> int:
     """Runs `policy_node`; returns the exit code."""
 
     def run(stop: StopSignals) -> None:
-        from policy_node.node.shell import PolicyNode
+        from policy_node.node.node import PolicyNode
 
         if stop:
             return

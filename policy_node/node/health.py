@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from msgs_spec.diagnostics import Increase, Report
 from msgs_spec.tick import EpisodeStatus
-from policy_node.commander import Commander
 from policy_node.node.responder import Responder
+from policy_node.policies.commander import Commander
 
 # Seconds without a complete observation after which the report says so.
 _SILENCE = 1.0

@@ -16,11 +16,11 @@ from rich.table import Table
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import TASKS, task_spec
-from policy_node import checkpoint
-from policy_node.actor import actor_path
-from policy_node.training.collector import Policy
-from policy_node.training.evaluate import EpisodeOutcomes, evaluate, summarize
-from policy_node.training.floors import RandomPolicy, RestingPolicy
+from policy_node.policies import checkpoint
+from policy_node.policies.actor import actor_path
+from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, summarize
+from policy_node.training.evaluation.floors import RandomPolicy, RestingPolicy
+from policy_node.training.learning.collector import Policy
 
 FLOORS = ('random', 'resting')
 # Far from the seeds of training and of its evaluations.

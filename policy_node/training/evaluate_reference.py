@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from msgs_spec.tasks import task_spec
-from policy_node import checkpoint
-from policy_node.actor import actor_path
-from policy_node.training.evaluate import wilson_interval
+from policy_node.policies import checkpoint
+from policy_node.policies.actor import actor_path
 from policy_node.training.evaluate_policy import FIRST_SEED
+from policy_node.training.evaluation.episodes import wilson_interval
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:

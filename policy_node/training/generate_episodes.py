@@ -17,13 +17,13 @@ import torch
 from rich.console import Console
 from rich.progress import Progress
 
-from fetch_hand_sim.episode_generator import EpisodeGenerator
 from fetch_hand_sim.episode_log import EpisodeLogError
-from fetch_hand_sim.recording_context import RecordingContext
+from fetch_hand_sim.episodes.context import RecordingContext
+from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.simulation import Observation, Simulation
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS
-from policy_node import checkpoint
-from policy_node.actor import actor_path
+from policy_node.policies import checkpoint
+from policy_node.policies.actor import actor_path
 from policy_node.training.evaluate_policy import FLOORS, load_policy
 
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.simulation import Simulation
-from policy_node import checkpoint
-from policy_node.training.evaluate import evaluate, summarize
+from policy_node.policies import checkpoint
 from policy_node.training.evaluate_policy import FIRST_SEED, print_table
-from policy_node.training.run_folder import BEST_FILE
-from policy_node.training.run_log import draw_curve, read_progress
+from policy_node.training.evaluation.episodes import evaluate, summarize
+from policy_node.training.learning.run_folder import BEST_FILE
+from policy_node.training.learning.run_log import draw_curve, read_progress
 
 ACTORS = Path(__file__).parents[1] / 'actors'
 

@@ -14,7 +14,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from msgs_spec.tasks import TASKS, task_spec
-from policy_node.training.config import (
+from policy_node.training.learning.config import (
     RECIPES,
     TrainConfig,
     config_from_dict,
@@ -23,8 +23,8 @@ from policy_node.training.config import (
 )
 
 if TYPE_CHECKING:
-    from policy_node.training.replay import Episodes
-    from policy_node.training.trainer import Trainer
+    from policy_node.training.learning.replay import Episodes
+    from policy_node.training.learning.trainer import Trainer
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -92,8 +92,8 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
         if options.task is None:
             raise ValueError(f'--task is missing; allowed: {", ".join(TASKS)}')
         return recipe_config(options.task, options.recipe, **overrides)
-    from policy_node.training.run_folder import STATE_FILE
-    from policy_node.training.training_state import read_extra
+    from policy_node.training.learning.run_folder import STATE_FILE
+    from policy_node.training.learning.training_state import read_extra
 
     stored = read_extra(options.resume / STATE_FILE)['config']
     if options.task not in (None, stored['task']):
@@ -129,11 +129,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def train(config: TrainConfig, options: argparse.Namespace, arguments: Sequence[str]) -> int:
     """Trains as configured and reports how it went."""
-    from policy_node.training.ddpg import choose_device
-    from policy_node.training.distributed import join_workers, leave_workers
-    from policy_node.training.run_folder import STATE_FILE
-    from policy_node.training.run_log import RunLog
-    from policy_node.training.trainer import Trainer, TrainingError
+    from policy_node.training.learning.ddpg import choose_device
+    from policy_node.training.learning.distributed import join_workers, leave_workers
+    from policy_node.training.learning.run_folder import STATE_FILE
+    from policy_node.training.learning.run_log import RunLog
+    from policy_node.training.learning.trainer import Trainer, TrainingError
 
     output = options.resume or options.output
     output = output or Path('runs') / f'{config.task}_{config.recipe}_seed{config.seed}'
@@ -176,7 +176,7 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
     """
     if directory is None:
         return None
-    from policy_node.training.logged_episodes import read_experience
+    from policy_node.training.learning.logged_episodes import read_experience
 
     episodes, skipped = read_experience(directory, task_spec(config.task), config.control_hz)
     transitions = len(episodes) * episodes.ticks
@@ -209,7 +209,7 @@ def _stop_on_signals(trainer: Trainer) -> Iterator[None]:
 
 
 def _report(config: TrainConfig, output: Path, reason: str, counters: Any) -> None:
-    from policy_node.training.run_log import draw_curve, read_progress
+    from policy_node.training.learning.run_log import draw_curve, read_progress
 
     title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
     draw_curve(read_progress(output / 'progress.csv'), title, output / 'curve.png')

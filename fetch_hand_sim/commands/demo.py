@@ -1,0 +1,285 @@
+"""`make demo`: a robot and an actor in two processes, watched from a third.
+
+It starts `sim_node` and `policy_node`, listens to the robot as any other subscriber would, and
+prints a row for every episode that it finds logged.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import util
+from pathlib import Path
+from typing import IO, Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from fetch_hand_sim.episode_log import EpisodeReadError, read_episode
+from msgs_spec.codecs import decode_status
+from msgs_spec.qos import rclpy_profile
+from msgs_spec.ros import StopSignals, keep_discovery_local, ros_message_class
+from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.tick import EpisodeStatus
+from msgs_spec.topics import topic
+
+_SHUTDOWN_TIMEOUT = 10.0
+_START_TIMEOUT = 60.0
+_COLUMNS = '{:>7}  {:>5}  {:>5}  {:>7}  {:<7}  {}'
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One logged episode, as its file tells it."""
+
+    episode: int
+    seed: int
+    steps: int
+    episode_return: float
+    is_success: bool
+    path: Path
+
+    @classmethod
+    def from_directory(cls, path: Path) -> Row:
+        """Reads the metadata of a bag.
+
+        Raises:
+            EpisodeReadError: If it is not a complete episode.
+        """
+        episode = read_episode(path)
+        return cls(
+            episode=int(episode.metadata['episode']),
+            seed=int(episode.metadata['seed']),
+            steps=int(episode.result['steps']),
+            episode_return=float(episode.result['return']),
+            is_success=episode.result['success'] == 'true',
+            path=path,
+        )
+
+    def __str__(self) -> str:
+        success = 'yes' if self.is_success else 'no'
+        return _COLUMNS.format(
+            self.episode, self.seed, self.steps, f'{self.episode_return:g}', success, self.path
+        )
+
+
+class Watcher:
+    """A plain subscriber that follows an episode's progress."""
+
+    def __init__(self, spec: TaskSpec) -> None:
+        """Subscribes to the robot of a task."""
+        self.status: EpisodeStatus | None = None
+        self.ticks = 0
+        self._node = rclpy.create_node('demo')
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        for name, callback in (('episode_status', self._on_status), ('reward', self._on_reward)):
+            source = topic(spec, name)
+            self._node.create_subscription(
+                ros_message_class(source.type_name), name, callback, rclpy_profile(source.qos)
+            )
+
+    def spin(self) -> None:
+        """Serves callbacks for a moment."""
+        self._executor.spin_once(timeout_sec=0.05)
+
+    def close(self) -> None:
+        """Leaves the graph."""
+        self._executor.remove_node(self._node)
+        self._node.destroy_node()
+
+    def _on_status(self, message: Any) -> None:
+        self.status = EpisodeStatus.from_values(decode_status(message))
+        self.ticks = self.status.tick
+
+    def _on_reward(self, message: Any) -> None:
+        del message
+        self.ticks += 1
+
+
+class Demo:
+    """Runs the two nodes until the episodes are done."""
+
+    def __init__(self, options: argparse.Namespace, console: Console) -> None:
+        """Takes the options of the command line."""
+        self._options = options
+        self._console = console
+        self._spec = task_spec(options.task)
+        self._directory = Path(options.episode_dir)
+        self._known = set(self._episodes())
+        self._rows: list[Row] = []
+
+    def run(self, stop: StopSignals) -> int:
+        """Runs the demo and returns the exit code."""
+        watcher = Watcher(self._spec)
+        began = time.monotonic()
+        with _logs() as logs:
+            policy = self._start('policy_node.node', [f'checkpoint:={self._checkpoint()}'], logs)
+            sim = self._start('fetch_hand_sim.sim_node', self._sim_parameters(), logs)
+            try:
+                self._watch(watcher, sim, policy, stop)
+            finally:
+                codes = [_stop(process) for process in (sim, policy)]
+                watcher.close()
+            self._print_new_rows()
+            if any(codes) or (len(self._rows) < self._options.episodes and not stop):
+                self._console.print(Path(logs.name).read_text(), markup=False, highlight=False)
+                self._console.print(f'the nodes ended with exit codes {codes}')
+                return 1
+        self._print_summary(time.monotonic() - began)
+        return 0
+
+    def _checkpoint(self) -> str:
+        if self._options.checkpoint:
+            return str(self._options.checkpoint)
+        package = util.find_spec('policy_node')
+        folder = Path(package.origin).parent if package and package.origin else Path()
+        if (folder / 'actors' / f'{self._spec.name}.safetensors').exists():
+            return self._spec.name
+        self._console.print(f'No actor is shipped for {self._spec.name} yet: commands are random.')
+        return 'random'
+
+    def _sim_parameters(self) -> list[str]:
+        return [
+            f'task:={self._spec.name}',
+            f'episodes:={self._options.episodes}',
+            f'seed:={self._options.seed}',
+            f'episode_dir:={self._directory}',
+            'wait_for_commands:=true',
+        ]
+
+    def _start(
+        self, module: str, parameters: Sequence[str], logs: IO[str]
+    ) -> subprocess.Popen[str]:
+        pairs = [word for parameter in parameters for word in ('-p', parameter)]
+        # A process group of its own: Ctrl-C reaches the demo, which ends its nodes in order.
+        return subprocess.Popen(
+            [sys.executable, '-m', module, '--ros-args', *pairs],
+            stdout=logs,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+
+    def _watch(
+        self,
+        watcher: Watcher,
+        sim: subprocess.Popen[str],
+        policy: subprocess.Popen[str],
+        stop: StopSignals,
+    ) -> None:
+        columns = (TextColumn('{task.description}'), BarColumn(), TextColumn('{task.fields[note]}'))
+        print(_COLUMNS.format('episode', 'seed', 'steps', 'return', 'success', 'file'))
+        deadline = time.monotonic() + _START_TIMEOUT
+        with Progress(*columns, console=self._console, transient=True) as progress:
+            bar = progress.add_task('starting', total=self._spec.episode_ticks, note='')
+            while sim.poll() is None and policy.poll() is None and not stop:
+                watcher.spin()
+                _show(progress, bar, watcher)
+                self._print_new_rows(progress.console)
+                has_started = watcher.status is not None and watcher.status.phase != 'waiting'
+                if not has_started and time.monotonic() > deadline:
+                    return
+
+    def _episodes(self) -> Iterator[Path]:
+        if self._directory.is_dir():
+            yield from (p for p in self._directory.iterdir() if not p.name.startswith('.'))
+
+    def _print_new_rows(self, console: Console | None = None) -> None:
+        for path in sorted(set(self._episodes()) - self._known):
+            self._known.add(path)
+            try:
+                row = Row.from_directory(path)
+            except EpisodeReadError:
+                continue
+            self._rows.append(row)
+            (console or self._console).print(
+                str(row), markup=False, highlight=False, soft_wrap=True
+            )
+
+    def _print_summary(self, seconds: float) -> None:
+        count = len(self._rows)
+        successes = sum(row.is_success for row in self._rows)
+        steps = sum(row.steps for row in self._rows)
+        mean = sum(row.episode_return for row in self._rows) / count if count else 0.0
+        self._console.print(
+            f'{self._spec.name}: {successes} of {count} episodes succeeded, mean return '
+            f'{mean:.2f}, {steps} steps, {seconds:.1f} s with start-up. Episodes are in '
+            f'{self._directory}/',
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+def _show(progress: Progress, bar: TaskID, watcher: Watcher) -> None:
+    status = watcher.status
+    if status is None or status.phase == 'waiting':
+        return
+    note = f'tick {watcher.ticks}, seed {status.seed}'
+    progress.update(
+        bar, description=f'episode {status.episode}', completed=watcher.ticks, note=note
+    )
+
+
+def _stop(process: subprocess.Popen[str]) -> int:
+    """Asks a node to end and returns its exit code."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(_SHUTDOWN_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+@contextmanager
+def _logs() -> Iterator[IO[str]]:
+    """A file for what the nodes print, shown if something goes wrong."""
+    with tempfile.NamedTemporaryFile('w+', prefix='demo_', suffix='.log') as file:
+        yield file
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog='fetch_hand_sim.commands.demo', description=__doc__)
+    parser.add_argument('--task', default='FetchReach', help='one of the thirteen tasks')
+    parser.add_argument('--episodes', type=int, default=5, help='how many episodes')
+    parser.add_argument('--seed', type=int, default=0, help='seed of the first episode')
+    parser.add_argument('--episode-dir', default='episodes', help='where episodes are logged')
+    parser.add_argument('--checkpoint', default='', help="actor file, 'random' or 'resting'")
+    options = parser.parse_args(arguments)
+    try:
+        task_spec(options.task)
+    except ValueError as error:
+        parser.error(str(error))
+    if options.episodes < 1:
+        parser.error(f'--episodes {options.episodes}; allowed: 1 or more')
+    if options.seed < 0:
+        parser.error(f'--seed {options.seed}; allowed: 0 or more')
+    return options
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the demo; returns the exit code."""
+    options = _parse(arguments)
+    keep_discovery_local()
+    os.environ.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
+    stop = StopSignals()
+    rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    try:
+        return Demo(options, Console()).run(stop)
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

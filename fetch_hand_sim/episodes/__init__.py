@@ -1,0 +1,1 @@
+"""Episodes: how they run, how they are logged, checked and exported."""

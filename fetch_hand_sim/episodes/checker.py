@@ -1,0 +1,270 @@
+"""Runs a logged episode again, from its seed, goals and commands, and compares every bit."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from fetch_hand_sim.episode_log import Episode, EpisodeReadError, episode_metadata, read_episode
+from fetch_hand_sim.episode_log.model import model_sha256
+from fetch_hand_sim.episode_log.reader import UNREADABLE, one_line, printable
+from fetch_hand_sim.episode_log.ticks import LoggedTick, TickMessage, episode_task, split_ticks
+from fetch_hand_sim.episodes.context import source_revision
+from fetch_hand_sim.episodes.recorder import episode_result
+from fetch_hand_sim.episodes.runner import Array, EpisodeRunner
+from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
+from msgs_spec.codecs import decode
+from msgs_spec.schemas import deserialize
+from msgs_spec.tick import EpisodeStatus, TickEncoder
+from msgs_spec.topics import TopicSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Where a recorded episode first differs from the one simulated again.
+
+    Attributes:
+        tick: Number of the tick, 0 for the reset.
+        stamp_ns: Its recorded stamp.
+        field: Topic, and the field of its message if there is one.
+        recorded: What the file says.
+        simulated: What the simulation says.
+    """
+
+    tick: int
+    stamp_ns: int
+    field: str
+    recorded: str
+    simulated: str
+
+    def __str__(self) -> str:
+        return (
+            f'tick {self.tick} ({self.stamp_ns / 1e9:.3f} s), {self.field}: recorded '
+            f'{self.recorded}, simulated {self.simulated}'
+        )
+
+
+@dataclass(slots=True)
+class CheckResult:
+    """What came out.
+
+    Attributes:
+        path: The MCAP file.
+        ticks: Ticks that are identical.
+        messages: Messages in them that are identical.
+        unchecked: Messages of a last tick that was cut off before its command.
+        difference: The first difference, None if there is none.
+        changed: What the file was written with and is different here: `name recorded -> here`.
+    """
+
+    path: Path
+    ticks: int = 0
+    messages: int = 0
+    unchecked: int = 0
+    difference: Difference | None = None
+    changed: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        changes = f'; changed since: {", ".join(self.changed)}' if self.changed else ''
+        if self.difference is not None:
+            return f'{self.path}: differs at {self.difference}{changes}'
+        rest = f', {self.unchecked} of a cut-off tick not checked' if self.unchecked else ''
+        counts = f'{self.ticks} ticks, {self.messages} messages'
+        return f'{self.path}: identical, {counts}{rest}{changes}'
+
+
+class EpisodeChecker:
+    """Checks one episode after the other; compiles a model only when the task changes."""
+
+    def __init__(self) -> None:
+        self._key: tuple[str, ...] = ()
+        self._simulation: Simulation | None = None
+        self._model_sha256 = ''
+
+    def check(self, path: Path) -> CheckResult:
+        """Checks one episode.
+
+        Args:
+            path: Bag directory or MCAP file.
+
+        Raises:
+            EpisodeReadError: If the file is damaged, or does not say how to run the episode again.
+        """
+        episode = read_episode(path)
+        ticks = split_ticks(episode)
+        try:
+            runner = self._runner(episode, ticks)
+            result = CheckResult(episode.path, changed=self._changes(episode, runner))
+            _compare(runner, ticks, episode, result)
+        except UNREADABLE as error:
+            raise EpisodeReadError(
+                f'{episode.path}: cannot be run again ({one_line(error)})'
+            ) from error
+        return result
+
+    def _runner(self, episode: Episode, ticks: list[LoggedTick]) -> EpisodeRunner:
+        metadata = episode.metadata
+        index, seed = int(metadata['episode']), int(metadata['seed'])
+        return EpisodeRunner(
+            self._simulation_of(episode),
+            first_seed=seed - index,
+            first_episode=index,
+            first_stamp_ns=ticks[0].stamp_ns,
+        )
+
+    def _simulation_of(self, episode: Episode) -> Simulation:
+        names = ('reward_type', 'success_rule', 'control_hz')
+        key = (episode_task(episode).name, *(episode.metadata[name] for name in names))
+        if self._simulation is None or key != self._key:
+            task, reward_type, success_rule, control_hz = key
+            self._simulation = Simulation(
+                task,
+                num_threads=1,
+                reward_type=cast(RewardType, reward_type),
+                success_rule=cast(SuccessRule, success_rule),
+                control_hz=float(control_hz),
+            )
+            self._key = key
+            self._model_sha256 = model_sha256(self._simulation.model)
+        return self._simulation
+
+    def _changes(self, episode: Episode, runner: EpisodeRunner) -> list[str]:
+        here = episode_metadata(
+            runner.spec,
+            episode=runner.episode,
+            seed=runner.seed,
+            reward_type=runner.simulation.metric.reward_type,
+            success_rule=runner.simulation.metric.success_rule,
+            control_hz=runner.simulation.control_hz,
+            model_sha256=self._model_sha256,
+            source_revision=source_revision(),
+        )
+        recorded = episode.metadata
+        return [
+            f'{name.removesuffix("_version")} {printable(recorded[name])[:12]} -> {value[:12]}'
+            for name, value in here.items()
+            if recorded.get(name, value) != value
+        ]
+
+
+def _compare(
+    runner: EpisodeRunner, ticks: list[LoggedTick], episode: Episode, result: CheckResult
+) -> None:
+    """Runs the episode and notes how far it is the recorded one."""
+    encoder = TickEncoder(runner.spec)
+    for number, logged in enumerate(ticks):
+        command = _applied_command(logged) if number else runner.resting_command()
+        if command is None:
+            if logged is not ticks[-1]:
+                raise ValueError(f'no applied_command at tick {number}')
+            result.unchecked = len(logged.published)
+            return
+        if number and runner.is_between_episodes:
+            result.difference = Difference(
+                number, logged.stamp_ns, 'length', f'{len(ticks)} ticks', f'{number} ticks'
+            )
+            return
+        tick = runner.advance(command)
+        has_status = logged.find('episode_status') is not None
+        expected = encoder.encode(tick, latched=has_status or tick.status.phase != 'running')
+        may_be_cut = logged is ticks[-1] and not runner.is_between_episodes
+        result.difference = _tick_difference(number, logged, tick.stamp_ns, expected, may_be_cut)
+        if result.difference is not None:
+            return
+        result.ticks += 1
+        result.messages += len(logged.published)
+        _set_goals(runner, logged)
+    result.difference = _result_difference(ticks[-1], tick.status, runner, episode)
+
+
+def _result_difference(
+    last: LoggedTick, status: EpisodeStatus, runner: EpisodeRunner, episode: Episode
+) -> Difference | None:
+    """Whether the record `episode_result` says something else than the last tick."""
+    expected = episode_result(status)
+    if not runner.is_between_episodes:
+        expected['complete'] = 'false'
+    for name, simulated in expected.items():
+        recorded = episode.result.get(name, simulated)
+        if recorded != simulated:
+            where = f'episode_result {name}'
+            return Difference(
+                status.tick, last.stamp_ns, where, printable(recorded)[:80], simulated
+            )
+    return None
+
+
+def _applied_command(logged: LoggedTick) -> Array | None:
+    message = logged.find('applied_command')
+    return None if message is None else _decoded(message)
+
+
+def _decoded(message: TickMessage) -> Array:
+    return decode(message.topic, deserialize(message.topic.type_name, message.data))
+
+
+def _set_goals(runner: EpisodeRunner, logged: LoggedTick) -> None:
+    """Does what the node did with the goals it received; it dropped those that do not fit."""
+    for message in logged.received:
+        if message.topic.name == 'set_goal' and not runner.is_between_episodes:
+            try:
+                runner.set_goal(_decoded(message))
+            except ValueError:
+                continue
+
+
+def _tick_difference(
+    number: int,
+    logged: LoggedTick,
+    stamp_ns: int,
+    expected: list[tuple[TopicSpec, bytes]],
+    may_be_cut: bool,
+) -> Difference | None:
+    def difference(field: str, recorded: object, simulated: object) -> Difference:
+        return Difference(number, logged.stamp_ns, field, str(recorded), str(simulated))
+
+    names = [message.topic.name for message in logged.published]
+    wanted = [topic.name for topic, _ in expected]
+    if may_be_cut:
+        wanted = wanted[: len(names)]
+    if names != wanted:
+        return difference('topics', ', '.join(names), ', '.join(wanted))
+    for rank, (message, (topic, data)) in enumerate(zip(logged.published, expected, strict=False)):
+        if message.data != data:
+            where, recorded, simulated = _field_difference(topic, message.data, data)
+            return difference(f'{topic.name}{where}', recorded, simulated)
+        if message.log_time_ns != stamp_ns + rank:
+            return difference(f'log time of {topic.name}', message.log_time_ns, stamp_ns + rank)
+    return None
+
+
+def _field_difference(topic: TopicSpec, recorded: bytes, simulated: bytes) -> tuple[str, str, str]:
+    """The first field in which two messages differ, and its two values."""
+    try:
+        first, second = (deserialize(topic.type_name, data) for data in (recorded, simulated))
+    except UNREADABLE:
+        return '', f'{len(recorded)} unreadable bytes', f'{len(simulated)} bytes'
+    for (where, one), (other_where, other) in zip(_leaves(first), _leaves(second), strict=False):
+        # Text shows every bit of a float64, except those of NaN.
+        if (where, repr(one)) != (other_where, repr(other)):
+            return where, printable(repr(one))[:80], repr(other)[:80]
+    return '', f'{len(recorded)} bytes', f'{len(simulated)} bytes of other length or padding'
+
+
+def _leaves(value: Any, where: str = '') -> Iterator[tuple[str, Any]]:
+    if dataclasses.is_dataclass(value):
+        for item in dataclasses.fields(value):
+            if item.name != '__msgtype__':
+                yield from _leaves(getattr(value, item.name), f'{where}.{item.name}')
+    elif isinstance(value, np.ndarray | list):
+        yield f'{where} length', len(value)
+        for index, element in enumerate(value):
+            yield from _leaves(element, f'{where}[{index}]')
+    else:
+        yield where, value

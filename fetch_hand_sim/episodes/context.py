@@ -1,0 +1,72 @@
+"""What every episode of a running robot has in common in its log."""
+
+from __future__ import annotations
+
+import subprocess
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+
+from fetch_hand_sim.episode_log import Attachment, episode_metadata
+from fetch_hand_sim.episode_log.model import compiled_attachment, mjcf_attachment, model_sha256
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.tick import EpisodeStatus
+
+
+class RecordingContext:
+    """Makes metadata and attachments for the episodes of one simulation.
+
+    Attributes:
+        attachments: The model, stored with every episode.
+        checkpoint_sha256: Fingerprint of the actor that commands the robot, if one told.
+    """
+
+    def __init__(self, simulation: Simulation, *, with_compiled_model: bool = True) -> None:
+        """Fingerprints the model.
+
+        Args:
+            simulation: Whose episodes are logged.
+            with_compiled_model: Whether to store the compiled model, meshes and all, 3 MB per
+            episode; its
+                MJCF text is stored in any case.
+        """
+        self._simulation = simulation
+        self._model_sha256 = model_sha256(simulation.model)
+        self.attachments: list[Attachment] = [mjcf_attachment(simulation.asset)]
+        if with_compiled_model:
+            self.attachments.append(compiled_attachment(simulation.model))
+        self.checkpoint_sha256: str | None = None
+
+    def metadata(self, status: EpisodeStatus) -> dict[str, str]:
+        """Returns the metadata record `episode` for an episode with this first status."""
+        return episode_metadata(
+            self._simulation.spec,
+            episode=status.episode,
+            seed=status.seed,
+            reward_type=status.reward_type,
+            success_rule=status.success_rule,
+            control_hz=status.control_hz,
+            model_sha256=self._model_sha256,
+            source_revision=source_revision(),
+            checkpoint_sha256=self.checkpoint_sha256,
+            started=datetime.now(UTC).isoformat(timespec='milliseconds'),
+        )
+
+
+@cache
+def source_revision() -> str | None:
+    """Git revision of this source tree, or None for an installed copy or without git."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / '.git').exists():
+        return None
+    try:
+        revision = subprocess.run(
+            ['git', '-C', str(root), 'rev-parse', 'HEAD'],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=5.0,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return revision.stdout.strip()

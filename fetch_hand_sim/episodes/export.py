@@ -1,0 +1,205 @@
+"""Logged episodes as datasets of the ecosystem: Parquet tables, Minari datasets.
+
+Needs the extra `[export]`. Values are those of `load_episodes`, float64, unchanged.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import json
+import os
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from fetch_hand_sim.episode_log import EpisodeArrays
+from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
+from fetch_hand_sim.gym_envs.spaces import observation_space
+
+_OBSERVATIONS = ('observation', 'achieved_goal', 'desired_goal')
+
+
+class ExportError(RuntimeError):
+    """A dataset cannot be written; the message is one line."""
+
+
+def _require(module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ExportError(
+            f'{module.partition(".")[0]} is missing; install it with pip install '
+            "'fetch_hand_sim[export]'"
+        ) from error
+
+
+def export_parquet(episodes: Sequence[EpisodeArrays], directory: Path) -> list[Path]:
+    """Writes the episodes of one task as two tables.
+
+    `<task>.parquet` has N + 1 rows per episode, one per observation: `episode_index`, `step`,
+    `timestamp` in seconds since the reset, the three observations, then what happened after it:
+    `action`, `command`, `reward`, `terminated`, `truncated`, `next_success`, all null in the last
+    row. `<task>_episodes.parquet` has a row per episode: what the file says of itself.
+
+    Args:
+        episodes: At least one, all of one task.
+        directory: Where to write.
+
+    Returns:
+        The two files.
+
+    Raises:
+        ExportError: If pyarrow is missing, the files exist or cannot be written.
+    """
+    pyarrow, parquet = _require('pyarrow'), _require('pyarrow.parquet')
+    task = episodes[0].spec.name
+    tables = {
+        directory / f'{task}.parquet': pyarrow.concat_tables(
+            _step_table(pyarrow, index, episode) for index, episode in enumerate(episodes)
+        ),
+        directory / f'{task}_episodes.parquet': pyarrow.Table.from_pylist(
+            [_episode_row(index, episode) for index, episode in enumerate(episodes)]
+        ),
+    }
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for path, table in tables.items():
+            if path.exists():
+                raise ExportError(f'{path} exists; nothing is overwritten')
+            parquet.write_table(table, path, compression='zstd')
+    except OSError as error:
+        raise ExportError(f'{directory}: {error.strerror or error}') from error
+    return list(tables)
+
+
+def _step_table(pyarrow: Any, index: int, episode: EpisodeArrays) -> Any:
+    rows = len(episode) + 1
+    seconds = (episode.stamps - episode.stamps[0]) / 1e9
+    columns = {
+        'episode_index': pyarrow.array(np.full(rows, index)),
+        'step': pyarrow.array(np.arange(rows)),
+        'timestamp': pyarrow.array(seconds),
+        **{name: _vectors(pyarrow, episode.observations[name], rows) for name in _OBSERVATIONS},
+        'action': _vectors(pyarrow, episode.actions, rows),
+        'command': _vectors(pyarrow, episode.commands, rows),
+    }
+    steps = {
+        'reward': episode.rewards,
+        'terminated': episode.terminated,
+        'truncated': episode.truncated,
+        'next_success': episode.success[1:],
+    }
+    for name, values in steps.items():
+        columns[name] = pyarrow.concat_arrays(
+            [pyarrow.array(values), pyarrow.nulls(1, pyarrow.array(values).type)]
+        )
+    return pyarrow.table(columns)
+
+
+def _vectors(pyarrow: Any, values: NDArray[np.float64], rows: int) -> Any:
+    """A column of vectors of fixed size, filled up with nulls to `rows`."""
+    size = values.shape[1]
+    column = pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(values.ravel()), size)
+    missing = rows - len(values)
+    return pyarrow.concat_arrays([column, pyarrow.nulls(missing, column.type)])
+
+
+def _episode_row(index: int, episode: EpisodeArrays) -> dict[str, Any]:
+    return {
+        'episode_index': index,
+        'path': str(episode.path),
+        'task': episode.spec.name,
+        'seed': int(episode.metadata['seed']),
+        'steps': len(episode),
+        'return': float(episode.rewards.sum()),
+        'success': bool(episode.success[-1]),
+        'complete': episode.is_complete,
+        'control_hz': float(episode.metadata['control_hz']),
+        'metadata': json.dumps(episode.metadata),
+        'result': json.dumps(episode.result),
+    }
+
+
+def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str) -> str:
+    """Writes the episodes of one task as a Minari dataset.
+
+    Args:
+        episodes: At least one, all of one task.
+        directory: Where Minari datasets live (`MINARI_DATASETS_PATH`).
+        name: Of the dataset, such as `logged-v0`; the task comes before it.
+
+    Returns:
+        The id of the dataset, `<task>/<name>`.
+
+    Raises:
+        ExportError: If minari is missing, the dataset exists or cannot be written.
+    """
+    os.environ['MINARI_DATASETS_PATH'] = str(directory.resolve())
+    minari, collector = _require('minari'), _require('minari.data_collector')
+    spec = episodes[0].spec
+    dataset_id = f'{spec.name}/{name}'
+    if (directory / dataset_id).exists():
+        raise ExportError(f'{directory / dataset_id} exists; nothing is overwritten')
+    buffers = [
+        collector.EpisodeBuffer(
+            id=index,
+            seed=int(episode.metadata['seed']),
+            observations=dict(episode.observations),
+            actions=episode.actions,
+            rewards=episode.rewards.tolist(),
+            terminations=episode.terminated.tolist(),
+            truncations=episode.truncated.tolist(),
+            infos={'is_success': episode.success[:, None]},
+        )
+        for index, episode in enumerate(episodes)
+    ]
+    # Actions worked out from commands are not all float32.
+    actions = spaces.Box(-1.0, 1.0, (spec.robot.action_size,), np.float64)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with warnings.catch_warnings():
+            # Minari warns of every field that only an author could fill in.
+            warnings.filterwarnings('ignore', module='minari')
+            minari.create_dataset_from_buffers(
+                dataset_id,
+                buffers,
+                env=_environment(episodes[0]),
+                observation_space=observation_space(spec),
+                action_space=actions,
+                algorithm_name=_algorithm(episodes),
+                description=f'Logged episodes of {spec.name}.',
+                data_format='arrow',
+                requirements=_requirements(episodes[0]),
+            )
+    except ImportError as error:
+        raise ExportError(f"{error}; install with pip install 'fetch_hand_sim[export]'") from error
+    except (OSError, ValueError, AssertionError) as error:
+        raise ExportError(f'{dataset_id}: {" ".join(str(error).split())}') from error
+    return dataset_id
+
+
+def _environment(episode: EpisodeArrays) -> Any:
+    """The Gymnasium environment the episode could have come from, for `recover_environment`."""
+    register_environments()
+    spec = copy.deepcopy(gymnasium.spec(environment_id(episode.spec.name)))
+    for name in ('reward_type', 'success_rule'):
+        spec.kwargs[name] = episode.metadata[name]
+    spec.kwargs['control_hz'] = float(episode.metadata['control_hz'])
+    return spec
+
+
+def _algorithm(episodes: Sequence[EpisodeArrays]) -> str:
+    checkpoints = {episode.metadata.get('checkpoint_sha256', 'unknown') for episode in episodes}
+    return f'checkpoints {", ".join(sorted(checkpoints))}'
+
+
+def _requirements(episode: EpisodeArrays) -> list[str]:
+    names = ('mujoco', 'gymnasium-robotics')
+    return [f'{name}=={episode.metadata.get(f"{name}_version", "unknown")}' for name in names]

@@ -1,0 +1,198 @@
+"""Logged episodes by the thousand: the batched simulation writes what `sim_node` would.
+
+The files are those of a robot in lockstep that got the same commands: same messages, stamps, log
+times and metadata keys, so whatever reads the node's episodes reads these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeLogError, EpisodeWriter
+from fetch_hand_sim.episodes.context import RecordingContext
+from fetch_hand_sim.episodes.recorder import LoggedEpisode, episode_result
+from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS, robot_readings
+from fetch_hand_sim.simulation import Observation, Simulation
+from msgs_spec.cdr import TopicEncoder
+from msgs_spec.commands import clip_command, command_from_action
+from msgs_spec.tick import EpisodeStatus, Phase, Tick, TickEncoder
+from msgs_spec.topics import topic
+
+Array = NDArray[np.float64]
+Act = Callable[[Observation], NDArray[Any]]
+
+# Completing a file waits for the disk several times; so many files wait at once.
+_COMPLETING_THREADS = 4
+
+
+@dataclass(slots=True)
+class _Robot:
+    """One of the batch, through one episode."""
+
+    episode: int
+    seed: int
+    stamp_ns: int
+    messages: list[tuple[int, list[Any], bytes | None]] = field(default_factory=list)
+    tick: int = 0
+    episode_return: float = 0.0
+    status: EpisodeStatus | None = None
+
+    @property
+    def is_finished(self) -> bool:
+        return self.status is not None and self.status.phase == 'finished'
+
+
+class EpisodeGenerator:
+    """Runs an actor in all robots of a simulation and logs every episode.
+
+    Args:
+        simulation: The robots.
+        directory: Where episodes are collected.
+        act: Returns actions (N, action size) in [-1, 1] for the observations of all robots.
+        context: Metadata and attachments.
+    """
+
+    def __init__(
+        self, simulation: Simulation, directory: Path, act: Act, context: RecordingContext
+    ) -> None:
+        self._simulation = simulation
+        self._episodes = EpisodeDirectory(directory)
+        self._act = act
+        self._context = context
+        self._encoder = TickEncoder(simulation.spec)
+        self._commands = topic(simulation.spec, 'commands')
+        self._command_encoder = TopicEncoder(self._commands)
+        self._period_ns = round(simulation.tick_duration * 1e9)
+
+    def generate(self, episodes: int, first_seed: int = 0) -> Iterator[LoggedEpisode]:
+        """Yields the episodes, in order, as their files are completed.
+
+        Episode i has the seed `first_seed + i` and the stamps it would have in a series run by
+        one robot.
+
+        Args:
+            episodes: How many.
+            first_seed: Seed of the first.
+
+        Raises:
+            EpisodeLogError: If a file cannot be written.
+        """
+        with ThreadPoolExecutor(_COMPLETING_THREADS, 'episode_log') as pool:
+            waiting: list[Future[LoggedEpisode]] = []
+            for first in range(0, episodes, self._simulation.num_envs):
+                count = min(self._simulation.num_envs, episodes - first)
+                robots = [self._robot(first + i, first_seed) for i in range(count)]
+                self._run(robots, first_seed + first)
+                yield from (future.result() for future in waiting)
+                waiting = [pool.submit(_complete, self._write(robot), robot) for robot in robots]
+            yield from (future.result() for future in waiting)
+
+    def _robot(self, episode: int, first_seed: int) -> _Robot:
+        ticks = self._simulation.spec.episode_ticks + 1
+        return _Robot(
+            episode, first_seed + episode, FIRST_STAMP_NS + episode * ticks * self._period_ns
+        )
+
+    def _run(self, robots: Sequence[_Robot], first_seed: int) -> None:
+        """Runs one episode in every robot; robots beyond those given run idle."""
+        simulation, robot_spec = self._simulation, self._simulation.spec.robot
+        observation = simulation.reset(seed=first_seed)
+        success = simulation.compute_success(
+            observation['achieved_goal'], observation['desired_goal']
+        )
+        self._take(robots, observation, success, None, None)
+        for _ in range(simulation.spec.episode_ticks):
+            actions = self._act(observation)
+            commands = np.asarray(command_from_action(robot_spec, actions), dtype=np.float64)
+            self._receive(robots, commands)
+            applied = clip_command(robot_spec, commands)
+            result = simulation.step_commands(applied)
+            observation = result.observation
+            self._take(robots, observation, result.success, applied, result.reward, result.diverged)
+
+    def _take(
+        self,
+        robots: Sequence[_Robot],
+        observation: Observation,
+        success: NDArray[np.bool_],
+        applied: Array | None,
+        reward: Array | None,
+        diverged: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Encodes one tick of every robot that is still in its episode."""
+        readings = self._simulation.readings()
+        for index, robot in enumerate(robots):
+            if robot.is_finished:
+                continue
+            phase: Phase = 'reset'
+            if reward is not None and diverged is not None:
+                robot.tick += 1
+                robot.episode_return += float(reward[index])
+                is_last = diverged[index] or robot.tick >= self._simulation.spec.episode_ticks
+                phase = 'finished' if is_last else 'running'
+            robot.status = self._status(robot, phase, bool(success[index]))
+            tick = Tick(
+                stamp_ns=robot.stamp_ns,
+                **robot_readings(readings, index),
+                desired_goal=observation['desired_goal'][index],
+                achieved_goal=observation['achieved_goal'][index],
+                reward=None if reward is None else float(reward[index]),
+                is_success=bool(success[index]),
+                applied_command=None if applied is None else applied[index],
+                status=robot.status,
+            )
+            messages = self._encoder.encode(tick, latched=phase != 'running')
+            robot.messages.append((robot.stamp_ns, messages, None))
+            robot.stamp_ns += self._period_ns
+
+    def _receive(self, robots: Sequence[_Robot], commands: Array) -> None:
+        """Notes the command that each robot got after its last tick, as `policy_node` sends it."""
+        for robot, command in zip(robots, commands, strict=False):
+            if not robot.is_finished:
+                stamp_ns, messages, _ = robot.messages[-1]
+                robot.messages[-1] = (stamp_ns, messages, self._command_encoder.encode(0, command))
+
+    def _status(self, robot: _Robot, phase: Phase, is_success: bool) -> EpisodeStatus:
+        metric = self._simulation.metric
+        return EpisodeStatus(
+            task=self._simulation.spec.name,
+            episode=robot.episode,
+            seed=robot.seed,
+            tick=robot.tick,
+            phase=phase,
+            control_hz=self._simulation.control_hz,
+            reward_type=metric.reward_type,
+            success_rule=metric.success_rule,
+            episode_return=robot.episode_return,
+            is_success=is_success,
+        )
+
+    def _write(self, robot: _Robot) -> EpisodeWriter:
+        assert robot.status is not None
+        writer = self._episodes.begin(
+            robot.status.task,
+            robot.seed,
+            self._context.metadata(robot.status),
+            self._context.attachments,
+        )
+        for stamp_ns, messages, command in robot.messages:
+            writer.write_tick(stamp_ns, messages)
+            if command is not None:
+                writer.write_received(self._commands, command)
+        robot.messages.clear()
+        return writer
+
+
+def _complete(writer: EpisodeWriter, robot: _Robot) -> LoggedEpisode:
+    assert robot.status is not None
+    path = writer.finish(episode_result(robot.status))
+    if path is None:
+        raise EpisodeLogError(f'episode of seed {robot.seed} could not be written')
+    return LoggedEpisode(robot.status, path, is_complete=True)

@@ -1,0 +1,203 @@
+"""Episodes of one robot, tick by tick: command in, `Tick` out.
+
+Nothing here knows of ROS, of files or of wall time: what paces the ticks is outside, so real time,
+lockstep and a Python loop give the same ticks for the same commands.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation import Observation, Simulation
+from fetch_hand_sim.simulation.tasks import Readings
+from msgs_spec.tick import EpisodeStatus, Phase, Tick
+
+Array = NDArray[np.float64]
+
+# Simulated time of the first tick. Not 0, because ROS takes a time of 0 for "no time yet".
+FIRST_STAMP_NS = 1_000_000_000
+
+
+class EpisodeRunner:
+    """Runs episodes one after the other on a `Simulation` of one robot.
+
+    Each reset takes a tick of its own: `advance` starts an episode when `is_between_episodes`, and
+    steps it otherwise. Episode i has the seed `first_seed + i`. Stamps grow by one period per tick
+    and never go back.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        *,
+        first_seed: int = 0,
+        episodes: int = 0,
+        first_episode: int = 0,
+        first_stamp_ns: int = FIRST_STAMP_NS,
+    ) -> None:
+        """Prepares the first episode.
+
+        Args:
+            simulation: With `num_envs` 1.
+            first_seed: Seed of the first episode.
+            episodes: How many episodes to run; 0 for no end.
+            first_episode: Index of the first episode, which has the seed `first_seed` plus it; to
+                run an episode from the middle of a series again.
+            first_stamp_ns: Simulated time of the first tick, likewise.
+
+        Raises:
+            ValueError: If the simulation holds more than one robot.
+        """
+        if simulation.num_envs != 1:
+            raise ValueError(f'one robot is run at a time, not {simulation.num_envs}')
+        self.simulation = simulation
+        self.spec = simulation.spec
+        self._first_seed = first_seed
+        self._episodes = episodes
+        self._period_ns = round(simulation.tick_duration * 1e9)
+        self._first_stamp_ns = self._next_stamp_ns = first_stamp_ns
+        self._episode = first_episode
+        self._tick = 0
+        self._return = 0.0
+        self.is_between_episodes = True
+        self.has_diverged = False
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all episodes asked for are finished."""
+        return 0 < self._episodes <= self._episode
+
+    @property
+    def episode(self) -> int:
+        """Index of the running or next episode, from 0."""
+        return self._episode
+
+    @property
+    def seed(self) -> int:
+        """Seed of the running or next episode."""
+        return self._first_seed + self._episode
+
+    @property
+    def tick(self) -> int:
+        """Steps of the running or last episode so far."""
+        return self._tick
+
+    @property
+    def stamp_ns(self) -> int:
+        """Simulated time of the last tick; one period before the first if there is none."""
+        return self._next_stamp_ns - self._period_ns
+
+    @property
+    def has_started(self) -> bool:
+        """Whether there has been a tick."""
+        return self._next_stamp_ns > self._first_stamp_ns
+
+    def waiting_status(self) -> EpisodeStatus:
+        """What to say of the first episode before it starts."""
+        return self._status('waiting', is_success=False)
+
+    def resting_command(self) -> Array:
+        """The command (action size,) that leaves the robot as it is."""
+        (command,) = self.simulation.resting_commands()
+        return np.asarray(command)
+
+    def set_goal(self, goal: Array) -> None:
+        """Replaces the goal (goal size,) of the running episode from the next tick on.
+
+        Raises:
+            ValueError: If it does not fit the task.
+        """
+        self.simulation.set_goal(goal[None])
+
+    def end_episode(self) -> None:
+        """Gives the running episode up: the next tick starts another."""
+        if not self.is_between_episodes:
+            self._finish()
+
+    def advance(self, command: Array) -> Tick:
+        """Advances by one tick: the reset of the next episode, or one step of the running one.
+
+        Args:
+            command: (action size,) in command units and within limits; a reset ignores it.
+        """
+        if self.is_between_episodes:
+            return self._reset()
+        return self._step(command)
+
+    def _reset(self) -> Tick:
+        self._tick = 0
+        self._return = 0.0
+        self.has_diverged = False
+        self.is_between_episodes = False
+        observation = self.simulation.reset(seed=self.seed)
+        success = self.simulation.compute_success(
+            observation['achieved_goal'], observation['desired_goal']
+        )
+        return self._make_tick(observation, 'reset', bool(success[0]), None, None)
+
+    def _step(self, command: Array) -> Tick:
+        result = self.simulation.step_commands(command[None])
+        reward = float(result.reward[0])
+        self._tick += 1
+        self._return += reward
+        self.has_diverged = bool(result.diverged[0])
+        is_last = self.has_diverged or self._tick >= self.spec.episode_ticks
+        tick = self._make_tick(
+            result.observation,
+            'finished' if is_last else 'running',
+            bool(result.success[0]),
+            reward,
+            command.copy(),
+        )
+        if is_last:
+            self._finish()
+        return tick
+
+    def _finish(self) -> None:
+        self.is_between_episodes = True
+        self._episode += 1
+
+    def _make_tick(
+        self,
+        observation: Observation,
+        phase: Phase,
+        is_success: bool,
+        reward: float | None,
+        applied_command: Array | None,
+    ) -> Tick:
+        stamp_ns = self._next_stamp_ns
+        self._next_stamp_ns += self._period_ns
+        return Tick(
+            stamp_ns=stamp_ns,
+            **robot_readings(self.simulation.readings(), 0),
+            desired_goal=observation['desired_goal'][0],
+            achieved_goal=observation['achieved_goal'][0],
+            reward=reward,
+            is_success=is_success,
+            applied_command=applied_command,
+            status=self._status(phase, is_success=is_success),
+        )
+
+    def _status(self, phase: Phase, *, is_success: bool) -> EpisodeStatus:
+        metric = self.simulation.metric
+        return EpisodeStatus(
+            task=self.spec.name,
+            episode=self._episode,
+            seed=self.seed,
+            tick=self._tick,
+            phase=phase,
+            control_hz=self.simulation.control_hz,
+            reward_type=metric.reward_type,
+            success_rule=metric.success_rule,
+            episode_return=self._return,
+            is_success=is_success,
+        )
+
+
+def robot_readings(readings: Readings, index: int) -> dict[str, Array]:
+    """Returns what one of the robots reads, without what it does not have."""
+    fields = ((f.name, getattr(readings, f.name)) for f in dataclasses.fields(readings))
+    return {name: values[index] for name, values in fields if values is not None}

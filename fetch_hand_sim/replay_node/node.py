@@ -1,0 +1,196 @@
+"""The ROS node around a `ReplaySchedule`."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from std_srvs.srv import SetBool
+
+from fetch_hand_sim.episode_log import EpisodeReadError
+from fetch_hand_sim.replay_node import NODE_NAME
+from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
+from msgs_spec.parameters import ParameterSpec, set_callback
+from msgs_spec.qos import rclpy_profile
+from msgs_spec.ros import (
+    StopSignals,
+    UsageError,
+    declare_parameters,
+    ros_message_class,
+)
+
+PARAMETERS = (
+    ParameterSpec('path', 'string', '', 'Episode: bag directory or MCAP file.'),
+    ParameterSpec(
+        'rate',
+        'double',
+        1.0,
+        'Recorded seconds per second.',
+        lower=0.01,
+        upper=100.0,
+        read_only=False,
+    ),
+    ParameterSpec('loop', 'bool', False, 'Whether to start again at the end.', read_only=False),
+    ParameterSpec('start_paused', 'bool', False, 'Whether to wait for ~/pause with false.'),
+    ParameterSpec(
+        'start_offset', 'double', 0.0, 'Recorded seconds to leave out.', lower=0.0, upper=1e6
+    ),
+    ParameterSpec(
+        'topics', 'string', '', 'Topics to publish, separated by commas; empty for all published.'
+    ),
+    ParameterSpec(
+        'inputs', 'bool', False, 'Whether to publish also what the robot received: commands, goals.'
+    ),
+    ParameterSpec(
+        'wait_for_commands', 'bool', False, 'Whether to start when somebody publishes commands.'
+    ),
+)
+# Seconds between looks at the stop flag while nothing is due.
+_SPIN = 0.1
+_LAST_WORDS_TIMEOUT = 1.0
+_CLOCK = '/clock'
+
+
+class ReplayNode(Node):
+    """Publishes an episode, once or in a loop."""
+
+    def __init__(self) -> None:
+        """Reads the episode and opens its topics.
+
+        Raises:
+            UsageError: If a parameter is not allowed or the episode cannot be read.
+        """
+        super().__init__(NODE_NAME)
+        self._settings = declare_parameters(self, PARAMETERS)
+        self._schedule = self._read_schedule()
+        self._start_ns = self._schedule.start_ns + round(self._settings['start_offset'] * 1e9)
+        if self._start_ns > self._schedule.end_ns:
+            length = (self._schedule.end_ns - self._schedule.start_ns) / 1e9
+            raise UsageError(
+                f'start_offset: {self._settings["start_offset"]} given; allowed: up to {length:.3f}'
+            )
+        # The last tick lasts as long as the others before a loop starts again.
+        self._end_ns = self._schedule.end_ns + self._schedule.period_ns
+        self._publishers_by_topic = {name: self._open(name) for name in self._schedule.topics}
+        self._next = 0
+        self._last_clock: bytes | None = None
+        self._playhead = Playhead(
+            self._start_ns,
+            self._settings['rate'],
+            time.monotonic(),
+            is_paused=self._settings['start_paused'],
+        )
+        self.create_service(SetBool, '~/pause', self._on_pause)
+        self.add_on_set_parameters_callback(set_callback(PARAMETERS))
+        self.add_post_set_parameters_callback(self._apply_changes)
+
+    def _read_schedule(self) -> ReplaySchedule:
+        path = self._settings['path']
+        if not path:
+            raise UsageError('path is missing; allowed: a bag directory or an MCAP file')
+        names = [name.strip() for name in self._settings['topics'].split(',') if name.strip()]
+        try:
+            return ReplaySchedule(Path(path), names, self._settings['inputs'])
+        except (EpisodeReadError, ValueError) as error:
+            raise UsageError(str(error)) from None
+
+    def _open(self, name: str) -> Publisher:
+        spec = self._schedule.topics[name]
+        return self.create_publisher(
+            ros_message_class(spec.type_name), name, rclpy_profile(spec.qos)
+        )
+
+    def run(self, stop: StopSignals) -> None:
+        """Publishes until the end of the episode, or until the signals say stop."""
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
+        try:
+            self._wait_for_commander(executor, stop)
+            self._begin()
+            while not stop and not self._is_over():
+                self._serve(executor)
+                self._publish_due()
+        finally:
+            for publisher in self._publishers_by_topic.values():
+                publisher.wait_for_all_acked(Duration(seconds=_LAST_WORDS_TIMEOUT))
+            executor.remove_node(self)
+
+    def _wait_for_commander(self, executor: SingleThreadedExecutor, stop: StopSignals) -> None:
+        """Shows the latched topics, from which a policy learns what robot this is."""
+        self._publish_latched()
+        commands = f'{self._schedule.namespace}/commands'
+        own = int(commands in self._publishers_by_topic)
+        while (
+            self._settings['wait_for_commands']
+            and not stop
+            and self.count_publishers(commands) <= own
+        ):
+            executor.spin_once(timeout_sec=_SPIN)
+
+    def _begin(self) -> None:
+        """Goes to the start."""
+        self._next = self._schedule.index_at(self._start_ns)
+        self._playhead.jump(self._start_ns, time.monotonic())
+
+    def _is_over(self) -> bool:
+        if self._next < len(self._schedule.messages):
+            return False
+        if not self._settings['loop']:
+            return True
+        if self._playhead.remaining(self._end_ns, time.monotonic()) <= 0.0:
+            self._publish_latched()
+            self._begin()
+        return False
+
+    def _serve(self, executor: SingleThreadedExecutor) -> None:
+        """Serves callbacks until the next message is due, a tenth of a second at most."""
+        messages = self._schedule.messages
+        due = messages[self._next].time_ns if self._next < len(messages) else self._end_ns
+        remaining = self._playhead.remaining(due, time.monotonic())
+        executor.spin_once(timeout_sec=max(0.0, min(remaining, _SPIN)))
+        if math.isinf(remaining) and self._last_clock is not None:
+            self._publishers_by_topic[_CLOCK].publish(self._last_clock)
+
+    def _publish_due(self) -> None:
+        position = self._playhead.position_ns(time.monotonic())
+        messages = self._schedule.messages
+        while (
+            not self._playhead.is_paused
+            and self._next < len(messages)
+            and messages[self._next].time_ns <= position
+        ):
+            self._publish(messages[self._next])
+            self._next += 1
+
+    def _publish_latched(self) -> None:
+        for message in self._schedule.latched_at(self._start_ns):
+            self._publish(message)
+
+    def _publish(self, message: ReplayMessage) -> None:
+        self._publishers_by_topic[message.name].publish(message.data)
+        if message.name == _CLOCK:
+            self._last_clock = message.data
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if request.data == self._playhead.is_paused:
+            response.message = 'already paused' if request.data else 'already running'
+        else:
+            response.message = 'paused' if request.data else 'running'
+        if request.data:
+            self._playhead.pause(time.monotonic())
+        else:
+            self._playhead.resume(time.monotonic())
+        response.success = True
+        return response
+
+    def _apply_changes(self, changes: list[Any]) -> None:
+        for change in changes:
+            self._settings[change.name] = change.value
+            if change.name == 'rate':
+                self._playhead.set_rate(float(change.value), time.monotonic())

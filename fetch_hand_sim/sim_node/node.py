@@ -1,0 +1,300 @@
+"""The ROS node around a `Robot`.
+
+One thread does everything but completing log files, because a tick takes 2 ms of 40.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from pathlib import Path
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from fetch_hand_sim.episode_log import find_leftovers
+from fetch_hand_sim.episodes.context import RecordingContext
+from fetch_hand_sim.episodes.recorder import EpisodeRecorder, LoggedEpisode
+from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.sim_node import NODE_NAME
+from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
+from fetch_hand_sim.sim_node.graph_watch import GraphWatch
+from fetch_hand_sim.sim_node.health import Health, Surroundings, clock_problems, waiting_line
+from fetch_hand_sim.sim_node.pacing import RealTimePacer
+from fetch_hand_sim.sim_node.receivers import Receivers
+from fetch_hand_sim.sim_node.robot import Messages, Robot
+from fetch_hand_sim.sim_node.schedule import TickSchedule
+from fetch_hand_sim.sim_node.services import open_services
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.cdr import TopicEncoder
+from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports
+from msgs_spec.parameters import SIM_NODE, set_callback
+from msgs_spec.qos import rclpy_profile
+from msgs_spec.ros import (
+    BEAT,
+    EventLoop,
+    StopSignals,
+    UsageError,
+    declare_parameters,
+    ros_message_class,
+)
+from msgs_spec.tick import Tick
+from msgs_spec.topics import DIAGNOSTICS, MONITORING, REAL_TIME_FACTOR, topics
+
+_WARN_PERIOD = 1.0
+# Seconds a beat may take: none begins that close to a tick.
+_BEAT_TIME = 0.01
+# Callbacks that are served before a tick which is due: far more than an orderly network leaves.
+_SERVED_FIRST = 100
+# Seconds a robot waits for the name of a commander who is about to give it.
+_INTRODUCTION_TIME = 1.0
+# Seconds a robot waits in lockstep before it says so, and between two lines about it.
+_WAITING_PERIOD = 5.0
+_LAST_WORDS_TIMEOUT = 1.0
+
+
+class SimNode(Node):
+    """Publishes the state of one robot at every tick and applies the commands it receives."""
+
+    def __init__(self) -> None:
+        """Compiles the model and opens all topics and services.
+
+        Raises:
+            UsageError: If a parameter is not allowed.
+        """
+        super().__init__(NODE_NAME)
+        self._settings = declare_parameters(self, SIM_NODE)
+        self._robot = self._make_robot()
+        self._recording_context: RecordingContext | None = None
+        self._recorder = self._make_recorder()
+        self._watch = GraphWatch(self, self._robot.runner.spec)
+        self._outputs = self._open_topics()
+        open_services(self, self._robot)
+        now = time.monotonic()
+        self._health = Health(self._robot, self.get_fully_qualified_name(), now)
+        self._factor_encoder = TopicEncoder(REAL_TIME_FACTOR)
+        self._said: set[str] = set()
+        self._has_introduction = False
+        self._beat_due = self._ticked_at = now
+        self._report_due = now + REPORT_PERIOD
+        self.add_on_set_parameters_callback(set_callback(SIM_NODE))
+        self.add_post_set_parameters_callback(self._apply_changes)
+
+    # Set-up
+
+    def _make_robot(self) -> Robot:
+        values = self._settings
+        try:
+            simulation = Simulation(
+                values['task'],
+                num_envs=1,
+                num_threads=1,
+                reward_type=values['reward_type'],
+                success_rule=values['success_rule'],
+                control_hz=values['control_hz'],
+            )
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        runner = EpisodeRunner(simulation, first_seed=values['seed'], episodes=values['episodes'])
+        pacer = RealTimePacer(
+            simulation.tick_duration, values['real_time_factor'], time.monotonic()
+        )
+        return Robot(
+            runner,
+            CommandBuffer(runner.spec.robot, values['command_timeout']),
+            TickSchedule(values['mode'], pacer),
+            self._emit,
+        )
+
+    def _open_topics(self) -> dict[str, Publisher]:
+        receivers = Receivers(self._robot, self._recorder, self._on_commander, self._warn)
+        publishers = {}
+        for spec in (*topics(self._robot.runner.spec), *MONITORING):
+            message_class = ros_message_class(spec.type_name)
+            profile = rclpy_profile(spec.qos)
+            if spec.direction == 'subscribed':
+                callback = receivers.callback(spec)
+                self.create_subscription(message_class, spec.name, callback, profile)
+            elif spec.name != '/clock' or self._settings['publish_clock']:
+                publishers[spec.name] = self.create_publisher(message_class, spec.name, profile)
+        return publishers
+
+    def _make_recorder(self) -> EpisodeRecorder | None:
+        directory = self._settings['episode_dir']
+        if not directory:
+            return None
+        self._recording_context = context = RecordingContext(
+            self._robot.runner.simulation,
+            with_compiled_model=self._settings['log_compiled_model'],
+        )
+        for leftover in find_leftovers(Path(directory)):
+            self.get_logger().warning(str(leftover))
+        return EpisodeRecorder(
+            Path(directory),
+            namespace=self.get_namespace(),
+            attachments=context.attachments,
+            metadata=context.metadata,
+            on_error=lambda line: self.get_logger().error(line),
+            on_logged=self._on_logged,
+        )
+
+    # Running
+
+    def run(self, stop: StopSignals) -> None:
+        """Runs episodes until all are done or the signals say stop."""
+        loop = EventLoop(self)
+        try:
+            self._publish(self._robot.waiting_status())
+            if self._settings['wait_for_commands']:
+                self._wait_for_commander(loop, stop)
+            gc.collect()
+            gc.freeze()
+            self._robot.schedule.pacer.restart(time.monotonic())
+            while not stop and not self._robot.runner.is_done:
+                self._serve_until_due(loop, stop)
+                self._beat_when_due()
+        finally:
+            self._close(stop)
+            loop.close()
+
+    def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
+        """Lets nothing move until there is a commander who hears everything."""
+        watch = self._watch
+        while not stop and not (watch.commanders.names and watch.is_heard(self._outputs)):
+            loop.wait(BEAT)
+            watch.look()
+            self._beat_when_due()
+        # Latched, so it comes a little after its publisher is seen; the log names who commands.
+        end = time.monotonic() + _INTRODUCTION_TIME
+        while not stop and watch.will_introduce() and not self._has_introduction:
+            if time.monotonic() > end:
+                return
+            loop.wait(BEAT)
+
+    def _serve_until_due(self, loop: EventLoop, stop: StopSignals) -> None:
+        """Serves one callback, or all that wait and then the tick that is due."""
+        remaining = self._robot.wait()
+        if remaining > 0.0:
+            loop.wait(min(remaining, BEAT))
+            return
+        loop.serve_pending(_SERVED_FIRST)
+        # A callback may have paused the robot.
+        if not stop and self._robot.wait() <= 0.0:
+            self._robot.tick_when_due()
+            self._ticked_at = time.monotonic()
+
+    def _beat_when_due(self) -> None:
+        """Does what has to happen a few times a second; a tick that is near goes first."""
+        now = time.monotonic()
+        if now < self._beat_due or (
+            self._robot.wait() < _BEAT_TIME and now < self._beat_due + BEAT
+        ):
+            return
+        self._beat_due = now + BEAT
+        if now - self._ticked_at >= BEAT:
+            self._stand_still(now)
+        if now >= self._report_due:
+            self._report_due = max(self._report_due + REPORT_PERIOD, now)
+            self._report(now)
+
+    def _stand_still(self, now: float) -> None:
+        """Keeps time alive without ticks; lets a commander who came too late hear the last one."""
+        robot, watch = self._robot, self._watch
+        if robot.schedule.is_paused or not robot.runner.has_started:
+            self._publish([robot.clock_message()])
+        elif robot.schedule.waits_for_commands:
+            watch.look()
+            if watch.has_newcomer and watch.is_heard(self._outputs):
+                watch.has_newcomer = False
+                self._publish(robot.present())
+            if now - self._ticked_at > _WAITING_PERIOD:
+                line = waiting_line(robot, watch.commanders.names)
+                self.get_logger().warning(line, throttle_duration_sec=_WAITING_PERIOD)
+
+    def _emit(self, tick: Tick, messages: Messages) -> None:
+        if self._watch.has_newcomer and self._watch.is_heard(self._outputs):
+            self._watch.has_newcomer = False
+        self._publish(messages)
+        if self._recorder is not None:
+            self._recorder.record(tick, messages)
+        if tick.status.phase == 'finished' and self._robot.runner.has_diverged:
+            count = self._robot.runner.simulation.divergences
+            self.get_logger().error(
+                f'MuJoCo reports divergence; the episode ends early (so far {count} times)'
+            )
+
+    def _publish(self, messages: Messages) -> None:
+        for spec, data in messages:
+            publisher = self._outputs.get(spec.name)
+            # None where another robot owns the clock.
+            if publisher is not None:
+                publisher.publish(data)
+
+    def _close(self, stop: StopSignals) -> None:
+        if self._recorder is not None:
+            self._recorder.close(stop.received or 'end of the run')
+        deadline = time.monotonic() + _LAST_WORDS_TIMEOUT
+        for publisher in self._outputs.values():
+            # A killed subscriber never acknowledges: together, not each, they get a second.
+            left = max(0.0, deadline - time.monotonic())
+            publisher.wait_for_all_acked(Duration(seconds=left))
+
+    # Reports
+
+    def _report(self, now: float) -> None:
+        self._watch.look()
+        surroundings = self._surroundings()
+        report = self._health.report(surroundings, now)
+        self._say_news(surroundings)
+        stamp_ns = self.get_clock().now().nanoseconds
+        factor = self._factor_encoder.encode(0, [self._health.real_time_factor])
+        self._publish([(DIAGNOSTICS, encode_reports(stamp_ns, [report]))])
+        self._publish([(REAL_TIME_FACTOR, factor)])
+
+    def _surroundings(self) -> Surroundings:
+        recorder, directory = self._recorder, self._settings['episode_dir']
+        has_failed = recorder is not None and recorder.has_failed
+        return Surroundings(
+            commanders=self._watch.commanders.names,
+            problems=self._watch.commanders.problems(),
+            clock_publishers=self._watch.clock_publishers,
+            publishes_clock=self._settings['publish_clock'],
+            log=f'logging to {directory} has failed' if has_failed else directory or 'off',
+            has_log_failed=has_failed,
+        )
+
+    def _say_news(self, surroundings: Surroundings) -> None:
+        """Logs each problem once when it begins."""
+        problems = {*surroundings.problems, *clock_problems(surroundings)}
+        for line in sorted(problems - self._said):
+            self.get_logger().warning(line)
+        self._said = problems
+
+    def _on_logged(self, episode: LoggedEpisode) -> None:
+        status = episode.status
+        outcome = 'success' if status.is_success else 'failure'
+        self.get_logger().info(
+            f'episode {status.episode} seed {status.seed}: {status.tick} steps, return '
+            f'{status.episode_return:g}, {outcome if episode.is_complete else "cut short"}, '
+            f'{episode.path}'
+        )
+
+    # Callbacks
+
+    def _warn(self, line: str) -> None:
+        self.get_logger().warning(line, throttle_duration_sec=_WARN_PERIOD)
+
+    def _on_commander(self, checkpoint_sha256: str | None) -> None:
+        self._has_introduction = True
+        if self._recording_context is not None:
+            self._recording_context.checkpoint_sha256 = checkpoint_sha256
+
+    def _apply_changes(self, changes: list[Any]) -> None:
+        for change in changes:
+            self._settings[change.name] = change.value
+            if change.name == 'real_time_factor':
+                self._robot.set_real_time_factor(float(change.value))
+            elif change.name == 'command_timeout':
+                self._robot.buffer.timeout = float(change.value)

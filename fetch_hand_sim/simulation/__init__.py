@@ -1,0 +1,5 @@
+"""The simulation: thirteen tasks on MuJoCo, any number of copies at once, without ROS."""
+
+from fetch_hand_sim.simulation.simulation import Observation, Simulation, StepResult
+
+__all__ = ['Observation', 'Simulation', 'StepResult']

@@ -1,0 +1,334 @@
+"""`Simulation`: any number of copies of one task, stepped together.
+
+One copy serves the ROS node and `gymnasium.make`; sixty-four and more serve the trainer. It counts
+no steps and ends no episodes: whoever drives it decides.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.utils import seeding
+from mujoco import mjtWarning
+from mujoco.batch import SimulationError
+from numpy.typing import ArrayLike, NDArray
+
+from fetch_hand_sim.simulation.models import asset_path
+from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
+from fetch_hand_sim.simulation.tasks import Readings, make_task
+from msgs_spec.commands import command_from_action
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind
+
+Array = NDArray[np.float64]
+Observation = dict[str, Array]
+Seed = int | np.random.Generator | None
+Seeds = int | Sequence[Seed] | None
+
+_LOGGER = logging.getLogger(__name__)
+# MuJoCo warnings after which it has thrown the state away.
+_DIVERGENCE = (
+    mjtWarning.mjWARN_BADQPOS.value,
+    mjtWarning.mjWARN_BADQVEL.value,
+    mjtWarning.mjWARN_BADQACC.value,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """What one tick of N simulations gave.
+
+    Attributes:
+        observation: `observation`, `achieved_goal`, `desired_goal`, each (N, ...), fresh arrays.
+        reward: (N,).
+        success: (N,) booleans.
+        diverged: (N,) booleans: MuJoCo lost this simulation during the tick and it was reset, so
+            that its observation is the first of a new episode.
+    """
+
+    observation: Observation
+    reward: Array
+    success: NDArray[np.bool_]
+    diverged: NDArray[np.bool_]
+
+
+class Simulation:
+    """N copies of one task on a pool of threads."""
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        num_threads: int = 0,
+        reward_type: RewardType = 'sparse',
+        success_rule: SuccessRule = 'gymnasium',
+        control_hz: float = DEFAULT_CONTROL_HZ,
+    ) -> None:
+        """Compiles the model and prepares the copies; call `reset` before `step`.
+
+        Args:
+            task: One of the thirteen tasks (`msgs_spec.tasks.TASKS`).
+            num_envs: Number of copies N.
+            num_threads: Threads that step them; 0 for all processors.
+            reward_type: `sparse` or `dense`.
+            success_rule: `gymnasium` (released code) or `paper` (its text).
+            control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
+
+        Raises:
+            ValueError: If an argument is not allowed; the message says what is.
+        """
+        if num_envs < 1:
+            raise ValueError(f'num_envs must be at least 1, not {num_envs}')
+        if num_threads < 0:
+            raise ValueError(f'num_threads must be 0 (all processors) or more, not {num_threads}')
+        self._task = make_task(
+            task, num_envs=num_envs, num_threads=num_threads, control_hz=control_hz
+        )
+        self.spec = self._task.spec
+        self.num_envs = num_envs
+        self.control_hz = control_hz
+        self.metric = self._task.goal_metric(success_rule, reward_type)
+        self.divergences = 0
+        self._warnings = np.zeros(num_envs, dtype=np.int64)
+        self._goals = np.zeros((num_envs, self.spec.goal.size))
+        self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self._all = np.arange(num_envs)
+
+    @property
+    def model(self) -> Any:
+        """The compiled `mujoco.MjModel`."""
+        return self._task.model
+
+    @property
+    def asset(self) -> Path:
+        """The MJCF file of the model."""
+        return asset_path(self._task.asset)
+
+    def data(self, index: int) -> Any:
+        """A copy of simulation `index` as a `mujoco.MjData`, to render or inspect."""
+        return self._task.batch.get_data(index)
+
+    @property
+    def tick_duration(self) -> float:
+        """Simulated seconds per step."""
+        return self._task.tick_duration
+
+    def reset(self, seed: Seeds = None, ids: ArrayLike | None = None) -> Observation:
+        """Starts simulations again.
+
+        Args:
+            seed: One seed (simulation i takes seed + i), one per reset simulation, or None: the
+                random generators go on. The same seed gives the reference's draws. Instead of a
+                seed there may be a generator, which is used from then on.
+            ids: Which simulations: indices or a boolean mask (N,); None for all.
+
+        Returns:
+            The observations of all N simulations.
+
+        Raises:
+            ValueError: If a seed is negative, or ids or seeds do not fit.
+            TypeError: If a seed is not an integer.
+        """
+        selected = self._select(ids)
+        self._seed(selected, seed)
+        generators = [self._generator(i) for i in selected.tolist()]
+        if selected.size:
+            self._goals[selected] = self._task.reset(selected, generators)
+            self._warnings = self._count_warnings()
+        return self._observe()
+
+    def step(self, actions: ArrayLike) -> StepResult:
+        """Advances every simulation by one tick.
+
+        Args:
+            actions: (N, action size) in [-1, 1], float32 or float64.
+
+        Raises:
+            ValueError: If the shape is wrong, or a value is not finite or out of range; nothing has
+                moved then.
+        """
+        checked = self._check_finite('actions', actions)
+        if checked.size and (np.abs(checked) > 1.0).any():
+            env, part = np.argwhere(np.abs(checked) > 1.0)[0]
+            raise ValueError(
+                f'actions must lie in [-1, 1]; actions[{env}, {part}] is {checked[env, part]}'
+            )
+        return self._advance(command_from_action(self.spec.robot, checked))
+
+    def step_commands(self, commands: ArrayLike) -> StepResult:
+        """Advances every simulation by one tick, with commands in ROS units.
+
+        Args:
+            commands: (N, action size): Fetch as actions; hand absolute joint positions in radians.
+                What lies beyond a limit must have been clipped (`msgs_spec.commands`).
+
+        Raises:
+            ValueError: If the shape is wrong or a value is not finite.
+        """
+        return self._advance(self._check_finite('commands', commands))
+
+    def compute_reward(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
+    ) -> Array:
+        """Reward of goals of any batch shape (..., goal size)."""
+        return self.metric.reward(achieved_goal, desired_goal, info)
+
+    def compute_success(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike
+    ) -> NDArray[np.bool_]:
+        """Success of goals of any batch shape (..., goal size)."""
+        return self.metric.success(achieved_goal, desired_goal)
+
+    def set_goal(self, goals: ArrayLike, ids: ArrayLike | None = None) -> None:
+        """Replaces desired goals.
+
+        Quaternions are normalised and taken in the hemisphere nearest to the object's, because the
+        `gymnasium` success rule tells q from -q.
+
+        Args:
+            goals: (n, goal size) for the n simulations of `ids`.
+            ids: Which simulations; None for all.
+
+        Raises:
+            ValueError: If the shape is wrong, a value is not finite or a quaternion is zero.
+        """
+        selected = self._select(ids)
+        wanted = np.array(goals, dtype=np.float64)
+        shape = (selected.size, self.spec.goal.size)
+        if wanted.shape != shape:
+            raise ValueError(f'goals of {self.spec.name} have shape {shape}, not {wanted.shape}')
+        if not np.isfinite(wanted).all():
+            raise ValueError(f'goals must be finite, not {wanted.tolist()}')
+        if self.spec.goal is GoalKind.POSE:
+            norm = np.linalg.norm(wanted[:, 3:], axis=1, keepdims=True)
+            if not (norm > 1e-6).all():
+                raise ValueError('a goal quaternion must not be zero')
+            wanted[:, 3:] /= norm
+            achieved = self._task.observe()[1][selected]
+            flipped = (wanted[:, 3:] * achieved[:, 3:]).sum(axis=1) < 0.0
+            wanted[flipped, 3:] *= -1.0
+        self._goals[selected] = wanted
+
+    def resting_commands(self) -> Array:
+        """Commands (N, action size) that let the robots stay as they are."""
+        return self._task.resting_commands()
+
+    def readings(self) -> Readings:
+        """What the sensors say now, for the network."""
+        return self._task.readings()
+
+    def observe(self) -> Observation:
+        """The observation as it is now, fresh arrays."""
+        return self._observe()
+
+    def _advance(self, commands: NDArray[np.floating]) -> StepResult:
+        self._task.apply_commands(commands)
+        try:
+            self._task.step()
+            failed = np.zeros(self.num_envs, dtype=bool)
+        except SimulationError as error:
+            failed = np.isin(self._all, error.ids)
+        diverged = failed | self._has_diverged()
+        if diverged.any():
+            self._restart(diverged)
+        observation = self._observe()
+        reward, success = self.metric.evaluate(observation['achieved_goal'], self._goals)
+        return StepResult(observation, reward, success, diverged)
+
+    def _has_diverged(self) -> NDArray[np.bool_]:
+        """Which simulations MuJoCo has given up since the last reset or step, (N,)."""
+        before, self._warnings = self._warnings, self._count_warnings()
+        return np.asarray(self._warnings > before)
+
+    def _count_warnings(self) -> NDArray[np.int64]:
+        """How often MuJoCo has given each simulation up, (N,)."""
+        # The last axis of `Batch.warning` is (last info, number).
+        first, second, third = (self._task.batch.warning[:, kind, 1] for kind in _DIVERGENCE)
+        return np.asarray(first + second + third)
+
+    def _restart(self, diverged: NDArray[np.bool_]) -> None:
+        ids = np.flatnonzero(diverged)
+        self.divergences += ids.size
+        _LOGGER.warning(
+            '%s: MuJoCo reports simulations %s as diverged; they start a new episode',
+            self.spec.name,
+            ids.tolist(),
+        )
+        self._goals[ids] = self._task.reset(ids, [self._generator(i) for i in ids.tolist()])
+        self._warnings = self._count_warnings()
+
+    def _observe(self) -> Observation:
+        observation, achieved = self._task.observe()
+        return {
+            'observation': observation,
+            'achieved_goal': achieved,
+            'desired_goal': self._goals.copy(),
+        }
+
+    def _check_finite(self, name: str, values: ArrayLike) -> NDArray[np.floating]:
+        array = np.asarray(values)
+        shape = (self.num_envs, self.spec.robot.action_size)
+        if array.shape != shape:
+            raise ValueError(f'{name} of {self.spec.name} have shape {shape}, not {array.shape}')
+        if array.dtype.kind not in 'iuf':
+            raise ValueError(f'{name} are numbers, not of type {array.dtype}')
+        if array.dtype not in (np.float32, np.float64):
+            array = array.astype(np.float64)
+        if not np.isfinite(array).all():
+            env, part = np.argwhere(~np.isfinite(array))[0]
+            raise ValueError(f'{name} must be finite; {name}[{env}, {part}] is {array[env, part]}')
+        return array
+
+    def _select(self, ids: ArrayLike | None) -> NDArray[np.intp]:
+        if ids is None:
+            return self._all
+        selected = np.asarray(ids)
+        if selected.dtype == bool and selected.shape == (self.num_envs,):
+            return np.flatnonzero(selected)
+        if selected.ndim == 1 and selected.size == 0:
+            return np.zeros(0, dtype=np.intp)
+        if selected.ndim != 1 or not np.issubdtype(selected.dtype, np.integer):
+            raise ValueError(
+                f'ids must be indices below {self.num_envs} or a boolean mask of shape '
+                f'({self.num_envs},), not {ids!r}'
+            )
+        unique = np.unique(selected)
+        if unique[0] < 0 or unique[-1] >= self.num_envs or unique.size != selected.size:
+            raise ValueError(f'ids must be distinct and in [0, {self.num_envs}), not {ids!r}')
+        return unique.astype(np.intp)
+
+    def _seed(self, selected: NDArray[np.intp], seed: Seeds) -> None:
+        if seed is None:
+            return
+        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+            seeds: list[Seed] = [int(seed) + int(i) for i in selected]
+        elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes):
+            seeds = list(seed)
+        else:
+            raise TypeError(f'a seed is an integer, a sequence of integers or None, not {seed!r}')
+        if len(seeds) != selected.size:
+            raise ValueError(f'{selected.size} simulations start again but {len(seeds)} seeds came')
+        fresh = [None if value is None else _generator_from(value) for value in seeds]
+        for index, generator in zip(selected.tolist(), fresh, strict=True):
+            if generator is not None:
+                self._generators[index] = generator
+
+    def _generator(self, index: int) -> np.random.Generator:
+        generator = self._generators[index]
+        if generator is None:
+            generator = self._generators[index] = seeding.np_random(None)[0]
+        return generator
+
+
+def _generator_from(seed: Any) -> np.random.Generator:
+    if isinstance(seed, np.random.Generator):
+        return seed
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool):
+        raise TypeError(f'a seed is an integer, not {seed!r}')
+    if seed < 0:
+        raise ValueError(f'a seed must not be negative, but {seed} is')
+    return seeding.np_random(int(seed))[0]

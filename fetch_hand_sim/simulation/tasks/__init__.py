@@ -1,0 +1,8 @@
+"""The thirteen tasks, from data (`msgs_spec.tasks`) to running batches."""
+
+from __future__ import annotations
+
+from fetch_hand_sim.simulation.tasks.registry import make_task
+from fetch_hand_sim.simulation.tasks.task import Readings, Task
+
+__all__ = ['Readings', 'Task', 'make_task']

@@ -1,0 +1,329 @@
+"""The four Fetch tasks: a mocap-driven gripper, with or without an object.
+
+Facts follow Gymnasium-Robotics 1.4.2 `fetch_env.py` to the bit, accidents included: positions are
+those of the last substep unless the gripper is blocked (then a forward pass refreshes them),
+velocities come from that Jacobian and the newest qvel, and the mocap body is re-anchored to the
+lagged gripper pose at each action.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.model_tuning import (
+    FETCH_NEVER_TOUCHING,
+    exclude_body_pairs,
+    skip_unread_stages,
+)
+from fetch_hand_sim.simulation.models import load_spec
+from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
+from fetch_hand_sim.simulation.tasks.task import (
+    Array,
+    Generators,
+    Ids,
+    Readings,
+    Task,
+    integration_state,
+    joint_qpos_slice,
+)
+from msgs_spec.observations import fetch_observation
+from msgs_spec.robots import GRIPPER_STEP
+from msgs_spec.rotations import quaternion_multiply
+from msgs_spec.tasks import TaskSpec
+
+# The gripper is held in this (unnormalised) orientation: fetch_env.py adds it to the mocap
+# quaternion.
+_GRIPPER_ROTATION = np.array([1.0, 0.0, 1.0, 0.0])
+# Where the gripper starts, relative to where the compiled model has it, metres.
+_GRIPPER_START = np.array([-0.498, 0.005, -0.431])
+_SETTLING_SUBSTEPS = 200
+# No object starts closer to the gripper than this, metres.
+_OBJECT_CLEARANCE = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class FetchConfig:
+    """Numbers in which the Fetch tasks differ; metres.
+
+    Attributes:
+        asset: MJCF file.
+        start: Initial positions of robot0:slide0, slide1, slide2.
+        object_start: Initial object qpos, or None.
+        block_gripper: Whether the fingers are locked shut.
+        gripper_extra_height: Added to the gripper's starting height.
+        object_range: Half width of the square in which the object starts.
+        target_range: Half width of the cube in which goals lie.
+        target_offset: Added to goals.
+        target_in_the_air: Whether half of the goals are above the table.
+    """
+
+    asset: str
+    start: tuple[float, float, float]
+    object_start: tuple[float, ...] | None
+    block_gripper: bool
+    gripper_extra_height: float
+    object_range: float = 0.15
+    target_range: float = 0.15
+    target_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    target_in_the_air: bool = False
+
+
+_BOX_START = (1.25, 0.53, 0.4, 1.0, 0.0, 0.0, 0.0)
+_PUCK_START = (1.7, 1.1, 0.41, 1.0, 0.0, 0.0, 0.0)
+
+FETCH_CONFIGS = {
+    'FetchReach': FetchConfig(
+        asset='fetch/reach.xml',
+        start=(0.4049, 0.48, 0.0),
+        object_start=None,
+        block_gripper=True,
+        gripper_extra_height=0.2,
+    ),
+    'FetchPush': FetchConfig(
+        asset='fetch/push.xml',
+        start=(0.405, 0.48, 0.0),
+        object_start=_BOX_START,
+        block_gripper=True,
+        gripper_extra_height=0.0,
+    ),
+    'FetchSlide': FetchConfig(
+        asset='fetch/slide.xml',
+        start=(0.05, 0.48, 0.0),
+        object_start=_PUCK_START,
+        block_gripper=True,
+        gripper_extra_height=-0.02,
+        object_range=0.1,
+        target_range=0.3,
+        target_offset=(0.4, 0.0, 0.0),
+    ),
+    'FetchPickAndPlace': FetchConfig(
+        asset='fetch/pick_and_place.xml',
+        start=(0.405, 0.48, 0.0),
+        object_start=_BOX_START,
+        block_gripper=False,
+        gripper_extra_height=0.2,
+        target_in_the_air=True,
+    ),
+}
+
+
+class FetchTask(Task):
+    """FetchReach, FetchPush, FetchSlide, FetchPickAndPlace."""
+
+    def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
+        """Lets the robot settle once and keeps that state as the start of every episode."""
+        self.config = FETCH_CONFIGS[spec.name]
+        mjcf = load_spec(self.config.asset)
+        exclude_body_pairs(mjcf, FETCH_NEVER_TOUCHING)
+        model = mjcf.compile()
+        skip_unread_stages(model)
+        self._settle(model, spec)
+        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
+        self._grip = _SiteReader(self, 'robot0:grip')
+        self._object = _SiteReader(self, 'object0') if spec.has_object else None
+        self._fingers = self._joint_qpos[-2:]
+        self._ctrl = self.batch.bind('ctrl')
+        self._mocap_pos = self.batch.bind('mocap_pos')
+        self._mocap_quat = self.batch.bind('mocap_quat')
+        gripper_body = model.body('robot0:gripper_link').id
+        self._gripper_xpos = self.batch.bind('xpos')[:, gripper_body]
+        self._gripper_xquat = self.batch.bind('xquat')[:, gripper_body]
+        self.batch.state[:] = self._start_state
+
+    def _settle(self, model: mujoco.MjModel, spec: TaskSpec) -> None:
+        """Drives the gripper to its start and records the state after a reset."""
+        config = self.config
+        data = mujoco.MjData(model)
+        for joint, value in zip(spec.robot.joints[:3], config.start, strict=True):
+            data.joint(joint).qpos = value
+        if config.object_start is not None:
+            data.joint('object0:joint').qpos = config.object_start
+        model.eq_data[model.eq_type == mujoco.mjtEq.mjEQ_WELD, :7] = [0, 0, 0, 0, 0, 0, 1]
+        mujoco.mj_forward(model, data)
+        target = _GRIPPER_START + np.array([0.0, 0.0, config.gripper_extra_height])
+        data.mocap_pos[0] = target + data.site('robot0:grip').xpos
+        data.mocap_quat[0] = _GRIPPER_ROTATION
+        mujoco.mj_step(model, data, nstep=_SETTLING_SUBSTEPS)
+        self._gripper_start: Array = data.site('robot0:grip').xpos.copy()
+        if spec.has_object:
+            self._object_height = float(data.site('object0').xpos[2])
+        time, qpos, qvel = data.time, data.qpos.copy(), data.qvel.copy()
+        mujoco.mj_resetData(model, data)
+        data.time, data.qpos[:], data.qvel[:] = time, qpos, qvel
+        self._start_state = integration_state(model, data)
+
+    @property
+    def asset(self) -> str:
+        """The MJCF asset."""
+        return self.config.asset
+
+    def reset(self, ids: Ids, generators: Generators) -> Array:
+        """Restores the settled state, places the objects, samples goals."""
+        self.batch.state[ids] = self._start_state
+        if self.spec.has_object:
+            places = [self._sample_object_place(generator) for generator in generators]
+            start = joint_qpos_slice(self.model, 'object0:joint').start
+            self._qpos[ids, start : start + 2] = places
+        self.batch.forward(ids)
+        return np.array([self._sample_goal(generator) for generator in generators])
+
+    def _sample_object_place(self, generator: np.random.Generator) -> Array:
+        reach = self.config.object_range
+        center = self._gripper_start[:2]
+        place = center
+        while np.linalg.norm(place - center) < _OBJECT_CLEARANCE:
+            place = center + generator.uniform(-reach, reach, size=2)
+        return place
+
+    def _sample_goal(self, generator: np.random.Generator) -> Array:
+        config = self.config
+        reach = config.target_range
+        goal = self._gripper_start + generator.uniform(-reach, reach, size=3)
+        if self.spec.has_object:
+            goal += config.target_offset
+            goal[2] = self._object_height
+            if config.target_in_the_air and generator.uniform() < 0.5:
+                goal[2] += generator.uniform(0, 0.45)
+        return np.asarray(goal)
+
+    def apply_commands(self, commands: NDArray[np.floating]) -> None:
+        """Moves the mocap target by 0.05 m per unit and sets the finger actuators.
+
+        The offset is scaled in the floating type of the command, as the reference does.
+        """
+        offset = commands[:, :3] * commands.dtype.type(GRIPPER_STEP)
+        if self.model.nu:
+            fingers = 0.0 if self.config.block_gripper else commands[:, 3:]
+            self._ctrl[:] = self._finger_controls(fingers)
+        self._mocap_pos[:, 0] = self._gripper_xpos + offset
+        self._mocap_quat[:, 0] = self._gripper_xquat + _GRIPPER_ROTATION
+
+    def resting_commands(self) -> Array:
+        """Returns zeros: the gripper stays where it is, the fingers too."""
+        return np.zeros((self.batch.nsim, self.spec.robot.action_size))
+
+    def _finger_controls(self, fingers: NDArray[np.floating] | float) -> Array:
+        """Position actuators take targets relative to the present finger positions."""
+        model = self.model
+        controls = np.broadcast_to(fingers, self._ctrl.shape).astype(np.float64)
+        relative = np.flatnonzero(model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE)
+        joints = model.actuator_trnid[relative, 0]
+        controls[:, relative] += self._qpos[:, model.jnt_qposadr[joints]]
+        return controls
+
+    def step(self) -> None:
+        """Advances one tick; a blocked gripper is shut again, with a forward pass.
+
+        Of the pass only positions are ever read; these models have no actuators, so no efforts.
+        """
+        super().step()
+        if self.config.block_gripper:
+            self._qpos[:, self._fingers] = 0.0
+            self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
+
+    def observe(self) -> tuple[Array, Array]:
+        """Returns the observations (N, 10 or 25) and achieved goals (N, 3)."""
+        joint_position, joint_velocity = self._joint_state()
+        grip_linear, _ = self._grip.velocity()
+        if self._object is None:
+            grip = self._grip.position()
+            observation = fetch_observation(
+                grip, grip_linear, joint_position, joint_velocity, self.tick_duration
+            )
+            return observation, grip
+        place = self._object.position()
+        linear, angular = self._object.velocity()
+        observation = fetch_observation(
+            self._grip.position(),
+            grip_linear,
+            joint_position,
+            joint_velocity,
+            self.tick_duration,
+            place,
+            self._object.quaternion(),
+            linear,
+            angular,
+        )
+        return observation, place
+
+    def readings(self) -> Readings:
+        """Returns joint states and the poses and velocities of gripper and object."""
+        joint_position, joint_velocity = self._joint_state()
+        grip_linear, grip_angular = self._grip.velocity()
+        object_linear, object_angular = self._object.velocity() if self._object else (None, None)
+        return Readings(
+            joint_position=joint_position,
+            joint_velocity=joint_velocity,
+            joint_effort=self._joint_effort(),
+            end_effector_position=self._grip.position(),
+            end_effector_quaternion=self._grip.quaternion(),
+            end_effector_linear_velocity=grip_linear,
+            end_effector_angular_velocity=grip_angular,
+            object_position=self._object.position() if self._object else None,
+            object_quaternion=self._object.quaternion() if self._object else None,
+            object_linear_velocity=object_linear,
+            object_angular_velocity=object_angular,
+        )
+
+    def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
+        """Returns the distance to a point."""
+        return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)
+
+
+class _SiteReader:
+    """Pose and velocity of a site, as MuJoCo computed them in its last pass."""
+
+    def __init__(self, task: FetchTask, site_name: str) -> None:
+        model, batch = task.model, task.batch
+        site = model.site(site_name).id
+        body = int(model.site_bodyid[site])
+        self._site_quaternion = model.site_quat[site].copy()
+        self._site_aligned = bool((self._site_quaternion == [1.0, 0.0, 0.0, 0.0]).all())
+        self._dofs = _chain_dofs(model, body)
+        self._position: Array = batch.bind('site_xpos')[:, site]
+        self._body_quaternion: Array = batch.bind('xquat')[:, body]
+        self._center = batch.bind('subtree_com')[:, int(model.body_rootid[body])]
+        self._cdof = batch.bind('cdof')
+        self._qvel = batch.bind('qvel')
+
+    def position(self) -> Array:
+        """World position, (N, 3)."""
+        return self._position.copy()
+
+    def quaternion(self) -> Array:
+        """World orientation wxyz, (N, 4)."""
+        if self._site_aligned:
+            return self._body_quaternion.copy()
+        site = np.broadcast_to(self._site_quaternion, self._body_quaternion.shape)
+        return quaternion_multiply(self._body_quaternion, site)
+
+    def velocity(self) -> tuple[Array, Array]:
+        """Linear and angular world velocity, (N, 3) each: `mj_jacSite` times qvel.
+
+        The sum runs over degrees of freedom in a fixed order, so that one simulation and sixty-four
+        give the same bits.
+        """
+        spatial = (self._cdof[:, self._dofs] * self._qvel[:, self._dofs, None]).sum(axis=1)
+        angular, linear = spatial[:, :3], spatial[:, 3:]
+        return linear + _cross(angular, self._position - self._center), angular
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """`np.cross` of (N, 3) arrays with the same bits, in a fraction of its time."""
+    product = first[:, [1, 2, 0]] * second[:, [2, 0, 1]]
+    product -= first[:, [2, 0, 1]] * second[:, [1, 2, 0]]
+    return product
+
+
+def _chain_dofs(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
+    """Degrees of freedom that move a body, ascending."""
+    dofs: list[int] = []
+    while body:
+        first, count = int(model.body_dofadr[body]), int(model.body_dofnum[body])
+        dofs.extend(range(first, first + count))
+        body = int(model.body_parentid[body])
+    return np.array(sorted(dofs), dtype=np.intp)

@@ -1,0 +1,58 @@
+"""What all hand tasks share: twenty position actuators, twenty-four joints, five fingertips."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.model_tuning import list_geom_pairs, skip_unread_stages
+from fetch_hand_sim.simulation.models import load_spec
+from fetch_hand_sim.simulation.tasks.task import Array, Task
+from msgs_spec.robots import FINGERTIPS
+from msgs_spec.tasks import TaskSpec
+
+
+def load_hand_model(asset: str) -> mujoco.MjModel:
+    """Compiles a hand model, tuned to step fast along the same trajectories."""
+    mjcf = load_spec(asset)
+    list_geom_pairs(mjcf)
+    model = mjcf.compile()
+    skip_unread_stages(model)
+    return model
+
+
+def fingertip_sites(model: mujoco.MjModel) -> NDArray[np.intp]:
+    """Site indices of the fingertips in the order of goals."""
+    return np.array([model.site(f'robot0:S_{name}').id for name in FINGERTIPS], dtype=np.intp)
+
+
+class HandTask(Task):
+    """Base of the hand tasks."""
+
+    def __init__(
+        self,
+        spec: TaskSpec,
+        model: mujoco.MjModel,
+        *,
+        num_envs: int,
+        num_threads: int,
+        substeps: int,
+    ) -> None:
+        """Binds controls and fingertip positions."""
+        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
+        self._ctrl: Array = self.batch.bind('ctrl')
+        self._site_xpos: Array = self.batch.bind('site_xpos')
+        self._fingertip_sites = fingertip_sites(model)
+
+    def apply_commands(self, commands: NDArray[np.floating]) -> None:
+        """Sets the position actuators to absolute joint angles, radians."""
+        self._ctrl[:] = commands
+
+    def resting_commands(self) -> Array:
+        """Returns the joint angles that the actuators hold now."""
+        return self._ctrl.copy()
+
+    def _fingertips(self) -> Array:
+        """Fingertip positions, (N, 15), metres."""
+        return self._site_xpos[:, self._fingertip_sites].reshape(self.batch.nsim, -1)

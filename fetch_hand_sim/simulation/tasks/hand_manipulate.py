@@ -1,0 +1,201 @@
+"""The eight manipulation tasks: turn a block, an egg or a pen in the hand.
+
+Facts follow Gymnasium-Robotics 1.4.2 `manipulate.py` in a fresh instance. One thing is put right:
+the reference does not restore controls and warm start between episodes, so its n-th episode of a
+seed differs from the first; here every reset starts from the fresh state.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
+from fetch_hand_sim.simulation.tasks.hand import HandTask, load_hand_model
+from fetch_hand_sim.simulation.tasks.task import (
+    Array,
+    Generators,
+    Ids,
+    Readings,
+    integration_state,
+    joint_qpos_slice,
+    joint_qvel_slice,
+)
+from msgs_spec.commands import resting_command
+from msgs_spec.observations import hand_object_observation
+from msgs_spec.rotations import (
+    euler_to_matrix,
+    euler_to_quaternion,
+    matrix_to_euler,
+    quaternion_from_axis_angle,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
+from msgs_spec.tasks import TaskSpec
+
+_OBJECT_JOINT = 'object:joint'
+_OBJECT_SITE = 'object:center'
+# An object whose centre is lower than this after settling has fallen off the palm, metres.
+_PALM_HEIGHT = 0.04
+_SETTLING_TICKS = 10
+_POSITION_SCATTER = 0.005
+# Box around the object in which `Full` goals lie, metres.
+_TARGET_RANGE = np.array([(-0.04, 0.04), (-0.06, 0.02), (0.0, 0.06)])
+_Z_AXIS = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class ManipulateConfig:
+    """In what the manipulation tasks differ.
+
+    Attributes:
+        asset: MJCF file.
+        target_rotation: Which rotations goals have: about z, about z on any face, or any.
+        randomizes_rotation: Whether the object starts turned.
+    """
+
+    asset: str
+    target_rotation: Literal['z', 'parallel', 'xyz']
+    randomizes_rotation: bool = True
+
+
+_BLOCK, _EGG, _PEN = (f'hand/manipulate_{name}.xml' for name in ('block', 'egg', 'pen'))
+
+MANIPULATE_CONFIGS = {
+    'HandManipulateBlockRotateZ': ManipulateConfig(_BLOCK, 'z'),
+    'HandManipulateBlockRotateParallel': ManipulateConfig(_BLOCK, 'parallel'),
+    'HandManipulateBlockRotateXYZ': ManipulateConfig(_BLOCK, 'xyz'),
+    'HandManipulateBlockFull': ManipulateConfig(_BLOCK, 'xyz'),
+    'HandManipulateEggRotate': ManipulateConfig(_EGG, 'xyz'),
+    'HandManipulateEggFull': ManipulateConfig(_EGG, 'xyz'),
+    'HandManipulatePenRotate': ManipulateConfig(_PEN, 'xyz', False),
+    'HandManipulatePenFull': ManipulateConfig(_PEN, 'xyz', False),
+}
+
+
+class HandManipulateTask(HandTask):
+    """HandManipulateBlock*, HandManipulateEgg*, HandManipulatePen*."""
+
+    def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
+        """Keeps the fresh state, from which every episode starts."""
+        self.config = MANIPULATE_CONFIGS[spec.name]
+        model = load_hand_model(self.config.asset)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        self._start_state = integration_state(model, data)
+        self._start_qpos = data.qpos.copy()
+        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
+        self._object_qpos = self._qpos[:, joint_qpos_slice(model, _OBJECT_JOINT)]
+        self._object_qvel = self._qvel[:, joint_qvel_slice(model, _OBJECT_JOINT)]
+        self._object_site = model.site(_OBJECT_SITE).id
+        self._resting_command = resting_command(spec.robot)
+        self._parallel_quaternions = euler_to_quaternion(_parallel_rotations())
+        self.batch.state[:] = self._start_state
+
+    @property
+    def asset(self) -> str:
+        """The MJCF asset."""
+        return self.config.asset
+
+    def reset(self, ids: Ids, generators: Generators) -> Array:
+        """Drops the object on the palm until it stays there, then samples goals.
+
+        A try that fails is followed by another from the same controls and warm start, as in the
+        reference.
+        """
+        self.batch.state[ids] = self._start_state
+        generator_of = dict(zip(ids.tolist(), generators, strict=True))
+        left = ids
+        while left.size:
+            self._start_again(left)
+            self._object_qpos[left] = [self._sample_start(generator_of[i]) for i in left.tolist()]
+            self._ctrl[left] = self._resting_command
+            self.batch.step(left, nstep=_SETTLING_TICKS * self.substeps)
+            self.batch.forward(left)
+            height = self._site_xpos[left, self._object_site, 2]
+            left = left[~(height > _PALM_HEIGHT)]
+        return np.array([self._sample_goal(i, generator_of[i]) for i in ids.tolist()])
+
+    def _start_again(self, ids: Ids) -> None:
+        self.batch.bind('time')[ids] = 0.0
+        self._qpos[ids] = self._start_qpos
+        self._qvel[ids] = 0.0
+        self.batch.forward(ids)
+
+    def _sample_start(self, generator: np.random.Generator) -> Array:
+        """Draws the object's starting pose, (7,)."""
+        start = self._start_qpos[joint_qpos_slice(self.model, _OBJECT_JOINT)]
+        position, quaternion = start[:3].copy(), start[3:]
+        if self.config.randomizes_rotation:
+            offset = self._sample_rotation(generator)
+            quaternion = quaternion_multiply(quaternion, offset)
+        position += generator.normal(size=3, scale=_POSITION_SCATTER)
+        return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
+
+    def _sample_rotation(self, generator: np.random.Generator) -> Array:
+        """Draws a rotation of the task's kind: quaternion wxyz, (4,)."""
+        angle = generator.uniform(-np.pi, np.pi)
+        if self.config.target_rotation == 'xyz':
+            axis = generator.uniform(-1.0, 1.0, size=3)
+            return quaternion_from_axis_angle(axis, angle)
+        about_z = quaternion_from_axis_angle(_Z_AXIS, angle)
+        if self.config.target_rotation == 'z':
+            return about_z
+        faces = self._parallel_quaternions
+        return quaternion_multiply(about_z, faces[generator.integers(len(faces))])
+
+    def _sample_goal(self, index: int, generator: np.random.Generator) -> Array:
+        position = self._object_qpos[index, :3].copy()
+        if self.spec.position_counts:
+            position += generator.uniform(_TARGET_RANGE[:, 0], _TARGET_RANGE[:, 1])
+        quaternion = self._sample_rotation(generator)
+        return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
+
+    def observe(self) -> tuple[Array, Array]:
+        """Returns the observations (N, 61) and achieved goals (N, 7)."""
+        joint_position, joint_velocity = self._joint_state()
+        pose = self._object_qpos.copy()
+        observation = hand_object_observation(
+            joint_position, joint_velocity, self._object_qvel, pose
+        )
+        return observation, pose
+
+    def readings(self) -> Readings:
+        """Returns joint states, fingertips and the object."""
+        joint_position, joint_velocity = self._joint_state()
+        pose, velocity = self._object_qpos.copy(), self._object_qvel.copy()
+        rotation = quaternion_to_matrix(pose[:, 3:])
+        angular = np.einsum('nij,nj->ni', rotation, velocity[:, 3:])
+        return Readings(
+            joint_position=joint_position,
+            joint_velocity=joint_velocity,
+            joint_effort=self._joint_effort(),
+            fingertip_positions=self._fingertips(),
+            object_position=pose[:, :3],
+            object_quaternion=pose[:, 3:],
+            object_linear_velocity=velocity[:, :3],
+            object_angular_velocity=angular,
+            object_qpos=pose,
+            object_qvel=velocity,
+        )
+
+    def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
+        """Returns the distance between poses."""
+        return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)
+
+
+def _parallel_rotations() -> Array:
+    """The 24 rotations that map a cube to itself, Euler xyz, (24, 3), in the reference's order."""
+    quarter = np.pi / 2
+    found: list[Array] = []
+    for euler in itertools.product([0.0, quarter, -quarter, np.pi], repeat=3):
+        turns = np.round(matrix_to_euler(euler_to_matrix(euler)) / quarter)
+        turns[[0, 2]] = np.where(turns[[0, 2]] == -2, 2, turns[[0, 2]])
+        rotation = turns * quarter
+        if not any((rotation == other).all() for other in found):
+            found.append(rotation)
+    return np.array(found)

@@ -1,0 +1,111 @@
+"""HandReach: bring thumb and one finger together (Gymnasium-Robotics 1.4.2 `reach.py`)."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
+from fetch_hand_sim.simulation.tasks.hand import HandTask, fingertip_sites, load_hand_model
+from fetch_hand_sim.simulation.tasks.task import Array, Generators, Ids, Readings, integration_state
+from msgs_spec.observations import hand_reach_observation
+from msgs_spec.robots import FINGERTIPS
+from msgs_spec.tasks import TaskSpec
+
+_ASSET = 'hand/reach.xml'
+# Where fingers meet, relative to the palm, and how far that place scatters, metres.
+_MEETING_OFFSET = np.array([0.0, -0.09, 0.05])
+_MEETING_SCATTER = 0.005
+# How far each fingertip stays from the meeting place, so that goals do not overlap, metres.
+_MEETING_GAP = 0.005
+_PROBABILITY_OF_INITIAL_POSE = 0.1
+
+# Initial joint positions, radians (`DEFAULT_INITIAL_QPOS` of the reference).
+_INITIAL_QPOS = {
+    'robot0:WRJ1': -0.16514339750464327,
+    'robot0:WRJ0': -0.31973286565062153,
+    'robot0:FFJ3': 0.14340512546557435,
+    'robot0:FFJ2': 0.32028208333591573,
+    'robot0:FFJ1': 0.7126053607727917,
+    'robot0:FFJ0': 0.6705281001412586,
+    'robot0:MFJ3': 0.000246444303701037,
+    'robot0:MFJ2': 0.3152655251085491,
+    'robot0:MFJ1': 0.7659800313729842,
+    'robot0:MFJ0': 0.7323156897425923,
+    'robot0:RFJ3': 0.00038520700007378114,
+    'robot0:RFJ2': 0.36743546201985233,
+    'robot0:RFJ1': 0.7119514095008576,
+    'robot0:RFJ0': 0.6699446327514138,
+    'robot0:LFJ4': 0.0525442258033891,
+    'robot0:LFJ3': -0.13615534724474673,
+    'robot0:LFJ2': 0.39872030433433003,
+    'robot0:LFJ1': 0.7415570009679252,
+    'robot0:LFJ0': 0.704096378652974,
+    'robot0:THJ4': 0.003673823825070126,
+    'robot0:THJ3': 0.5506291436028695,
+    'robot0:THJ2': -0.014515151997119306,
+    'robot0:THJ1': -0.0015229223564485414,
+    'robot0:THJ0': -0.7894883021600622,
+}
+
+
+class HandReachTask(HandTask):
+    """HandReach."""
+
+    def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
+        """Keeps the initial pose, its fingertips and the palm, from which goals are made."""
+        model = load_hand_model(_ASSET)
+        data = mujoco.MjData(model)
+        for joint, value in _INITIAL_QPOS.items():
+            data.joint(joint).qpos = value
+        self._start_state = integration_state(model, data)
+        mujoco.mj_forward(model, data)
+        self._start_fingertips: Array = data.site_xpos[fingertip_sites(model)].copy()
+        self._palm = data.body('robot0:palm').xpos.copy()
+        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
+        self.batch.state[:] = self._start_state
+
+    @property
+    def asset(self) -> str:
+        """The MJCF asset."""
+        return _ASSET
+
+    def reset(self, ids: Ids, generators: Generators) -> Array:
+        """Restores the initial pose and samples goals."""
+        self.batch.state[ids] = self._start_state
+        self.batch.forward(ids)
+        return np.array([self._sample_goal(generator) for generator in generators])
+
+    def _sample_goal(self, generator: np.random.Generator) -> Array:
+        fingers, thumb = list(FINGERTIPS[:-1]), len(FINGERTIPS) - 1
+        finger = fingers.index(str(generator.choice(fingers)))
+        meeting = self._palm + _MEETING_OFFSET
+        meeting += generator.normal(scale=_MEETING_SCATTER, size=3)
+        goal = self._start_fingertips.copy()
+        for index in (thumb, finger):
+            direction = meeting - goal[index]
+            direction /= np.linalg.norm(direction)
+            goal[index] = meeting - _MEETING_GAP * direction
+        if generator.uniform() < _PROBABILITY_OF_INITIAL_POSE:
+            goal = self._start_fingertips
+        return goal.flatten()
+
+    def observe(self) -> tuple[Array, Array]:
+        """Returns the observations (N, 63) and achieved goals (N, 15)."""
+        joint_position, joint_velocity = self._joint_state()
+        fingertips = self._fingertips()
+        return hand_reach_observation(joint_position, joint_velocity, fingertips), fingertips
+
+    def readings(self) -> Readings:
+        """Returns joint states and fingertips."""
+        joint_position, joint_velocity = self._joint_state()
+        return Readings(
+            joint_position=joint_position,
+            joint_velocity=joint_velocity,
+            joint_effort=self._joint_effort(),
+            fingertip_positions=self._fingertips(),
+        )
+
+    def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
+        """Returns the distance between fingertips."""
+        return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)

@@ -1,0 +1,39 @@
+"""From the name of a task to its running batch."""
+
+from __future__ import annotations
+
+from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
+from fetch_hand_sim.simulation.tasks.hand_manipulate import HandManipulateTask
+from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
+from fetch_hand_sim.simulation.tasks.task import Task
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, substeps_per_tick, task_spec
+
+
+def make_task(
+    name: str,
+    *,
+    num_envs: int = 1,
+    num_threads: int = 0,
+    control_hz: float = DEFAULT_CONTROL_HZ,
+) -> Task:
+    """Compiles a task's model and starts its simulations.
+
+    Args:
+        name: One of `msgs_spec.tasks.TASKS`.
+        num_envs: Number of simulations.
+        num_threads: Threads that step them; 0 for all processors.
+        control_hz: Actions per simulated second.
+
+    Raises:
+        ValueError: If the task is unknown or the rate is not a whole number of substeps.
+    """
+    spec = task_spec(name)
+    substeps = substeps_per_tick(control_hz)
+    family: type[FetchTask] | type[HandReachTask] | type[HandManipulateTask]
+    if spec.name in FETCH_CONFIGS:
+        family = FetchTask
+    elif spec.name == 'HandReach':
+        family = HandReachTask
+    else:
+        family = HandManipulateTask
+    return family(spec, num_envs=num_envs, num_threads=num_threads, substeps=substeps)

@@ -1,0 +1,151 @@
+"""What every task does on a batch of simulations: reset, command, step, observe."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.engine import prepare_engine
+from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
+from msgs_spec.tasks import TaskSpec
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.intp]
+Generators = Sequence[np.random.Generator]
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """What the robots' sensors say, SI units, world frame, leading axis the simulation.
+
+    Quaternions are wxyz. Parts the task does not have are None. `object_qpos` (N, 7) and
+    `object_qvel` (N, 6) are MuJoCo's free joint: linear velocity in the world frame, angular
+    velocity in the object's.
+    """
+
+    joint_position: Array
+    joint_velocity: Array
+    joint_effort: Array
+    end_effector_position: Array | None = None
+    end_effector_quaternion: Array | None = None
+    end_effector_linear_velocity: Array | None = None
+    end_effector_angular_velocity: Array | None = None
+    fingertip_positions: Array | None = None
+    object_position: Array | None = None
+    object_quaternion: Array | None = None
+    object_linear_velocity: Array | None = None
+    object_angular_velocity: Array | None = None
+    object_qpos: Array | None = None
+    object_qvel: Array | None = None
+
+
+class Task(ABC):
+    """One task on `num_envs` simulations.
+
+    Subclasses fill in the physics of a family. All arrays have the simulation as leading axis.
+    """
+
+    def __init__(
+        self,
+        spec: TaskSpec,
+        model: mujoco.MjModel,
+        *,
+        num_envs: int,
+        num_threads: int,
+        substeps: int,
+    ) -> None:
+        """Compiles the model and starts the batch.
+
+        Args:
+            spec: The task.
+            model: Its compiled model.
+            num_envs: Number of simulations.
+            num_threads: Threads that step them; 0 for all processors.
+            substeps: Physics steps per action.
+        """
+        prepare_engine()
+        self.spec = spec
+        self.substeps = substeps
+        self.model = model
+        self.tick_duration = substeps * float(model.opt.timestep)
+        self.batch = Batch(model, num_envs, min(num_threads, num_envs) if num_threads else 0)
+        self._qpos: Array = self.batch.bind('qpos')
+        self._qvel: Array = self.batch.bind('qvel')
+        self._actuator_force: Array = self.batch.bind('qfrc_actuator')
+        joints = [model.joint(name) for name in spec.robot.joints]
+        self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
+        self._joint_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
+
+    @property
+    @abstractmethod
+    def asset(self) -> str:
+        """The MJCF asset that the model was compiled from."""
+
+    @abstractmethod
+    def reset(self, ids: Ids, generators: Generators) -> Array:
+        """Starts simulations `ids` again and samples their goals.
+
+        Args:
+            ids: Sorted simulation indices, (n,).
+            generators: One generator per index; draws in the order of the reference.
+
+        Returns:
+            The desired goals, (n, goal size).
+        """
+
+    @abstractmethod
+    def apply_commands(self, commands: NDArray[np.floating]) -> None:
+        """Writes commands (N, action size), in command units and within limits, to the physics."""
+
+    @abstractmethod
+    def resting_commands(self) -> Array:
+        """Returns the commands (N, action size) that change nothing about what the robots hold."""
+
+    @abstractmethod
+    def observe(self) -> tuple[Array, Array]:
+        """Returns the observations (N, observation size) and achieved goals (N, goal size)."""
+
+    @abstractmethod
+    def readings(self) -> Readings:
+        """Returns what the sensors say, for the network."""
+
+    @abstractmethod
+    def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
+        """Returns the distances, success rule and reward of the task."""
+
+    def step(self) -> None:
+        """Advances all simulations by one tick under the commands applied last."""
+        self.batch.step(nstep=self.substeps)
+
+    def _joint_state(self) -> tuple[Array, Array]:
+        """Positions and velocities of the robot's scalar joints, (N, joints) each."""
+        return self._qpos[:, self._joint_qpos], self._qvel[:, self._joint_dofs]
+
+    def _joint_effort(self) -> Array:
+        return self._actuator_force[:, self._joint_dofs]
+
+
+def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """Returns everything that decides a simulation's future, as `Batch.state` holds it."""
+    spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
+    state = np.empty(mujoco.mj_stateSize(model, spec))
+    mujoco.mj_getState(model, data, state, spec)
+    return state
+
+
+def joint_qpos_slice(model: mujoco.MjModel, name: str) -> slice:
+    """Where a free joint's seven coordinates lie in qpos."""
+    address = int(model.joint(name).qposadr[0])
+    return slice(address, address + 7)
+
+
+def joint_qvel_slice(model: mujoco.MjModel, name: str) -> slice:
+    """Where a free joint's six velocities lie in qvel."""
+    address = int(model.joint(name).dofadr[0])
+    return slice(address, address + 6)

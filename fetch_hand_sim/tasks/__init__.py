@@ -1,8 +1,0 @@
-"""The thirteen tasks, from data (`msgs_spec.tasks`) to running batches."""
-
-from __future__ import annotations
-
-from fetch_hand_sim.tasks.registry import make_task
-from fetch_hand_sim.tasks.task import Readings, Task
-
-__all__ = ['Readings', 'Task', 'make_task']

@@ -1,0 +1,116 @@
+"""`export_actor`: writes an actor as an ONNX file, with normalisation and metadata."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import logging
+import os
+import sys
+import tempfile
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from policy_node.policies import checkpoint
+from policy_node.policies.actor import Actor, actor_path
+from policy_node.policies.onnx import FORMAT, INPUTS, OUTPUT, OnnxActor
+
+# Largest difference between the actions of both, in [-1, 1]; float32 sums differ in order.
+_TOLERANCE = 1e-4
+_TRIALS = 100
+
+
+class _Exported(nn.Module):
+    """Observation and goal in, action out."""
+
+    def __init__(self, actor: Actor) -> None:
+        super().__init__()
+        self._actor = actor
+
+    def forward(self, observation: Tensor, desired_goal: Tensor) -> Tensor:
+        action: Tensor = self._actor(self._actor.features(observation, desired_goal))
+        return action
+
+
+def export(source: Path, target: Path) -> float:
+    """Writes a checkpoint as ONNX; the file is complete and checked, or not there.
+
+    Returns:
+        The largest difference between the actions of both on random observations.
+
+    Raises:
+        ValueError: If the checkpoint or what is needed for ONNX is missing, or actions differ.
+    """
+    try:
+        import onnx
+        import onnxscript  # noqa: F401  torch's exporter is built on it.
+    except ImportError as error:
+        raise ValueError(f'ONNX needs {error.name}: pip install onnx onnxscript') from None
+    actor, info = checkpoint.load(source)
+    shape = actor.shape
+    sizes = (shape.observation_size, shape.goal_size)
+    batch = torch.export.Dim('batch')
+    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+        partial = Path(folder) / target.name
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            logging.getLogger('torch.onnx').setLevel(logging.ERROR)
+            torch.onnx.export(
+                _Exported(actor),
+                tuple(torch.zeros(2, size) for size in sizes),
+                partial,
+                input_names=list(INPUTS),
+                output_names=[OUTPUT],
+                dynamic_shapes=({0: batch}, {0: batch}),
+                external_data=False,
+                dynamo=True,
+                verbose=False,
+            )
+        model = onnx.load(partial)
+        values = {name: json.dumps(value) for name, value in dataclasses.asdict(info).items()}
+        onnx.helper.set_model_props(model, {'format': FORMAT, **values})
+        onnx.save(model, partial)
+        difference = _largest_difference(actor, OnnxActor(partial))
+        if difference > _TOLERANCE:
+            raise ValueError(f'actions of {target} differ by {difference:g}; nothing is written')
+        os.replace(partial, target)
+    return difference
+
+
+def _largest_difference(actor: Actor, exported: OnnxActor) -> float:
+    generator = np.random.default_rng(0)
+    mean = (actor.observation_normalizer.mean.numpy(), actor.goal_normalizer.mean.numpy())
+    std = (actor.observation_normalizer.std.numpy(), actor.goal_normalizer.std.numpy())
+    differences = []
+    for _ in range(_TRIALS):
+        vectors = (generator.normal(m, 2.0 * s) for m, s in zip(mean, std, strict=True))
+        observation = dict(zip(INPUTS, vectors, strict=True))
+        differences.append(exported.predict(observation) - actor.predict(observation)[0])
+    return float(np.abs(differences).max())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Writes the file; returns the exit code."""
+    parser = argparse.ArgumentParser(prog='export_actor', description=__doc__)
+    parser.add_argument('actor', help='name of a shipped actor, or a checkpoint')
+    parser.add_argument('target', type=Path, help='file to write, <name>.onnx')
+    options = parser.parse_args(arguments)
+    if options.target.suffix != '.onnx':
+        parser.error(f'target {str(options.target)!r}; allowed: a name that ends in .onnx')
+    try:
+        difference = export(actor_path(options.actor), options.target)
+    except (OSError, ValueError) as error:
+        print(f'export_actor: {error}', file=sys.stderr)
+        return 1
+    print(f'{options.target}: actions within {difference:.1e} of the checkpoint')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

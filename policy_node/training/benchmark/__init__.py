@@ -1,0 +1,1 @@
+"""What compares: the paper's four arms, task by task, seed by seed."""

@@ -1,0 +1,190 @@
+"""The jobs of a benchmark: task x arm x seed, each a `train_her` run in a folder of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from policy_node.training import train_her
+from policy_node.training.learning.config import TrainConfig, config_from_dict, recipe_config
+from policy_node.training.learning.run_folder import STATE_FILE
+from policy_node.training.learning.run_log import read_progress
+from policy_node.training.learning.training_state import read_extra
+
+PROGRESS_FILE = 'progress.csv'
+LOCK_FILE = '.lock'
+# What may differ between two parts of a job without another result to be expected.
+_SPEED_FIELDS = ('simulation_threads', 'torch_threads', 'checkpoint_seconds', 'device')
+
+
+class JobError(RuntimeError):
+    """A job failed; the message names it and its folder."""
+
+
+class JobTakenError(RuntimeError):
+    """Another process works on the job."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One of the four curves in each panel of the paper's figures.
+
+    Attributes:
+        name: Name of the folder and of the command-line option.
+        label: Name in figures and tables.
+        reward_type: `sparse` or `dense`.
+        hindsight: Whether goals are relabelled.
+    """
+
+    name: str
+    label: str
+    reward_type: str
+    hindsight: bool
+
+
+ARMS = {
+    arm.name: arm
+    for arm in (
+        Arm('her_sparse', 'DDPG+HER, sparse', 'sparse', True),
+        Arm('her_dense', 'DDPG+HER, dense', 'dense', True),
+        Arm('ddpg_sparse', 'DDPG, sparse', 'sparse', False),
+        Arm('ddpg_dense', 'DDPG, dense', 'dense', False),
+    )
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One training run.
+
+    Attributes:
+        arm: What is compared.
+        config: The whole configuration.
+        folder: Output of `train_her`.
+    """
+
+    arm: Arm
+    config: TrainConfig
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """Task, arm and seed, as in the path of the folder."""
+        return f'{self.config.task}/{self.arm.name}/seed{self.config.seed}'
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the budget is spent: the curve is whole."""
+        return self.has_checkpoint and self.env_steps >= self.config.total_steps
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether there is something to continue."""
+        return (self.folder / STATE_FILE).is_file()
+
+    @property
+    def env_steps(self) -> float:
+        """Environment steps logged so far."""
+        path = self.folder / PROGRESS_FILE
+        rows = read_progress(path) if path.is_file() else []
+        return rows[-1].get('env_steps', 0.0) if rows else 0.0
+
+    def check_configuration(self) -> None:
+        """Refuses a folder whose run was configured otherwise.
+
+        Raises:
+            ValueError: The message names the fields.
+        """
+        if not self.has_checkpoint:
+            return
+        stored = config_from_dict(read_extra(self.folder / STATE_FILE)['config'])
+        wanted = dataclasses.asdict(self.config)
+        differing = [
+            f'{name} {value!r}, now {wanted[name]!r}'
+            for name, value in dataclasses.asdict(stored).items()
+            if value != wanted[name] and name not in _SPEED_FIELDS
+        ]
+        if differing:
+            raise ValueError(
+                f'{self.folder} holds a run with {"; ".join(differing)}: choose another --output'
+            )
+
+
+def list_jobs(
+    tasks: Sequence[str],
+    arms: Sequence[str],
+    seeds: Sequence[int],
+    recipe: str,
+    overrides: dict[str, Any],
+    output: Path,
+) -> list[Job]:
+    """All jobs, seed by seed, so that an early stop leaves all arms with about as many seeds.
+
+    Args:
+        tasks: Task names.
+        arms: Keys of `ARMS`.
+        seeds: Seeds.
+        recipe: The recipe of all jobs.
+        overrides: Fields of `TrainConfig` for all jobs; what the arms differ in is theirs.
+        output: Folder for all runs.
+
+    Raises:
+        ValueError: If a value is not allowed.
+    """
+    jobs = []
+    for task in tasks:
+        for seed in seeds:
+            for arm in (ARMS[name] for name in arms):
+                config = recipe_config(task, recipe, **{**overrides, 'seed': seed})
+                config = dataclasses.replace(
+                    config,
+                    reward_type=arm.reward_type,
+                    strategy=config.strategy if arm.hindsight else 'none',
+                )
+                jobs.append(Job(arm, config, output / task / arm.name / f'seed{seed}'))
+    return jobs
+
+
+def run_job(job: Job) -> bool:
+    """Starts or continues a job in this process; False if a signal ended it early.
+
+    Raises:
+        JobTakenError: If another process works on it.
+        JobError: If training failed; `train_her` has printed why.
+    """
+    job.folder.mkdir(parents=True, exist_ok=True)
+    with (job.folder / LOCK_FILE).open('w') as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise JobTakenError(f'{job.name} is being run by another process') from None
+        if job.is_finished:
+            return True
+        resume = ['--resume', str(job.folder), *_assignments(job.config, _SPEED_FIELDS)]
+        status = train_her.main(resume if job.has_checkpoint else _start_arguments(job))
+        if status != 0:
+            raise JobError(f'{job.name} ended with status {status}; see {job.folder}')
+        return job.is_finished
+
+
+def _start_arguments(job: Job) -> list[str]:
+    """The command line of `train_her` that stands for the configuration: recipe and differences."""
+    config = job.config
+    recipe = recipe_config(config.task, config.recipe)
+    names = [field.name for field in dataclasses.fields(config)]
+    differing = [name for name in names if getattr(config, name) != getattr(recipe, name)]
+    arguments = ['--task', config.task, '--recipe', config.recipe, '--output', str(job.folder)]
+    return [*arguments, *_assignments(config, differing)]
+
+
+def _assignments(config: TrainConfig, names: Sequence[str]) -> list[str]:
+    arguments = []
+    for name in names:
+        value = getattr(config, name)
+        text = ','.join(map(str, value)) if isinstance(value, tuple) else str(value)
+        arguments += ['--set', f'{name}={text}']
+    return arguments

@@ -1,0 +1,220 @@
+"""Curves, figure and tables of a benchmark: median and quartiles over seeds."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import platform
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from msgs_spec.tasks import task_spec
+from policy_node.policies.checkpoint import read_info
+from policy_node.training.benchmark.jobs import ARMS, PROGRESS_FILE, Job
+from policy_node.training.benchmark.published import BEST, RERUN
+from policy_node.training.learning.run_folder import LATEST_FILE
+from policy_node.training.learning.run_log import read_progress
+
+# An epoch of the paper: 50 cycles of 2 episodes on each of 19 workers.
+EPISODES_PER_EPOCH = 1900
+FAST_SUCCESS = 0.95
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """Deterministic evaluations of one run.
+
+    Attributes:
+        env_steps: (n,) ascending.
+        success: (n,) success at the last step.
+        episodes: Episodes of the last evaluation.
+    """
+
+    env_steps: Array
+    success: Array
+    episodes: int
+
+    def steps_to(self, success: float) -> float:
+        """Environment steps of the first evaluation with this success; infinity if none has it."""
+        reached = np.flatnonzero(self.success >= success)
+        return float(self.env_steps[reached[0]]) if reached.size else float('inf')
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """Median and quartiles over seeds on common steps, each (n,)."""
+
+    env_steps: Array
+    median: Array
+    lower: Array
+    upper: Array
+
+
+def read_curve(path: Path) -> Curve:
+    """Reads the evaluations of a `progress.csv`.
+
+    Raises:
+        ValueError: If there is no evaluation.
+    """
+    evaluated = [row for row in read_progress(path) if 'eval_success' in row]
+    if not evaluated:
+        raise ValueError(f'{path} holds no evaluation')
+    return Curve(
+        env_steps=np.array([row['env_steps'] for row in evaluated]),
+        success=np.array([row['eval_success'] for row in evaluated]),
+        episodes=int(evaluated[-1]['eval_episodes']),
+    )
+
+
+def aggregate(curves: Sequence[Curve]) -> Band:
+    """Median and quartiles where all curves have begun and none has ended.
+
+    Evaluations of resumed runs fall on other steps; between evaluations a curve is a straight line.
+    """
+    first = max(float(curve.env_steps[0]) for curve in curves)
+    last = min(float(curve.env_steps[-1]) for curve in curves)
+    steps = np.unique(np.concatenate([curve.env_steps for curve in curves]))
+    steps = steps[(steps >= first) & (steps <= last)]
+    values = np.stack([np.interp(steps, curve.env_steps, curve.success) for curve in curves])
+    lower, median, upper = np.percentile(values, [25, 50, 75], axis=0)
+    return Band(steps, median, lower, upper)
+
+
+def summarize(task: str, arm: str, curves: Sequence[Curve]) -> dict[str, Any]:
+    """One row of the table: final success over seeds and what is published."""
+    final = [float(curve.success[-1]) for curve in curves]
+    lower, median, upper = (float(x) for x in np.percentile(final, [25, 50, 75]))
+    # The middle of an even number with an unreached one has no value: the slower one counts.
+    fast = sorted(curve.steps_to(FAST_SUCCESS) for curve in curves)[len(curves) // 2]
+    rerun, best = RERUN.get((task, arm)), BEST.get(task)
+    return {
+        'task': task,
+        'arm': arm,
+        'seeds': len(curves),
+        'env_steps': int(min(curve.env_steps[-1] for curve in curves)),
+        'evaluation_episodes': curves[0].episodes,
+        'final_median': median,
+        'final_lower_quartile': lower,
+        'final_upper_quartile': upper,
+        'final_of_each_seed': final,
+        'median_steps_to_0.95': None if np.isinf(fast) else int(fast),
+        'published_rerun': str(rerun) if rerun else None,
+        'published_best': str(best) if best else None,
+    }
+
+
+def write_report(jobs: Iterable[Job], output: Path, command: str) -> None:
+    """Writes figure (PNG), curves (CSV) and table (text, CSV, JSON), and prints the table.
+
+    Args:
+        jobs: Finished jobs.
+        output: Folder.
+        command: Command line, for the record.
+    """
+    groups: dict[str, dict[str, list[Curve]]] = {}
+    rows: list[tuple[str, str, int, Curve]] = []
+    revisions: set[str] = set()
+    for job in jobs:
+        revisions.add(read_info(job.folder / LATEST_FILE).source_revision)
+        curve, task, arm = read_curve(job.folder / PROGRESS_FILE), job.config.task, job.arm.name
+        groups.setdefault(task, {}).setdefault(arm, []).append(curve)
+        rows.append((task, arm, job.config.seed, curve))
+    table = [summarize(t, a, curves) for t, arms in groups.items() for a, curves in arms.items()]
+    output.mkdir(parents=True, exist_ok=True)
+    _write_curves(rows, output / 'benchmark_curves.csv')
+    with (output / 'benchmark.csv').open('w', newline='') as file:
+        writer = csv.DictWriter(file, list(table[0]))
+        writer.writeheader()
+        writer.writerows(table)
+    about = {'command': command, 'source_revisions': sorted(revisions), 'machine': machine()}
+    (output / 'benchmark.json').write_text(json.dumps({**about, 'results': table}, indent=2) + '\n')
+    bands = {t: {a: aggregate(curves) for a, curves in arms.items()} for t, arms in groups.items()}
+    draw(bands, output / 'benchmark.png')
+    text = format_table(table)
+    (output / 'benchmark.txt').write_text(text)
+    print(text, end='')
+    print(f'figure and tables in {output}')
+
+
+def machine() -> str:
+    """Processor and number of cores."""
+    info = Path('/proc/cpuinfo')
+    lines = info.read_text().splitlines() if info.is_file() else []
+    models = [line.split(':')[1].strip() for line in lines if line.startswith('model name')]
+    return f'{models[0] if models else platform.machine()}, {os.cpu_count()} cores'
+
+
+def format_table(table: Sequence[dict[str, Any]]) -> str:
+    """The results as text, and below them the published numbers with their kind and source."""
+    columns = ('task', 'arm', 'seeds', 'steps', 'median', 'quartiles', 'steps to 0.95')
+    results = Table(*columns, title='success at the last step, over seeds')
+    published = Table('task', 'arm', 'published success (kind; source)')
+    for row in table:
+        fast, label = row['median_steps_to_0.95'], ARMS[row['arm']].label
+        results.add_row(
+            row['task'],
+            label,
+            str(row['seeds']),
+            f'{row["env_steps"]:,}',
+            f'{row["final_median"]:.3f}',
+            f'{row["final_lower_quartile"]:.3f} ... {row["final_upper_quartile"]:.3f}',
+            'not reached' if fast is None else f'{fast:,}',
+        )
+        published.add_row(row['task'], label, row['published_rerun'] or 'none')
+    for row in {row['task']: row for row in table}.values():
+        published.add_row(row['task'], 'best of any method', row['published_best'] or 'none')
+    console = Console(file=io.StringIO(), width=110)
+    console.print(results, published)
+    return str(console.file.getvalue())  # type: ignore[attr-defined]
+
+
+def draw(bands: dict[str, dict[str, Band]], path: Path) -> None:
+    """Draws one panel per task: the median of each arm over its quartiles."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = min(len(bands), 4)
+    rows = -(-len(bands) // columns)
+    figure = Figure(figsize=(4.6 * columns + 0.8, 3.9 * rows), layout='constrained')
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[len(bands) :]:
+        axes.set_visible(False)
+    for axes, (task, arms) in zip(panels, bands.items(), strict=False):
+        for index, arm in enumerate(ARMS.values()):
+            if arm.name in arms:
+                band, color = arms[arm.name], f'C{index}'
+                axes.fill_between(band.env_steps, band.lower, band.upper, color=color, alpha=0.2)
+                axes.plot(band.env_steps, band.median, color=color, label=arm.label)
+        _label(axes, task)
+    panels[0].legend(loc='best', fontsize='small')
+    figure.savefig(path, dpi=130)
+
+
+def _label(axes: Any, task: str) -> None:
+    axes.set(xlabel='environment steps', ylabel='success at the last step', ylim=(-0.02, 1.02))
+    axes.set_title(task)
+    axes.grid(alpha=0.3)
+    steps = EPISODES_PER_EPOCH * task_spec(task).episode_ticks
+    epochs = axes.secondary_xaxis('top', functions=(lambda x: x / steps, lambda x: x * steps))
+    epochs.set_xlabel("the paper's epochs")
+
+
+def _write_curves(rows: Iterable[tuple[str, str, int, Curve]], path: Path) -> None:
+    with path.open('w', newline='') as file:
+        writer = csv.writer(file)
+        writer.writerow(['task', 'arm', 'seed', 'env_steps', 'success'])
+        for task, arm, seed, curve in rows:
+            for steps, success in zip(curve.env_steps, curve.success, strict=True):
+                writer.writerow([task, arm, seed, int(steps), f'{success:.6g}'])

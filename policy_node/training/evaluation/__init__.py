@@ -1,0 +1,1 @@
+"""What measures: success of policies over fresh episodes."""

@@ -1,0 +1,63 @@
+"""When a run evaluates its actor, and by which rule."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node.policies.actor import Actor
+from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, wilson_interval
+from policy_node.training.learning.config import TrainConfig
+
+# Seeds of evaluation episodes start here; those of training runs stay far below.
+EVALUATION_SEED = 1_000_000_000
+
+
+class Evaluator:
+    """Evaluates on the same episodes each time, in simulations of its own.
+
+    Training episodes therefore do not depend on whether there was an evaluation between them.
+    """
+
+    def __init__(self, simulation: Simulation, config: TrainConfig) -> None:
+        self._simulation = simulation
+        self._config = config
+        self._next = 0
+
+    def is_due(self, env_steps: int) -> bool:
+        """Whether it is time; if so, the next time is `evaluate_every` steps later."""
+        if env_steps < self._next:
+            return False
+        self.postpone(env_steps)
+        return True
+
+    def postpone(self, env_steps: int) -> None:
+        """Makes the next evaluation due `evaluate_every` steps after `env_steps`."""
+        self._next = env_steps + self._config.evaluate_every
+
+    def evaluate(self, actor: Actor, best_success: float) -> EpisodeOutcomes:
+        """Runs the episodes, fewer once their success cannot reach `best_success` any more.
+
+        "Cannot" means that it lies above the 95 % interval of the episodes so far.
+        """
+
+        def hopeless(outcomes: EpisodeOutcomes) -> bool:
+            successes = int(self.successes(outcomes).sum())
+            return wilson_interval(successes, len(outcomes))[1] < best_success
+
+        episodes = self._config.evaluation_episodes
+        return evaluate(self._simulation, actor, episodes, EVALUATION_SEED, hopeless)
+
+    def is_complete(self, outcomes: EpisodeOutcomes) -> bool:
+        """Whether an evaluation ran all its episodes; only then it may decide what is best."""
+        return len(outcomes) >= self._config.evaluation_episodes
+
+    def successes(self, outcomes: EpisodeOutcomes) -> NDArray[np.bool_]:
+        """Success of each episode at the last step, by the rule of the run."""
+        paper = self._config.success_rule == 'paper'
+        return outcomes.success_paper if paper else outcomes.success_gymnasium
+
+    def success_rate(self, outcomes: EpisodeOutcomes) -> float:
+        """Share of episodes that succeed."""
+        return float(self.successes(outcomes).mean())

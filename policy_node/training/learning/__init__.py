@@ -1,0 +1,1 @@
+"""What learns: DDPG with hindsight experience replay."""

@@ -1,0 +1,100 @@
+"""What a worker has seen, and the batches it learns from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from msgs_spec.tasks import TaskSpec
+from policy_node.policies.actor import Actor
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.hindsight import (
+    RewardFunction,
+    Transitions,
+    goal_mixture,
+    sample_transitions,
+)
+from policy_node.training.learning.normalizer import RunningStatistics
+from policy_node.training.learning.replay import EpisodeReplay, Episodes
+
+
+class Experience:
+    """Replay and normaliser statistics of one worker; statistics are shared by all workers.
+
+    Attributes:
+        replay: The episodes held.
+        statistics: Running statistics of observations and goals, by name.
+        generator: Source of relabelling and drawing.
+        batch_size: This worker's part of a batch.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        spec: TaskSpec,
+        workers: Workers,
+        compute_reward: RewardFunction,
+        generator: np.random.Generator,
+    ) -> None:
+        """Allocates the replay.
+
+        Args:
+            config: The configuration; `replay_transitions` and `batch_size` are totals.
+            spec: The task.
+            workers: This worker among all.
+            compute_reward: Reward of relabelled goals.
+            generator: Source of all randomness.
+        """
+        self._config = config
+        self._workers = workers
+        self._compute_reward = compute_reward
+        self.generator = generator
+        self.batch_size = workers.share(config.batch_size)
+        self.statistics = {
+            'observation_statistics': RunningStatistics(spec.observation_size),
+            'goal_statistics': RunningStatistics(spec.goal.size),
+        }
+        capacity = max(workers.share(config.replay_transitions) // spec.episode_ticks, 1)
+        self.replay = EpisodeReplay(
+            max(capacity, workers.share(config.num_envs)),
+            spec.episode_ticks,
+            spec.observation_size,
+            spec.goal.size,
+            spec.robot.action_size,
+        )
+        self._ticks = spec.episode_ticks
+
+    @property
+    def transitions(self) -> int:
+        """Transitions held."""
+        return len(self.replay) * self._ticks
+
+    def normalize(self, episodes: Episodes, actor: Actor, env_steps: int) -> None:
+        """Adds episodes to the statistics and gives these to the actor; all workers together.
+
+        Goals count as the networks will see them: relabelled.
+        """
+        observation, goal = episodes.observation[:, :-1], episodes.desired_goal
+        if len(episodes):
+            row = np.repeat(np.arange(len(episodes)), episodes.ticks)
+            goal = self._sample(episodes, row, env_steps).goal
+        for name, values, normalizer in (
+            ('observation_statistics', observation, actor.observation_normalizer),
+            ('goal_statistics', goal, actor.goal_normalizer),
+        ):
+            self.statistics[name].update(values, self._workers)
+            self.statistics[name].write(normalizer)
+
+    def batch(self, env_steps: int) -> Transitions:
+        """Draws the transitions of one update, after `env_steps` environment steps."""
+        row = self.replay.draw(self.batch_size, self._config.moved_share, self.generator)
+        return self._sample(self.replay.episodes, row, env_steps)
+
+    def _sample(
+        self, episodes: Episodes, row: np.ndarray[tuple[int], np.dtype[np.int64]], env_steps: int
+    ) -> Transitions:
+        config = self._config
+        early = env_steps < config.future_only_steps
+        strategy = 'future' if early and config.strategy == 'futureactual' else config.strategy
+        mixture = goal_mixture(strategy, config.hindsight_k)
+        return sample_transitions(episodes, row, mixture, self._compute_reward, self.generator)

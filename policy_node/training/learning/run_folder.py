@@ -1,0 +1,75 @@
+"""The files of a run and what goes into them."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from msgs_spec.tasks import task_spec
+from policy_node.policies import checkpoint
+from policy_node.policies.actor import Actor
+from policy_node.policies.checkpoint import ActorInfo
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.ddpg import DDPG
+from policy_node.training.learning.normalizer import RunningStatistics
+from policy_node.training.learning.training_state import Counters, save_state
+
+STATE_FILE = 'training_state.safetensors'
+LATEST_FILE = 'latest.safetensors'
+BEST_FILE = 'best.safetensors'
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """Where a run writes its actors and the state that `--resume` goes on from.
+
+    Attributes:
+        path: The folder.
+        config: Configuration of the run.
+        command: Command line, for the metadata of actors.
+        source_revision: Revision of the source, likewise.
+    """
+
+    path: Path
+    config: TrainConfig
+    command: str = ''
+    source_revision: str = ''
+
+    def save_actor(
+        self, name: str, actor: Actor, env_steps: int, success: dict[str, Any] | None = None
+    ) -> None:
+        """Writes an actor with everything that is needed to run it and to know it by.
+
+        Args:
+            name: `LATEST_FILE` or `BEST_FILE`.
+            actor: The actor.
+            env_steps: Environment steps behind it.
+            success: Measured success, if any.
+        """
+        config, spec = self.config, task_spec(self.config.task)
+        info = ActorInfo(
+            task=config.task,
+            observation_layout=checkpoint.observation_layout(spec),
+            goal_size=spec.goal.size,
+            action_size=spec.robot.action_size,
+            hidden_sizes=config.hidden_sizes,
+            layer_norm=config.layer_norm,
+            control_hz=config.control_hz,
+            seed=config.seed,
+            command=self.command,
+            source_revision=self.source_revision,
+            env_steps=env_steps,
+            config=dataclasses.asdict(config),
+            success=success or {},
+            goal_features=config.goal_features,
+        )
+        checkpoint.save(self.path / name, actor, info)
+
+    def save_state(
+        self, learner: DDPG, statistics: dict[str, RunningStatistics], counters: Counters
+    ) -> None:
+        """Writes everything that a resumed run needs but the replay."""
+        extra = {'config': dataclasses.asdict(self.config)}
+        save_state(self.path / STATE_FILE, learner, statistics, counters, extra)

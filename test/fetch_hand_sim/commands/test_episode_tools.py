@@ -1,0 +1,506 @@
+"""Episodes listed, recovered, checked, loaded, generated and taught from."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.commands import check_episode, list_episodes, recover_episodes
+from fetch_hand_sim.episode_log import (
+    EpisodeDirectory,
+    EpisodeReadError,
+    EpisodeWriter,
+    load_episodes,
+    read_episode,
+    read_summary,
+)
+from fetch_hand_sim.episode_log.ticks import split_ticks
+from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.context import RecordingContext
+from fetch_hand_sim.episodes.generator import EpisodeGenerator
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.cdr import LayoutError, TopicEncoder
+from msgs_spec.codecs import decode
+from msgs_spec.commands import action_from_command
+from msgs_spec.schemas import deserialize
+from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.topics import topic
+from policy_node.training import generate_episodes
+from policy_node.training.evaluation.floors import RandomPolicy
+from policy_node.training.learning.logged_episodes import read_experience
+from support.episode_recorder import Recorder
+
+# One of each kind of goal and robot.
+FAMILIES = ('FetchReach', 'FetchPickAndPlace', 'HandReach', 'HandManipulatePenFull')
+
+
+def generate(directory, task, episodes, num_envs=3, **options):
+    """Writes episodes under random actions; returns their directories."""
+    simulation = Simulation(task, num_envs=num_envs, num_threads=1, **options)
+    policy = RandomPolicy(simulation.spec.robot.action_size)
+    context = RecordingContext(simulation, with_compiled_model=False)
+    generator = EpisodeGenerator(
+        simulation, directory, lambda observation: policy.predict(observation)[0], context
+    )
+    return [logged.path for logged in generator.generate(episodes, first_seed=11)]
+
+
+@pytest.fixture(scope='module', params=FAMILIES)
+def generated(request, tmp_path_factory):
+    """A task and its generated episodes: two batches, the second not full."""
+    directory = tmp_path_factory.mktemp(request.param)
+    return request.param, generate(directory, request.param, episodes=4)
+
+
+@pytest.fixture(scope='module')
+def reach(tmp_path_factory):
+    """A directory of three complete FetchReach episodes."""
+    directory = tmp_path_factory.mktemp('reach')
+    generate(directory, 'FetchReach', episodes=3)
+    return directory
+
+
+def copy_of(episodes, tmp_path):
+    directory = tmp_path / 'copy'
+    shutil.copytree(episodes, directory)
+    return directory
+
+
+def rewrite(source, directory, change=lambda tick, name, data: data, result=None, last=None):
+    """Writes an episode again with some messages changed or, where `change` says None, left out."""
+    episode = read_episode(source)
+    writer = EpisodeWriter(directory, source.name, episode.metadata)
+    for number, tick in enumerate(split_ticks(episode)[:last]):
+        changed = [(m.topic, change(number, m.topic.name, m.data)) for m in tick.published]
+        writer.write_tick(tick.stamp_ns, [(t, data) for t, data in changed if data is not None])
+        for message in tick.received:
+            writer.write_received(message.topic, message.data)
+    kept = {k: v for k, v in episode.result.items() if k not in ('complete', 'reason')}
+    if last is None:
+        return writer.finish({**kept, **(result or {})})
+    return writer.abort('test', {'steps': str(last - 1)})
+
+
+# generate_episodes and check_episode
+
+
+def test_generated_episodes_are_those_of_one_robot(generated):
+    """Batch and single robot, bit for bit, with number, seed and stamps of a series."""
+    task, paths = generated
+    checker = EpisodeChecker()
+    for index, path in enumerate(paths):
+        result = checker.check(path)
+        assert result.difference is None, result
+        assert result.changed == []
+        assert result.ticks == TASKS[task].episode_ticks + 1
+        metadata = read_episode(path).metadata
+        assert (metadata['episode'], metadata['seed']) == (str(index), str(11 + index))
+        assert path.name == f'{task}_{index:06d}_seed{11 + index}'
+
+
+def test_generated_bytes_are_those_of_the_node_s_recorder(tmp_path):
+    """The same commands through `EpisodeRunner` and the node's encoder give the same messages."""
+    (path, *_) = generate(tmp_path, 'FetchPush', episodes=1)
+    ticks = split_ticks(read_episode(path))
+    recorder = Recorder('FetchPush')
+    recorder.runner._first_seed = 11
+    command = recorder.runner.resting_command()
+    for number, logged in enumerate(ticks):
+        tick = recorder.runner.advance(command)
+        messages = recorder._encoder.encode(tick, latched=tick.status.phase != 'running')
+        assert [(m.topic, m.data) for m in logged.published] == messages
+        times = [m.log_time_ns for m in (*logged.published, *logged.received)]
+        assert times == [tick.stamp_ns + rank for rank in range(len(times))]
+        assert len(logged.received) == (number < 50)
+        if logged.received:
+            (message,) = logged.received
+            command = decode(message.topic, deserialize(message.topic.type_name, message.data))
+
+
+def test_other_rates_rewards_and_rules_check_too(tmp_path):
+    paths = generate(
+        tmp_path,
+        'FetchPush',
+        episodes=1,
+        control_hz=125.0,
+        reward_type='dense',
+        success_rule='paper',
+    )
+    assert EpisodeChecker().check(paths[0]).difference is None
+
+
+def flip(target, at_tick, byte):
+    """Changes one bit of the messages of a topic at one tick."""
+
+    def change(tick, name, data):
+        if (tick, name) != (at_tick, target):
+            return data
+        damaged = bytearray(data)
+        damaged[byte] ^= 1
+        return bytes(damaged)
+
+    return change
+
+
+def test_check_names_the_first_tick_and_field_that_differ(reach, tmp_path):
+    source = min(reach.iterdir())
+    episode = read_episode(source)
+    size = len(episode.topics['/joint_states'].messages[0].data)
+    joints = len(task_spec('FetchReach').robot.joints)
+    # The last byte but those of velocity, effort and their lengths is that of a position.
+    position_end = size - 2 * (8 * joints + 8)
+    path = rewrite(source, tmp_path, flip('joint_states', 7, position_end - 8))
+    difference = EpisodeChecker().check(path).difference
+    assert difference is not None
+    assert (difference.tick, difference.field) == (7, f'joint_states.position[{joints - 1}]')
+    assert difference.recorded != difference.simulated
+    assert '1.280 s' in str(difference)
+
+
+def test_check_notices_a_changed_command_by_what_it_did(reach, tmp_path):
+    path = rewrite(min(reach.iterdir()), tmp_path, flip('applied_command', 20, -27))
+    difference = EpisodeChecker().check(path).difference
+    assert difference is not None and difference.tick == 20
+
+
+@pytest.mark.parametrize(
+    ('change', 'field'),
+    [
+        (lambda tick, name, data: None if (tick, name) == (3, 'reward') else data, 'topics'),
+        (flip('episode_status', 0, -8), 'episode_status'),
+    ],
+)
+def test_check_notices_what_is_missing_or_said_wrong(reach, tmp_path, change, field):
+    result = EpisodeChecker().check(rewrite(min(reach.iterdir()), tmp_path, change))
+    assert result.difference is not None
+    assert result.difference.field.startswith(field)
+
+
+def test_check_notices_a_result_that_is_not_true(reach, tmp_path):
+    path = rewrite(min(reach.iterdir()), tmp_path, result={'return': '0.0'})
+    difference = EpisodeChecker().check(path).difference
+    assert difference is not None and difference.field == 'episode_result return'
+
+
+def test_check_accepts_an_interrupted_episode(reach, tmp_path):
+    result = EpisodeChecker().check(rewrite(min(reach.iterdir()), tmp_path, last=20))
+    assert result.difference is None and result.ticks == 20
+
+
+def test_check_names_the_version_that_changed(reach, tmp_path):
+    episode = read_episode(min(reach.iterdir()))
+    writer = EpisodeWriter(tmp_path, 'old', {**episode.metadata, 'mujoco_version': '3.9.0'})
+    for tick in split_ticks(episode):
+        writer.write_tick(tick.stamp_ns, [(m.topic, m.data) for m in tick.published])
+    result = EpisodeChecker().check(writer.finish(episode.result))
+    assert [change.split()[:2] for change in result.changed] == [['mujoco', '3.9.0']]
+
+
+def test_check_runs_goals_that_were_set_on_the_way(tmp_path):
+    recorder = Recorder('HandManipulateBlockFull')
+    goal_topic = topic(recorder.spec, 'set_goal')
+    encoder = TopicEncoder(goal_topic)
+    directory = EpisodeDirectory(tmp_path)
+    writer = directory.begin(recorder.spec.name, 0, recorder.metadata())
+    command = recorder.runner.resting_command()
+    for number in range(recorder.spec.episode_ticks + 1):
+        tick = recorder.runner.advance(command)
+        latched = tick.status.phase != 'running'
+        writer.write_tick(tick.stamp_ns, recorder._encoder.encode(tick, latched=latched))
+        if number == 30:
+            # Neither of unit length nor in the hemisphere of the object.
+            goal = np.array([1.0, 0.87, 0.2, -0.5, 0.5, 0.5, 0.2])
+            writer.write_received(goal_topic, encoder.encode(tick.stamp_ns, goal))
+            recorder.runner.set_goal(goal)
+    path = writer.finish({})
+    assert EpisodeChecker().check(path).difference is None
+    (arrays,) = load_episodes(path)
+    assert len(np.unique(arrays.goals, axis=0)) == 2
+
+
+def test_check_episode_codes(reach, tmp_path, capsys):
+    assert check_episode.main([str(reach)]) == 0
+    assert capsys.readouterr().out.count('identical, 51 ticks') == 3
+    changed = rewrite(min(reach.iterdir()), tmp_path, flip('reward', 5, -1))
+    assert check_episode.main([str(changed), str(reach)]) == 1
+    assert 'differs at tick 5 (1.200 s), reward.data' in capsys.readouterr().out
+    assert check_episode.main([str(tmp_path / 'missing')]) == 2
+    (tmp_path / 'empty').mkdir()
+    assert check_episode.main([str(tmp_path / 'empty')]) == 2
+    assert all(len(line) < 300 for line in capsys.readouterr().err.splitlines())
+
+
+# load_episodes
+
+
+def test_loaded_observations_are_those_of_the_simulation(generated):
+    task, paths = generated
+    for arrays in load_episodes(paths[0].parent):
+        spec, steps = arrays.spec, TASKS[task].episode_ticks
+        simulation = Simulation(task, num_threads=1)
+        observation = simulation.reset(seed=int(arrays.metadata['seed']))
+        for k in range(steps + 1):
+            for key, values in observation.items():
+                assert arrays.observations[key][k].tobytes() == values[0].tobytes(), (k, key)
+            if k < steps:
+                result = simulation.step_commands(arrays.commands[k][None])
+                observation = result.observation
+                assert arrays.rewards[k] == result.reward[0]
+                assert arrays.success[k + 1] == result.success[0]
+        assert len(arrays) == steps and arrays.is_complete
+        assert arrays.observations['observation'].shape == (steps + 1, spec.observation_size)
+        assert not arrays.terminated.any()
+        assert arrays.truncated.tolist() == [False] * (steps - 1) + [True]
+        np.testing.assert_array_equal(
+            arrays.actions, action_from_command(spec.robot, arrays.commands)
+        )
+
+
+def test_decoding_all_at_once_equals_one_at_a_time(generated):
+    _, paths = generated
+    episode = read_episode(paths[0])
+    for spec in (
+        s for tick in split_ticks(episode)[1:2] for s in (m.topic for m in tick.published)
+    ):
+        if spec.name in ('episode_status', '/clock'):
+            continue
+        data = [m.data for m in episode.topics['/' + spec.name.lstrip('/')].messages]
+        rows = np.frombuffer(b''.join(data), np.uint8).reshape(len(data), -1)
+        _, values = TopicEncoder(spec).decode(rows)
+        expected = [decode(spec, deserialize(spec.type_name, each)) for each in data]
+        assert values.tobytes() == np.array(expected).tobytes(), spec.name
+
+
+def test_messages_of_another_layout_are_refused():
+    spec = topic(task_spec('FetchReach'), 'joint_states')
+    encoder = TopicEncoder(spec)
+    data = bytearray(encoder.encode(0, np.zeros(spec.size)))
+    rows = np.frombuffer(bytes(data), np.uint8)[None]
+    assert encoder.decode(rows)[1].shape == (1, spec.size)
+    data[data.index(b'robot0')] ^= 1
+    with pytest.raises(LayoutError, match='joint_states'):
+        encoder.decode(np.frombuffer(bytes(data), np.uint8)[None])
+    with pytest.raises(LayoutError, match='bytes'):
+        encoder.decode(rows[:, :-1])
+
+
+def test_interrupted_episodes_load_as_far_as_they_go(reach, tmp_path):
+    path = rewrite(min(reach.iterdir()), tmp_path, last=20)
+    (cut,), (whole,) = load_episodes(path), load_episodes(min(reach.iterdir()))
+    assert len(cut) == 19 and not cut.is_complete and cut.truncated[-1]
+    np.testing.assert_array_equal(cut.commands, whole.commands[:19])
+    assert cut.goals.shape == (20, 3)
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        lambda tick, name, data: None if (tick, name) == (9, 'reward') else data,
+        lambda tick, name, data: None if (tick, name) == (9, 'joint_states') else data,
+        flip('desired_goal', 9, 8),
+    ],
+)
+def test_a_hole_in_an_episode_is_an_error(reach, tmp_path, change):
+    path = rewrite(min(reach.iterdir()), tmp_path, change)
+    with pytest.raises(EpisodeReadError, match=r'stamps|missing|allowed|steps') as caught:
+        load_episodes(path)
+    assert str(path) in str(caught.value)
+
+
+def test_one_bad_file_does_not_hide_the_others(reach, tmp_path):
+    directory = copy_of(reach, tmp_path)
+    (directory / 'text.mcap').write_text('no bag')
+    with pytest.raises(EpisodeReadError, match=r'text\.mcap'):
+        load_episodes(directory)
+    skipped = []
+    assert len(load_episodes(directory, on_skip=skipped.append)) == 3
+    assert len(skipped) == 1
+
+
+# list_episodes and recover_episodes
+
+
+def test_list_shows_what_the_files_say(reach, capsys):
+    assert list_episodes.main([str(reach)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 5
+    for index, line in enumerate(lines[1:4]):
+        summary = read_summary(reach / f'FetchReach_{index:06d}_seed{11 + index}')
+        words = line.split()
+        assert words[:4] == [summary.path.parent.name, 'FetchReach', str(11 + index), '50']
+        assert float(words[4]) == float(summary.result['return'])
+        assert words[5:7] == ['no', '2.00'] and words[8] == 'complete'
+    assert lines[-1] == '3 episodes, 0 successes; 0 filtered'
+
+
+def test_summary_agrees_with_all_messages(generated):
+    _, paths = generated
+    summary, episode = read_summary(paths[0]), read_episode(paths[0])
+    assert (summary.metadata, summary.result) == (episode.metadata, episode.result)
+    counts = [len(logged.messages) for logged in episode.topics.values()]
+    assert summary.message_count == sum(counts)
+    assert summary.size_bytes == episode.path.stat().st_size
+
+
+def test_list_filters(reach, tmp_path, capsys):
+    directory = copy_of(reach, tmp_path)
+    for number, task in enumerate(('FetchPush', 'FetchReach')):
+        writer = EpisodeWriter(directory, f'x{number}', {'task': task, 'seed': '1'})
+        spec = topic(task_spec(task), '/clock')
+        writer.write(spec, TopicEncoder(spec).encode(0, []), 1)
+        if number:
+            writer.abort('the reason', {'success': 'false'})
+        else:
+            writer.finish({'success': 'true', 'steps': '1', 'return': '-1.0'})
+
+    def names(*options):
+        assert list_episodes.main([str(directory), *options]) == 0
+        table = capsys.readouterr().out.splitlines()[1:-1]
+        return [line.split()[0] for line in table]
+
+    assert len(names()) == 5
+    assert names('--task', 'FetchPush') == ['x0']
+    assert names('--success') == ['x0']
+    assert len(names('--failure')) == 4
+    assert len(names('--complete')) == 4
+    assert names('--no-complete') == ['x1']
+    assert len(names('--complete', '--failure', '--task', 'FetchReach')) == 3
+
+
+def test_list_names_and_skips_what_it_cannot_read(reach, tmp_path, capsys):
+    directory = copy_of(reach, tmp_path)
+    broken = directory / 'FetchReach_000000_seed11' / 'FetchReach_000000_seed11_0.mcap'
+    broken.write_bytes(broken.read_bytes()[:5000])
+    (directory / 'text.mcap').write_text('\x1b[31mno bag')
+    (directory / 'notes.txt').write_text('not an episode and no claim to be one')
+    (directory / 'hollow').mkdir()
+    (directory / 'hollow' / 'metadata.yaml').touch()
+    assert list_episodes.main([str(directory)]) == 1
+    output = capsys.readouterr()
+    assert '2 episodes' in output.out
+    named = [line for line in output.err.splitlines() if 'skipped' in line]
+    assert len(named) == len(output.err.splitlines()) == 3
+    for name in (str(broken), 'text.mcap', 'hollow'):
+        assert sum(name in line for line in named) == 1
+    assert '\x1b' not in output.out + output.err
+
+
+def test_list_shows_no_control_characters_of_a_file(tmp_path, capsys):
+    writer = EpisodeWriter(tmp_path, 'x', {'task': '\x1b]0;owned\x07', 'seed': '[red]1[/red]'})
+    spec = topic(task_spec('FetchReach'), '/clock')
+    writer.write(spec, TopicEncoder(spec).encode(0, []), 1)
+    writer.finish({'success': '\x9b', 'return': 'nan', 'steps': '\n'})
+    assert list_episodes.main([str(tmp_path)]) == 0
+    output = capsys.readouterr().out
+    assert '[red]1[/red]' in output
+    assert output.isascii() and all(c.isprintable() or c == '\n' for c in output)
+
+
+def test_usage_errors_exit_with_2(tmp_path, capsys):
+    for tool in (list_episodes, recover_episodes):
+        assert tool.main([str(tmp_path / 'missing')]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert 'missing' in line
+        with pytest.raises(SystemExit) as caught:
+            tool.main(['--nonsense', str(tmp_path)])
+        assert caught.value.code == 2
+        capsys.readouterr()
+
+
+def cut_off(source: Path, directory: Path, size: int) -> Path:
+    """A leftover: the file of an episode up to a size, in its hidden directory."""
+    active = directory / f'.{source.name}.active'
+    active.mkdir(parents=True)
+    file = f'{source.name}_0.mcap'
+    (active / file).write_bytes((source / file).read_bytes()[:size])
+    return active
+
+
+def test_recover_makes_bags_of_leftovers_and_says_which_it_cannot(reach, tmp_path, capsys):
+    sources = sorted(reach.iterdir())
+    size = (sources[0] / f'{sources[0].name}_0.mcap').stat().st_size
+    cut_off(sources[0], tmp_path, size // 2)
+    cut_off(sources[1], tmp_path, 2000)
+    assert recover_episodes.main([str(tmp_path), '--dry-run']) == 0
+    assert list_episodes.main([str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count('recover_episodes makes a bag of it') == 2
+    assert recover_episodes.main([str(tmp_path)]) == 1
+    output = capsys.readouterr()
+    assert 'marked as interrupted' in output.out
+    assert 'nothing to recover' in output.err and sources[1].name in output.err
+    result = EpisodeChecker().check(tmp_path / sources[0].name)
+    assert result.difference is None and 10 < result.ticks < 51
+    (arrays,) = load_episodes(tmp_path / sources[0].name)
+    assert len(arrays) == int(arrays.result['steps']) == result.ticks - 1
+    assert float(arrays.result['return']) == arrays.rewards.sum()
+    assert recover_episodes.main([str(reach)]) == 0
+
+
+# Learning
+
+
+def test_logged_episodes_become_experience(generated):
+    task, paths = generated
+    experience, skipped = read_experience(paths[0].parent, TASKS[task])
+    loaded = load_episodes(paths[0].parent)
+    assert len(experience) == 4 and skipped == []
+    assert experience.ticks == TASKS[task].episode_ticks
+    for index, arrays in enumerate(loaded):
+        pairs = (
+            (experience.observation, arrays.observations['observation']),
+            (experience.achieved_goal, arrays.observations['achieved_goal']),
+            (experience.desired_goal, arrays.goals[0]),
+            (experience.action, arrays.actions),
+        )
+        for given, expected in pairs:
+            assert given.dtype == np.float32
+            np.testing.assert_array_equal(given[index], expected.astype(np.float32))
+
+
+def test_what_cannot_be_learnt_from_is_left_out_and_named(reach, tmp_path):
+    source = min(reach.iterdir())
+    rewrite(source, tmp_path / 'mixed', last=20)
+    shutil.copytree(max(reach.iterdir()), tmp_path / 'mixed' / 'whole')
+    (tmp_path / 'mixed' / 'text.mcap').write_text('no bag')
+    generate(tmp_path / 'mixed', 'FetchPush', episodes=1)
+    generate(tmp_path / 'mixed', 'FetchReach', episodes=1, control_hz=50.0)
+    experience, skipped = read_experience(tmp_path / 'mixed', TASKS['FetchReach'])
+    assert len(experience) == 1 and len(skipped) == 4
+    for reason in ('19 of 50 steps', 'FetchPush, not FetchReach', '50.0 Hz', 'no MCAP file'):
+        assert sum(reason in line or 'begin and end' in line for line in skipped) >= 1
+    with pytest.raises(ValueError, match='holds no usable episode of HandReach'):
+        read_experience(tmp_path / 'mixed', TASKS['HandReach'])
+
+
+def test_the_command_line_generates(tmp_path, capsys):
+    arguments = ['--policy', 'random', '--task', 'FetchReach', '--output', str(tmp_path)]
+    assert generate_episodes.main([*arguments, '--episodes', '2', '--threads', '1']) == 0
+    assert '2 episodes of FetchReach' in capsys.readouterr().out
+    assert list_episodes.main([str(tmp_path), '--complete']) == 0
+    assert generate_episodes.main(['--policy', 'random', '--output', str(tmp_path)]) == 2
+    assert '--task is missing' in capsys.readouterr().err
+    with pytest.raises(SystemExit) as caught:
+        generate_episodes.main([*arguments, '--episodes', '0'])
+    assert caught.value.code == 2
+    file = tmp_path / 'file'
+    file.touch()
+    assert generate_episodes.main([*arguments[:-1], str(file), '--episodes', '1']) == 1
+    assert 'cannot log episode' in capsys.readouterr().err
+
+
+def test_equal_command_lines_give_equal_messages(tmp_path):
+    runs = [generate(tmp_path / name, 'FetchReach', episodes=2) for name in ('a', 'b')]
+    for first, second in zip(*runs, strict=True):
+        assert read_episode(first).topics == read_episode(second).topics
+        files = [path / f'{path.name}_0.mcap' for path in (first, second)]
+        assert files[0].read_bytes() != b'' and files[0].name == files[1].name
+
+
+def test_arrays_are_as_documented(reach):
+    (arrays, *_) = load_episodes(reach)
+    names = {field.name for field in dataclasses.fields(arrays)}
+    assert {'observations', 'actions', 'rewards', 'terminated', 'truncated', 'success'} <= names

@@ -1,0 +1,223 @@
+"""Every way a run can end: killed at random moments, disks that fill up, vanish or refuse."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from fetch_hand_sim.episode_log import (
+    EpisodeLogError,
+    LogSettings,
+    find_episodes,
+    find_leftovers,
+    read_episode,
+    recover_episode,
+)
+from msgs_spec.tasks import task_spec
+from support import SUPPORT, script_environment
+from support.graph import SIM_NODE, TIMEOUT, client, ros_args
+
+# `make torture` turns this up.
+KILLS = int(os.environ.get('EPISODE_KILLS', '20'))
+SCRIPT = SUPPORT / 'killed_writer.py'
+TICK_NS = 40_000_000
+FLUSH_PERIOD_NS = LogSettings().flush_period_ns
+REACH = task_spec('FetchReach')
+MIB = 1024 * 1024
+
+
+def finish(process, timeout=TIMEOUT):
+    output, errors = process.communicate(timeout=timeout)
+    return process.returncode, output + errors
+
+
+@pytest.mark.timeout(60 + 5 * KILLS)
+def test_killed_at_random_moments(tmp_path):
+    environment = script_environment()
+    run = subprocess.run(
+        [sys.executable, SCRIPT, tmp_path, str(KILLS), '5'],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    outcomes = [check_killed(**json.loads(line)) for line in run.stdout.splitlines()]
+    assert len(outcomes) == KILLS
+    # The moments are random, and yet a third of them or more hit an episode being written.
+    assert outcomes.count('recovered') >= KILLS // 4, outcomes
+
+
+def check_killed(directory, first, last):
+    """Checks what one killed process left; returns what became of its last episode."""
+    path = Path(directory)
+    if not path.exists():
+        return 'nothing'
+    for finished in find_episodes(path):
+        assert read_episode(finished).is_complete
+    leftovers = find_leftovers(path)
+    assert len(leftovers) <= 1
+    if not leftovers:
+        return 'between'
+    try:
+        recovered = recover_episode(leftovers[0].path)
+    except EpisodeLogError as error:
+        # Less than one flush had been written of it, or nothing but the file had been made.
+        assert 'nothing to recover' in str(error) or 'No such file' in str(error)
+        assert last - first <= FLUSH_PERIOD_NS + TICK_NS or last - first >= 50 * TICK_NS
+        return 'too short'
+    episode = read_episode(recovered)
+    times = [m.log_time_ns for t in episode.topics.values() for m in t.messages]
+    assert min(times) == first
+    assert max(times) >= last - FLUSH_PERIOD_NS - TICK_NS
+    assert find_leftovers(path) == []
+    if not episode.is_complete:
+        assert episode.result['reason'] == 'cut off, recovered later'
+    return 'recovered'
+
+
+@pytest.fixture
+def mount():
+    """Makes small file systems; needs the right to mount."""
+    mounted = []
+
+    def make(*options):
+        path = Path(tempfile.mkdtemp(prefix='episodes_'))
+        command = ['mount', '-t', 'tmpfs', '-o', ','.join(options), 'tmpfs', path]
+        result = subprocess.run(command, capture_output=True, text=True)
+        if result.returncode:
+            path.rmdir()
+            pytest.skip(f'no right to mount a small disk: {result.stderr.strip()}')
+        mounted.append(path)
+        return path
+
+    yield make
+    for path in mounted:
+        subprocess.run(['umount', '-l', path], check=True)
+        path.rmdir()
+
+
+def error_lines(output):
+    return [line for line in output.splitlines() if '[ERROR]' in line]
+
+
+def stop(robot):
+    robot.send_signal(signal.SIGINT)
+    code, output = finish(robot)
+    assert code == 0, output
+    assert 'Traceback' not in output
+    return output
+
+
+def ticks_after(listener, count=30):
+    """Waits for that many more ticks: the robot is alive."""
+    before = len(listener.received['joint_states'])
+    listener.spin_until(
+        lambda: len(listener.received['joint_states']) >= before + count, 'more ticks'
+    )
+
+
+def wait_for_episode_in_progress(listener, directory):
+    listener.spin_until(
+        lambda: directory.exists() and any(directory.glob('.*.active')), 'an episode in progress'
+    )
+
+
+def test_a_disk_that_fills_up_stops_the_log_and_not_the_robot(start_process, mount):
+    disk = mount('size=80m')
+    robot = start_process(*SIM_NODE, *ros_args(episode_dir=disk / 'episodes', real_time_factor=2.0))
+    with client(REACH) as listener:
+        listener.subscribe('joint_states')
+        wait_for_episode_in_progress(listener, disk / 'episodes')
+        fill(disk / 'filler')
+        ticks_after(listener, 160)
+        (disk / 'filler').unlink()
+        ticks_after(listener)
+    errors = error_lines(stop(robot))
+    assert len(errors) == 1
+    assert 'No space left on device' in errors[0] or 'MiB free on the disk' in errors[0]
+    for path in find_episodes(disk / 'episodes'):
+        assert read_episode(path).is_complete
+
+
+def fill(path):
+    """Takes all room there is."""
+    with path.open('wb', buffering=0) as file:
+        size = MIB
+        while size:
+            try:
+                file.write(bytes(size))
+            except OSError:
+                size //= 2
+
+
+def test_a_disk_that_is_full_from_the_start(start_process, mount):
+    disk = mount('size=8m')
+    robot = start_process(*SIM_NODE, *ros_args(episode_dir=disk))
+    with client(REACH) as listener:
+        listener.subscribe('joint_states')
+        ticks_after(listener, 60)
+    (error,) = error_lines(stop(robot))
+    assert 'MiB free on the disk, 64.0 MiB wanted' in error
+    assert list(disk.iterdir()) == []
+
+
+def test_a_read_only_disk(start_process, mount):
+    disk = mount('size=100m', 'ro')
+    robot = start_process(*SIM_NODE, *ros_args(episode_dir=disk / 'episodes'))
+    with client(REACH) as listener:
+        listener.subscribe('joint_states')
+        ticks_after(listener, 60)
+    (error,) = error_lines(stop(robot))
+    assert 'Read-only file system' in error
+
+
+def test_a_directory_that_is_removed_while_it_is_written(start_process, tmp_path):
+    directory = tmp_path / 'episodes'
+    robot = start_process(*SIM_NODE, *ros_args(episode_dir=directory, real_time_factor=4.0))
+    with client(REACH) as listener:
+        listener.subscribe('joint_states')
+        wait_for_episode_in_progress(listener, directory)
+        shutil.rmtree(directory)
+        ticks_after(listener, 160)
+    errors = error_lines(stop(robot))
+    assert len(errors) == 1 and 'No such file or directory' in errors[0]
+
+
+def test_a_terminated_robot_completes_its_episode(start_process, tmp_path):
+    robot = start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path))
+    with client(REACH) as listener:
+        listener.subscribe('reward')
+        listener.spin_until(lambda: len(listener.received['reward']) > 5, 'ticks')
+        robot.terminate()
+        code, output = finish(robot)
+    assert code == 0, output
+    *whole, last = map(read_episode, find_episodes(tmp_path))
+    assert all(episode.is_complete for episode in whole)
+    assert last.result['reason'] == 'SIGTERM'
+    assert find_leftovers(tmp_path) == []
+
+
+def test_leftovers_are_named_at_the_next_start(start_process, tmp_path):
+    robot = start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path))
+    deadline = time.monotonic() + TIMEOUT
+    while not list(tmp_path.glob('.*.active')):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    robot.kill()
+    robot.wait()
+    (leftover,) = find_leftovers(tmp_path)
+    arguments = ros_args(episode_dir=tmp_path, episodes=1, real_time_factor=0.0)
+    code, output = finish(start_process(*SIM_NODE, *arguments))
+    assert code == 0
+    (line,) = [line for line in output.splitlines() if leftover.name in line]
+    assert 'unfinished episode' in line

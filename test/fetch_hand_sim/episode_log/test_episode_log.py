@@ -1,0 +1,487 @@
+"""Finished episodes: what three independent readers find in them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+import zstandard
+from mcap.reader import make_reader
+from mcap.records import Chunk, ChunkIndex, Header, SummaryOffset
+from mcap.stream_reader import StreamReader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from ruamel.yaml import YAML
+
+from fetch_hand_sim.episode_log import (
+    EpisodeDirectory,
+    EpisodeWriter,
+    LogSettings,
+    log_time,
+    read_episode,
+)
+from fetch_hand_sim.episode_log.model import (
+    compiled_attachment,
+    compiled_bytes,
+    mjcf_attachment,
+    model_sha256,
+)
+from fetch_hand_sim.simulation.models import asset_path
+from msgs_spec.codecs import decode
+from msgs_spec.schemas import deserialize, schema_text, type_hash
+from msgs_spec.topics import topics
+from support.episode_recorder import Recorder
+
+TASKS = ('FetchReach', 'HandReach', 'HandManipulateBlockRotateZ')
+QOS_KEYS = {
+    'history',
+    'depth',
+    'reliability',
+    'durability',
+    'deadline',
+    'lifespan',
+    'liveliness',
+    'liveliness_lease_duration',
+    'avoid_ros_namespace_conventions',
+}
+METADATA_KEYS = {
+    'version',
+    'storage_identifier',
+    'duration',
+    'starting_time',
+    'message_count',
+    'topics_with_message_count',
+    'compression_format',
+    'compression_mode',
+    'relative_file_paths',
+    'files',
+    'custom_data',
+    'ros_distro',
+}
+
+
+class Bag:
+    """A finished episode beside what went into it."""
+
+    def __init__(self, directory, task):
+        self.recorder = Recorder(task)
+        self.spec = self.recorder.spec
+        self.metadata = self.recorder.metadata(started='2024-11-21T12:00:00+00:00')
+        self.ticks = self.recorder.ticks()
+        self.directory = write_bag(self.recorder, self.ticks, directory, self.metadata)
+        self.file = self.directory / f'{self.directory.name}_0.mcap'
+
+    def written(self):
+        """(log time, topic, CDR) of every message, by the rule of `log_times`."""
+        messages = []
+        for tick in self.ticks:
+            extra = [] if tick.command is None else [(self.recorder.commands, tick.command)]
+            for rank, (topic, data) in enumerate([*tick.messages, *extra]):
+                messages.append((tick.stamp_ns + rank, '/' + topic.name.lstrip('/'), data))
+        return messages
+
+    def records(self):
+        with self.file.open('rb') as stream:
+            return list(StreamReader(stream, emit_chunks=True, validate_crcs=True).records)
+
+    def info(self):
+        return yaml.safe_load((self.directory / 'metadata.yaml').read_text())[
+            'rosbag2_bagfile_information'
+        ]
+
+
+def write_bag(recorder, ticks, directory, metadata, settings=None, attachments=()):
+    writer = EpisodeWriter(directory, 'episode', metadata, attachments, settings)
+    recorder.write(writer, ticks)
+    return writer.finish({'success': 'false', 'return': '-50.0'})
+
+
+@pytest.fixture(scope='module', params=TASKS)
+def bag(request, tmp_path_factory):
+    return Bag(tmp_path_factory.mktemp(request.param), request.param)
+
+
+@pytest.fixture(scope='module')
+def reach(tmp_path_factory):
+    return Bag(tmp_path_factory.mktemp('reach'), 'FetchReach')
+
+
+def test_mcap_reads_every_message_with_its_time_and_sequence(bag):
+    with bag.file.open('rb') as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        read = list(reader.iter_messages(log_time_order=False))
+        summary = reader.get_summary()
+    assert [(m.log_time, c.topic, m.data) for _, c, m in read] == bag.written()
+    assert all(later.log_time > m.log_time for (_, _, m), (_, _, later) in itertools.pairwise(read))
+    for topic in {channel.topic for _, channel, _ in read}:
+        sequences = [m.sequence for _, channel, m in read if channel.topic == topic]
+        assert sequences == list(range(len(sequences)))
+    assert summary.statistics.message_count == len(read)
+    assert summary.statistics.message_start_time == bag.ticks[0].stamp_ns
+    assert set(summary.statistics.channel_message_counts) == set(summary.channels)
+    assert all(summary.statistics.channel_message_counts.values())
+
+
+def test_every_channel_says_type_quality_of_service_and_hash(bag):
+    specs = {'/' + spec.name.lstrip('/'): spec for spec in topics(bag.spec)}
+    with bag.file.open('rb') as stream:
+        summary = make_reader(stream).get_summary()
+    logged = {channel.topic for channel in summary.channels.values()}
+    subscribed = {name for name, spec in specs.items() if spec.direction == 'subscribed'}
+    assert logged == (set(specs) - subscribed) | {'/commands'}
+    for channel in summary.channels.values():
+        spec, schema = specs[channel.topic], summary.schemas[channel.schema_id]
+        (profile,) = yaml.safe_load(channel.metadata['offered_qos_profiles'])
+        assert channel.message_encoding == 'cdr'
+        assert (schema.name, schema.encoding) == (spec.type_name, 'ros2msg')
+        assert schema.data.decode() == schema_text(spec.type_name)
+        assert set(profile) == QOS_KEYS
+        assert profile['durability'] == spec.qos.durability
+        assert profile['depth'] == spec.qos.depth
+        assert channel.metadata['topic_type_hash'] == type_hash(spec.type_name)
+    assert len({schema.name for schema in summary.schemas.values()}) == len(summary.schemas)
+
+
+def test_profile_chunks_and_indexes(bag):
+    records = bag.records()
+    chunks = [record for record in records if isinstance(record, Chunk)]
+    indexes = [record for record in records if isinstance(record, ChunkIndex)]
+    assert isinstance(records[0], Header) and records[0].profile == 'ros2'
+    assert all(chunk.uncompressed_crc for chunk in chunks)
+    assert all(chunk.compression == 'lz4' for chunk in chunks)
+    assert all(chunk.uncompressed_size < 2 * LogSettings().chunk_size for chunk in chunks)
+    assert len(indexes) == len(chunks)
+    assert all(index.message_index_offsets for index in indexes)
+    groups = [record for record in records if isinstance(record, SummaryOffset)]
+    assert groups and all(group.group_length > 0 for group in groups)
+
+
+def test_a_chunk_holds_at_most_a_quarter_of_a_simulated_second(bag):
+    chunks = [record for record in bag.records() if isinstance(record, Chunk)]
+    # A flush comes with the first message a quarter of a second after the one before: 7 ticks.
+    assert all(c.message_end_time - c.message_start_time < 250_000_000 for c in chunks)
+    duration = bag.ticks[-1].stamp_ns - bag.ticks[0].stamp_ns
+    assert len(chunks) == duration // 280_000_000 + 1
+
+
+@pytest.mark.parametrize('part', ['directory', 'file'])
+def test_rosbags_deserialises_every_message(bag, part):
+    specs = {'/' + spec.name.lstrip('/'): spec for spec in topics(bag.spec)}
+    count = 0
+    with AnyReader([getattr(bag, part)]) as reader:
+        for connection, time_ns, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            written_ns, topic, written = bag.written()[count]
+            assert (connection.topic, time_ns) == (topic, written_ns)
+            spec = specs[connection.topic]
+            if spec.layout:
+                expected = decode(spec, deserialize(spec.type_name, written))
+                np.testing.assert_array_equal(decode(spec, message), expected)
+            count += 1
+        assert reader.message_count == count == len(bag.written())
+        assert reader.start_time == bag.ticks[0].stamp_ns
+        durability = {
+            connection.topic: connection.ext.offered_qos_profiles[0].durability.name.lower()
+            for connection in reader.connections
+        }
+    assert {topic for topic, value in durability.items() if value == 'transient_local'} == {
+        '/desired_goal',
+        '/episode_status',
+    }
+
+
+def test_mcap_ros2_support_decodes_every_message(bag):
+    with bag.file.open('rb') as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        decoded = list(reader.iter_decoded_messages())
+    assert len(decoded) == len(bag.written())
+    joints = [message for _, channel, _, message in decoded if channel.topic == '/joint_states']
+    assert [message.name for message in joints] == [list(bag.spec.robot.joints)] * len(bag.ticks)
+    stamps = [message.header.stamp for message in joints]
+    assert [s.sec * 10**9 + s.nanosec for s in stamps] == [tick.stamp_ns for tick in bag.ticks]
+
+
+def test_metadata_yaml_agrees_with_the_file(bag):
+    info = bag.info()
+    counts = {topic: 0 for _, topic, _ in bag.written()}
+    for _, topic, _ in bag.written():
+        counts[topic] += 1
+    times = [time for time, _, _ in bag.written()]
+    span = {
+        'starting_time': {'nanoseconds_since_epoch': times[0]},
+        'duration': {'nanoseconds': times[-1] - times[0]},
+        'message_count': len(times),
+    }
+    assert set(info) == METADATA_KEYS
+    assert (info['version'], info['storage_identifier'], info['ros_distro']) == (9, 'mcap', 'jazzy')
+    assert (info['compression_format'], info['compression_mode']) == ('', '')
+    assert {key: info[key] for key in span} == span
+    assert info['relative_file_paths'] == ['episode_0.mcap']
+    assert info['files'] == [{'path': 'episode_0.mcap', **span}]
+    for entry in info['topics_with_message_count']:
+        topic = entry['topic_metadata']
+        assert entry['message_count'] == counts.pop(topic['name'])
+        assert topic['serialization_format'] == 'cdr'
+        assert topic['type_description_hash'] == type_hash(topic['type'])
+        assert set(topic['offered_qos_profiles'][0]) == QOS_KEYS
+    assert counts == {}
+
+
+def test_custom_data_are_strings_to_every_yaml_reader(reach):
+    path = reach.directory / 'metadata.yaml'
+    readers = (yaml.safe_load, YAML(typ='safe').load)
+    for load in readers:
+        custom = load(path.read_text())['rosbag2_bagfile_information']['custom_data']
+        assert custom['source_revision'] == '12e4567'
+        assert all(isinstance(value, str) for value in custom.values())
+
+
+def test_metadata_records_say_what_the_episode_is_and_how_it_ended(bag):
+    with bag.file.open('rb') as stream:
+        records = [(r.name, r.metadata) for r in make_reader(stream).iter_metadata()]
+    names = [name for name, _ in records]
+    assert names == ['episode', 'rosbag2', 'episode_result', 'rosbag2']
+    assert records[0][1] == {'episode_id': 'episode', **bag.metadata}
+    assert records[2][1] == {'success': 'false', 'return': '-50.0', 'complete': 'true'}
+    opened, closed = (
+        yaml.safe_load(record['serialized_metadata'])
+        for name, record in records
+        if name == 'rosbag2'
+    )
+    assert closed == bag.info()
+    assert opened['message_count'] == 0 and opened['topics_with_message_count'] == []
+    assert closed['custom_data'] == {**opened['custom_data'], **records[2][1]}
+
+
+def test_episode_metadata_name_versions_orders_and_model(reach):
+    metadata = read_episode(reach.directory).metadata
+    assert json.loads(metadata['joint_order']) == list(reach.spec.robot.joints)
+    assert json.loads(metadata['command_order']) == ['x', 'y', 'z', 'gripper']
+    assert metadata['mujoco_version'] == mujoco.__version__
+    assert metadata['numpy_version'] == np.__version__
+    assert metadata['model_sha256'] == model_sha256(reach.recorder.simulation.model)
+    assert (metadata['task'], metadata['seed'], metadata['control_hz']) == (
+        'FetchReach',
+        '0',
+        '25.0',
+    )
+    assert 'checkpoint_sha256' not in metadata
+
+
+@pytest.mark.parametrize('part', ['directory', 'file'])
+def test_read_episode_gives_back_what_was_written(bag, part):
+    episode = read_episode(getattr(bag, part))
+    read = sorted(
+        (message.log_time_ns, name, message.data)
+        for name, topic in episode.topics.items()
+        for message in topic.messages
+    )
+    assert read == bag.written()
+    assert episode.is_complete
+    assert episode.path == bag.file
+
+
+def test_equal_inputs_give_equal_bytes(reach, tmp_path):
+    """Two simulations, the same seed and commands: every byte of both files is equal."""
+    files = []
+    for run in ('first', 'second'):
+        recorder = Recorder('FetchReach')
+        path = write_bag(recorder, recorder.ticks(), tmp_path / run, recorder.metadata())
+        files.append({file.name: file.read_bytes() for file in sorted(path.iterdir())})
+    assert list(files[0]) == ['episode_0.mcap', 'metadata.yaml']
+    assert files[0] == files[1]
+
+
+def test_the_wall_clock_is_only_in_the_metadata(reach, tmp_path):
+    paths = [
+        write_bag(reach.recorder, reach.ticks, tmp_path / name, reach.recorder.metadata(name))
+        for name in ('2024-11-21T12:00:00+00:00', '2025-12-22T13:01:01+00:00')
+    ]
+    first, second = (read_episode(path) for path in paths)
+    assert first.topics == second.topics
+    assert first.metadata.pop('started') != second.metadata.pop('started')
+    assert first.metadata == second.metadata
+
+
+def test_the_mjcf_text_comes_with_the_episode_and_compiles(reach, tmp_path):
+    path = asset_path('fetch/reach.xml')
+    attachment = mjcf_attachment(path)
+    bag = write_bag(reach.recorder, reach.ticks, tmp_path, {}, attachments=[attachment])
+    text = read_episode(bag).attachments['model.xml'].decode()
+    spec = mujoco.MjSpec.from_string(text)
+    spec.meshdir = str(path.parent / spec.meshdir)
+    spec.texturedir = str(path.parent / spec.texturedir)
+    model, original = spec.compile(), mujoco.MjModel.from_xml_path(str(path))
+    assert [model.joint(i).name for i in range(model.njnt)] == list(reach.spec.robot.joints)
+    np.testing.assert_allclose(model.body_mass, original.body_mass, rtol=1e-6)
+    assert model.nmeshvert == original.nmeshvert
+    assert len(text) < 64 * 1024
+
+
+def test_the_compiled_model_comes_back_bit_by_bit(reach, tmp_path):
+    model = reach.recorder.simulation.model
+    attachments = [compiled_attachment(model)]
+    bag = write_bag(reach.recorder, reach.ticks, tmp_path, {}, attachments=attachments)
+    compressed = read_episode(bag).attachments['model.mjb.zst']
+    data = zstandard.decompress(compressed)
+    assert data == compiled_bytes(model)
+    path = tmp_path / 'model.mjb'
+    path.write_bytes(data)
+    assert model_sha256(mujoco.MjModel.from_binary_path(str(path))) == model_sha256(model)
+
+
+@pytest.mark.parametrize('compression', ['none', 'lz4', 'zstd'])
+def test_settings_reach_the_file(reach, tmp_path, compression):
+    settings = LogSettings(chunk_size=4096, compression=compression, flush_period_ns=10**12)
+    path = write_bag(reach.recorder, reach.ticks, tmp_path, {}, settings)
+    with (path / 'episode_0.mcap').open('rb') as stream:
+        summary = make_reader(stream).get_summary()
+    size = sum(len(data) for _, _, data in reach.written())
+    assert {index.compression for index in summary.chunk_indexes} == {
+        '' if compression == 'none' else compression
+    }
+    # A chunk ends after the message that fills it.
+    assert size / (2 * 4096) < len(summary.chunk_indexes) < 2 * size / 4096
+    episode = read_episode(path)
+    assert sum(len(t.messages) for t in episode.topics.values()) == len(reach.written())
+
+
+def test_relative_names_are_resolved_in_the_namespace(reach, tmp_path):
+    writer = EpisodeWriter(tmp_path, 'episode', {}, namespace='/left')
+    reach.recorder.write(writer, reach.ticks)
+    names = set(read_episode(writer.finish({})).topics)
+    assert {'/clock', '/left/joint_states', '/left/commands'} <= names
+
+
+def test_an_aborted_episode_is_a_valid_bag_marked_incomplete(reach, tmp_path):
+    writer = EpisodeWriter(tmp_path, 'episode', reach.metadata)
+    reach.recorder.write(writer, reach.ticks[:20])
+    path = writer.abort('SIGTERM', {'return': '-19.0'})
+    episode = read_episode(path)
+    assert not episode.is_complete
+    assert episode.result == {'return': '-19.0', 'complete': 'false', 'reason': 'SIGTERM'}
+    assert len(episode.topics['/joint_states'].messages) == 20
+    with AnyReader([path]) as reader:
+        messages = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages()]
+    assert len(messages) == sum(len(topic.messages) for topic in episode.topics.values())
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_episode_without_messages_leaves_nothing(reach, tmp_path):
+    writer = EpisodeWriter(tmp_path, 'episode', reach.metadata)
+    assert writer.abort('SIGINT') is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_completed_writer_takes_no_more(reach, tmp_path):
+    writer = EpisodeWriter(tmp_path, 'episode', {})
+    reach.recorder.write(writer, reach.ticks)
+    path = writer.finish({})
+    before = (path / 'episode_0.mcap').read_bytes()
+    topic, data = reach.ticks[0].messages[0]
+    assert writer.write(topic, data, 10**12) is False
+    assert writer.finish({'success': 'true'}) == writer.abort('late') == path
+    assert (path / 'episode_0.mcap').read_bytes() == before
+
+
+def test_an_episode_is_hidden_until_it_is_complete(reach, tmp_path):
+    writer = EpisodeWriter(tmp_path, 'episode', {})
+    reach.recorder.write(writer, reach.ticks)
+    assert [path.name for path in tmp_path.iterdir()] == ['.episode.active']
+    writer.finish({})
+    assert [path.name for path in tmp_path.iterdir()] == ['episode']
+
+
+def test_times_must_grow(reach, tmp_path):
+    writer = EpisodeWriter(tmp_path, 'episode', {})
+    topic, data = reach.ticks[0].messages[0]
+    assert writer.write(topic, data, 1000)
+    for time_ns in (1000, 999):
+        with pytest.raises(ValueError, match=f'log time {time_ns} ns of /clock is not later'):
+            writer.write(topic, data, time_ns)
+    assert writer.write(topic, data, 1001)
+    (clock,) = read_episode(writer.finish({})).topics.values()
+    assert [message.log_time_ns for message in clock.messages] == [1000, 1001]
+
+
+def test_a_command_needs_a_tick_before_it(reach, tmp_path):
+    writer = EpisodeWriter(tmp_path, 'episode', {})
+    with pytest.raises(ValueError, match='commands was written before the first tick'):
+        writer.write_received(reach.recorder.commands, reach.ticks[0].command)
+    writer.abort('test')
+
+
+@pytest.mark.parametrize(('stamp_ns', 'rank'), [(-1, 0), (0, -1)])
+def test_log_times_are_unsigned(stamp_ns, rank):
+    assert log_time(10**9, 7) == 1_000_000_007
+    with pytest.raises(ValueError, match='must not be negative'):
+        log_time(stamp_ns, rank)
+
+
+def test_a_topic_has_one_type(reach, tmp_path):
+    writer = EpisodeWriter(tmp_path, 'episode', {})
+    topic, data = reach.ticks[0].messages[1]
+    other = type(topic)(topic.name, 'std_msgs/msg/Bool', topic.qos, '', (), (), 'published', '')
+    writer.write(topic, data, 1)
+    with pytest.raises(ValueError, match='joint_states is sensor_msgs/msg/JointState'):
+        writer.write(other, data, 2)
+    writer.abort('test')
+
+
+def test_metadata_must_be_strings(tmp_path):
+    with pytest.raises(ValueError, match="not 'seed': 3"):
+        EpisodeWriter(tmp_path, 'episode', {'seed': 3})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    'bad', [{'compression': 'gzip'}, {'chunk_size': 0}, {'flush_period_ns': 0}]
+)
+def test_bad_settings_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        LogSettings(**bad)
+
+
+def test_numbers_go_on_after_what_is_there(tmp_path):
+    recorder = Recorder('FetchReach')
+    names = [recorder.record(EpisodeDirectory(tmp_path)).name for _ in range(2)]
+    (tmp_path / '.FetchReach_000006_seed9.active').mkdir()
+    (tmp_path / 'FetchReachOld_000044_seed0').mkdir()
+    (tmp_path / 'HandReach_000055_seed0').mkdir()
+    directory = EpisodeDirectory(tmp_path)
+    names += [recorder.record(directory).name for _ in range(2)]
+    assert names == [
+        'FetchReach_000000_seed0',
+        'FetchReach_000001_seed1',
+        'FetchReach_000007_seed2',
+        'FetchReach_000008_seed3',
+    ]
+
+
+def test_two_recorders_in_one_directory_do_not_meet(tmp_path):
+    """Same task, same seeds, both begun before either has finished."""
+    recorders = [Recorder('FetchReach') for _ in range(2)]
+    directories = [EpisodeDirectory(tmp_path) for _ in range(2)]
+    writers = [
+        directory.begin('FetchReach', 0, recorder.metadata())
+        for directory, recorder in zip(directories, recorders, strict=True)
+    ]
+    assert directories[0].leftovers() == []
+    for writer, recorder in zip(writers, recorders, strict=True):
+        recorder.write(writer, recorder.ticks())
+    paths = [writer.finish({}) for writer in writers]
+    paths += [
+        recorder.record(directory)
+        for directory, recorder in zip(directories, recorders, strict=True)
+    ]
+    assert [path.name for path in paths] == [
+        'FetchReach_000000_seed0',
+        'FetchReach_000001_seed0',
+        'FetchReach_000001_seed1',
+        'FetchReach_000002_seed1',
+    ]
+    assert all(read_episode(path).is_complete for path in paths)

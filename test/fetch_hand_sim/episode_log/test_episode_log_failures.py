@@ -1,0 +1,422 @@
+"""Killed processes, full and read-only disks, damaged files."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from rosbags.highlevel import AnyReader
+
+from fetch_hand_sim.episode_log import (
+    EpisodeDirectory,
+    EpisodeExistsError,
+    EpisodeLogError,
+    EpisodeReadError,
+    EpisodeWriter,
+    LogSettings,
+    find_leftovers,
+    read_episode,
+    recover_episode,
+)
+from msgs_spec.schemas import deserialize
+from support import SUPPORT, script_environment
+from support.episode_recorder import Recorder
+
+RECORDER_SCRIPT = SUPPORT / 'episode_recorder.py'
+NOBODY = 65534
+TICK_NS = 40_000_000
+# Every message goes to the disk at once, so that errors come where they are caused.
+EAGER = LogSettings(chunk_size=1, flush_period_ns=1, minimum_free_bytes=0)
+
+
+@pytest.fixture(scope='module')
+def recorder():
+    return Recorder('FetchReach')
+
+
+@pytest.fixture(scope='module')
+def ticks(recorder):
+    return recorder.ticks()
+
+
+@pytest.fixture(scope='module')
+def finished(recorder, tmp_path_factory):
+    return recorder.record(EpisodeDirectory(tmp_path_factory.mktemp('finished')))
+
+
+@contextmanager
+def file_size_limit(size):
+    """The operating system refuses to write files beyond `size` bytes (EFBIG)."""
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+
+
+def first_error(writer, recorder, ticks):
+    """Writes ticks until one fails; the error and how many messages were taken before it."""
+    taken = 0
+    for tick in ticks:
+        for rank, (topic, data) in enumerate(tick.messages):
+            try:
+                assert writer.write(topic, data, tick.stamp_ns + rank) is True
+            except EpisodeLogError as error:
+                return error, taken
+            taken += 1
+    pytest.fail('the disk took everything')
+
+
+def assert_one_line(error):
+    assert '\n' not in str(error) and len(str(error)) < 300
+
+
+@pytest.fixture(scope='module')
+def killed(tmp_path_factory, ros_environment_for_module):
+    """A directory with two finished episodes and one whose recorder was killed after 40 ticks."""
+    directory = tmp_path_factory.mktemp('killed')
+    command = [sys.executable, RECORDER_SCRIPT, directory, 'FetchReach', '2', '40']
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=ros_environment_for_module
+    )
+    try:
+        assert process.stdout.readline().strip() == str(directory)
+        running = find_leftovers(directory)
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    return directory, running
+
+
+@pytest.fixture(scope='module')
+def ros_environment_for_module():
+    return script_environment()
+
+
+def test_a_killed_recorder_leaves_finished_episodes_intact(killed):
+    directory, _ = killed
+    for name in ('FetchReach_000000_seed0', 'FetchReach_000001_seed1'):
+        assert read_episode(directory / name).is_complete
+        with AnyReader([directory / name]) as reader:
+            for connection, _, data in reader.messages():
+                reader.deserialize(data, connection.msgtype)
+
+
+def test_a_killed_recorder_leaves_an_episode_marked_as_unfinished(killed):
+    directory, running = killed
+    assert running == [], 'an episode that is being written is no leftover'
+    (leftover,) = find_leftovers(directory, now_s=time.time() + 60)
+    assert leftover.name == 'FetchReach_000002_seed2'
+    assert leftover.path == directory / '.FetchReach_000002_seed2.active'
+    assert leftover.size_bytes == sum(f.stat().st_size for f in leftover.path.iterdir()) > 0
+    assert 60 <= leftover.age_s < 120
+    assert 'FetchReach_000002_seed2' in str(leftover)
+    assert not (directory / leftover.name).exists()
+    with pytest.raises(EpisodeReadError, match='truncated'):
+        read_episode(leftover.path)
+
+
+def test_a_kill_loses_at_most_half_a_simulated_second(killed):
+    directory, _ = killed
+    times = []
+    with pytest.raises(EndOfFile):
+        with (directory / '.FetchReach_000002_seed2.active/FetchReach_000002_seed2_0.mcap').open(
+            'rb'
+        ) as stream:
+            for record in StreamReader(stream, validate_crcs=True).records:
+                if isinstance(record, Message):
+                    times.append(record.log_time)
+    # Two episodes of 51 ticks came before.
+    last_ns = 10**9 + (2 * 51 + 39) * TICK_NS
+    assert last_ns - 500_000_000 - TICK_NS <= times[-1] < last_ns
+
+
+def test_the_next_run_starts_after_the_killed_one(killed, recorder, tmp_path):
+    directory = tmp_path / 'copy'
+    shutil.copytree(killed[0], directory)
+    writer = EpisodeDirectory(directory).begin('FetchReach', 2, {})
+    assert writer.abort('nothing written') is None
+    assert [leftover.name for leftover in EpisodeDirectory(directory).leftovers()] == [
+        'FetchReach_000002_seed2'
+    ]
+    with pytest.raises(EpisodeExistsError, match='was cut off'):
+        EpisodeWriter(directory, 'FetchReach_000002_seed2', {})
+    with pytest.raises(EpisodeExistsError, match='never overwritten'):
+        EpisodeWriter(directory, 'FetchReach_000001_seed1', {})
+
+
+def test_recovery_makes_a_bag_of_what_reached_the_disk(killed, tmp_path):
+    directory = tmp_path / 'copy'
+    shutil.copytree(killed[0], directory)
+    (leftover,) = find_leftovers(directory)
+    path = recover_episode(leftover.path)
+    assert path == directory / 'FetchReach_000002_seed2'
+    assert find_leftovers(directory) == []
+    assert sorted(file.name for file in path.iterdir()) == [f'{path.name}_0.mcap', 'metadata.yaml']
+    # The same seeds give the same episode once more, here to its end.
+    twin = Recorder('FetchReach')
+    whole = [twin.record(EpisodeDirectory(tmp_path / 'twin')) for _ in range(3)][-1]
+    recovered, original = read_episode(path), read_episode(whole)
+    steps = len(recovered.topics['/applied_command'].messages)
+    rewards = [
+        deserialize('std_msgs/msg/Float64', message.data).data
+        for message in original.topics['/reward'].messages
+    ]
+    assert recovered.result == {
+        'complete': 'false',
+        'reason': 'cut off, recovered later',
+        'steps': str(steps),
+        'return': str(sum(rewards[:steps])),
+        'success': 'false',
+    }
+    assert recovered.metadata == original.metadata
+    assert len(recovered.topics['/joint_states'].messages) > 25
+    for name, topic in recovered.topics.items():
+        expected = original.topics[name]
+        assert topic.messages == expected.messages[: len(topic.messages)]
+        assert (topic.qos_yaml, topic.type_hash) == (expected.qos_yaml, expected.type_hash)
+    with AnyReader([path]) as reader:
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
+
+
+def test_recovery_of_a_whole_file_keeps_its_result(finished, tmp_path):
+    """The process died between the last write and the rename."""
+    leftover = tmp_path / f'.{finished.name}.active'
+    shutil.copytree(finished, leftover)
+    (leftover / 'metadata.yaml').unlink()
+    path = recover_episode(leftover)
+    recovered, original = read_episode(path), read_episode(finished)
+    assert recovered.is_complete
+    assert (recovered.result, recovered.topics) == (original.result, original.topics)
+    name = 'metadata.yaml'
+    assert (path / name).read_bytes() == (finished / name).read_bytes()
+
+
+def test_recovery_refuses_what_it_cannot_recover(finished, recorder, ticks, tmp_path):
+    writer = EpisodeWriter(tmp_path, 'running', {})
+    recorder.write(writer, ticks)
+    with pytest.raises(EpisodeLogError, match='is being written'):
+        recover_episode(tmp_path / '.running.active')
+    (tmp_path / '.hollow.active').mkdir()
+    with pytest.raises(EpisodeLogError, match='No such file'):
+        recover_episode(tmp_path / '.hollow.active')
+    torn = tmp_path / '.torn.active' / 'torn_0.mcap'
+    torn.parent.mkdir()
+    torn.write_bytes(next(finished.glob('*.mcap')).read_bytes()[:4000])
+    before = torn.read_bytes()
+    with pytest.raises(EpisodeLogError, match='nothing to recover'):
+        recover_episode(torn.parent)
+    assert [file.read_bytes() for file in torn.parent.iterdir()] == [before]
+    (tmp_path / 'torn').mkdir()
+    with pytest.raises(EpisodeLogError, match='never overwritten'):
+        recover_episode(torn.parent)
+    with pytest.raises(EpisodeLogError, match='no unfinished episode'):
+        recover_episode(finished)
+    writer.abort('test')
+
+
+def test_a_recovery_that_fails_changes_nothing(killed, tmp_path):
+    directory = tmp_path / 'copy'
+    shutil.copytree(killed[0], directory)
+    (leftover,) = find_leftovers(directory)
+    with file_size_limit(5000), pytest.raises(EpisodeLogError, match='File too large') as caught:
+        recover_episode(leftover.path)
+    assert_one_line(caught.value)
+    (file,) = leftover.path.iterdir()
+    assert file.read_bytes() == (killed[0] / leftover.path.name / file.name).read_bytes()
+
+
+def test_leftovers_of_a_directory_that_does_not_exist(tmp_path):
+    assert find_leftovers(tmp_path / 'missing') == []
+
+
+def test_an_error_of_the_disk_is_raised_once_and_stops_the_log(tmp_path, recorder, ticks):
+    writer = EpisodeWriter(tmp_path, 'episode', {}, settings=EAGER)
+    with file_size_limit(20_000):
+        error, taken = first_error(writer, recorder, ticks)
+        assert_one_line(error)
+        assert '.episode.active/episode_0.mcap: File too large' in str(error)
+        assert taken > 10
+    # There is room again, but the episode has a hole: it stays closed.
+    assert writer.is_open is False
+    topic, data = ticks[-1].messages[0]
+    assert writer.write(topic, data, 10**12) is False
+    assert writer.write_tick(10**12, ticks[-1].messages) is False
+    assert writer.finish({'success': 'true'}) is None
+    assert writer.abort('late') is None
+    assert [leftover.name for leftover in find_leftovers(tmp_path)] == ['episode']
+    assert not (tmp_path / 'episode').exists()
+
+
+def test_an_error_at_the_end_never_shows_a_finished_episode(tmp_path, recorder, ticks):
+    writer = EpisodeWriter(tmp_path, 'episode', {}, settings=LogSettings(flush_period_ns=10**12))
+    recorder.write(writer, ticks)
+    with file_size_limit(4000), pytest.raises(EpisodeLogError, match='File too large') as caught:
+        writer.finish({'success': 'true'})
+    assert_one_line(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ['.episode.active']
+
+
+def test_an_episode_that_cannot_be_begun_leaves_nothing(tmp_path, recorder):
+    with file_size_limit(100), pytest.raises(EpisodeLogError, match='File too large') as caught:
+        EpisodeWriter(tmp_path, 'episode', recorder.metadata())
+    assert_one_line(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_next_episode_is_logged_again(tmp_path, ticks):
+    recorder, directory = Recorder('FetchReach'), EpisodeDirectory(tmp_path)
+    writer = directory.begin('FetchReach', 0, {})
+    with file_size_limit(4000), pytest.raises(EpisodeLogError):
+        recorder.write(writer, ticks)
+    assert recorder.record(directory).name == 'FetchReach_000001_seed0'
+
+
+@pytest.fixture
+def small_disk():
+    """A file system of 2 MiB of its own; needs the right to mount."""
+    path = Path(tempfile.mkdtemp(prefix='episode_log_'))
+    mount = subprocess.run(
+        ['mount', '-t', 'tmpfs', '-o', 'size=2m', 'tmpfs', path], capture_output=True, text=True
+    )
+    if mount.returncode:
+        path.rmdir()
+        pytest.skip(f'no right to mount a small disk: {mount.stderr.strip()}')
+    yield path
+    subprocess.run(['umount', path], check=True)
+    path.rmdir()
+
+
+def test_a_full_disk(small_disk, recorder, ticks):
+    settings = LogSettings(minimum_free_bytes=1024 * 1024)
+    directory = EpisodeDirectory(small_disk, settings)
+    writer = directory.begin('FetchReach', 0, {})
+    (small_disk / 'filler').write_bytes(bytes(2040 * 1024 - 16 * 1024))
+    with pytest.raises(EpisodeLogError, match='No space left on device') as caught:
+        recorder.write(writer, ticks)
+        writer.finish({})
+    assert_one_line(caught.value)
+    with pytest.raises(EpisodeLogError, match=r'MiB free on the disk, 1\.0 MiB wanted'):
+        directory.begin('FetchReach', 1, {})
+    (small_disk / 'filler').unlink()
+    writer = directory.begin('FetchReach', 1, {})
+    recorder.write(writer, ticks)
+    assert read_episode(writer.finish({})).is_complete
+    assert [leftover.name for leftover in directory.leftovers()] == ['FetchReach_000000_seed0']
+
+
+def test_too_little_free_space_is_noticed_before(tmp_path):
+    settings = LogSettings(minimum_free_bytes=2**62)
+    with pytest.raises(EpisodeLogError, match='MiB free on the disk') as caught:
+        EpisodeWriter(tmp_path, 'episode', {}, settings=settings)
+    assert_one_line(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@contextmanager
+def unprivileged():
+    """Root may write everywhere; become nobody where that is possible."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.seteuid(NOBODY)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+def test_a_directory_without_permission_to_write():
+    with tempfile.TemporaryDirectory() as directory:
+        os.chmod(directory, 0o555)
+        with unprivileged(), pytest.raises(EpisodeLogError, match='Permission denied') as caught:
+            EpisodeDirectory(Path(directory)).begin('FetchReach', 0, {})
+        assert_one_line(caught.value)
+        assert os.listdir(directory) == []
+
+
+def test_a_directory_without_permission_to_read():
+    with tempfile.TemporaryDirectory() as directory:
+        os.chmod(directory, 0o000)
+        with unprivileged(), pytest.raises(EpisodeLogError, match='Permission denied') as caught:
+            EpisodeDirectory(Path(directory)).begin('FetchReach', 0, {})
+        assert_one_line(caught.value)
+        with unprivileged(), pytest.raises(EpisodeLogError, match='Permission denied') as caught:
+            find_leftovers(Path(directory))
+        assert_one_line(caught.value)
+
+
+def test_a_directory_that_is_a_file(tmp_path):
+    path = tmp_path / 'file'
+    path.touch()
+    with pytest.raises(EpisodeLogError, match=r'cannot log episode .*file.*: (File exists|Not a)'):
+        EpisodeWriter(path, 'episode', {})
+
+
+def test_truncated_files_are_refused(finished, tmp_path):
+    whole = (finished / f'{finished.name}_0.mcap').read_bytes()
+    path = tmp_path / 'cut.mcap'
+    for size in [*range(0, 200, 7), *range(200, len(whole), 997), len(whole) - 1]:
+        path.write_bytes(whole[:size])
+        with pytest.raises(EpisodeReadError) as caught:
+            read_episode(path)
+        assert str(path) in str(caught.value)
+        assert_one_line(caught.value)
+
+
+def test_no_flipped_byte_goes_unnoticed(finished, tmp_path):
+    whole = (finished / f'{finished.name}_0.mcap').read_bytes()
+    path = tmp_path / 'damaged.mcap'
+    for position in range(0, len(whole), 397):
+        damaged = bytearray(whole)
+        damaged[position] ^= 0xFF
+        path.write_bytes(damaged)
+        with pytest.raises(EpisodeReadError) as caught:
+            read_episode(path)
+        assert_one_line(caught.value)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    foreign, text, empty = tmp_path / 'foreign.mcap', tmp_path / 'text.mcap', tmp_path / 'empty'
+    with foreign.open('wb') as stream:
+        writer = Writer(stream)
+        writer.start(profile='ros2')
+        writer.finish()
+    text.write_text('no bag at all')
+    empty.mkdir()
+    for path, reason in (
+        (foreign, "no metadata record 'episode'"),
+        (text, 'truncated, damaged or no MCAP file'),
+        (empty, 'holds 0 MCAP files'),
+        (tmp_path / 'missing', 'No such file'),
+    ):
+        with pytest.raises(EpisodeReadError, match=reason) as caught:
+            read_episode(path)
+        assert str(path) in str(caught.value)
+        assert_one_line(caught.value)
+
+
+def test_writing_costs_little_of_a_tick(tmp_path, recorder, ticks):
+    """A loose bound: a tick of 10 messages takes 0.1 ms of 40 ms on an idle machine."""
+    writer = EpisodeWriter(tmp_path, 'episode', {})
+    started = time.process_time()
+    recorder.write(writer, ticks)
+    per_tick = (time.process_time() - started) / len(ticks)
+    writer.finish({})
+    assert per_tick < 0.005

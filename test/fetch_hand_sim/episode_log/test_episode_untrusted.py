@@ -1,0 +1,63 @@
+"""Files that anybody may have made: a clear error or a partial read, at little cost."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from fetch_hand_sim.episode_log import (
+    EpisodeDirectory,
+    EpisodeReadError,
+    find_episodes,
+    load_episodes,
+    read_episode,
+    read_summary,
+)
+from support import SUPPORT, script_environment
+from support.episode_recorder import Recorder
+
+# `make torture` turns this up.
+FILES = int(os.environ.get('EPISODE_MUTATIONS', '360'))
+SCRIPT = SUPPORT / 'mutated_files.py'
+READERS = 6
+
+
+@pytest.fixture(scope='module')
+def episode(tmp_path_factory):
+    return Recorder('FetchReach').record(EpisodeDirectory(tmp_path_factory.mktemp('episode')))
+
+
+@pytest.mark.timeout(60 + FILES)
+def test_damaged_files_end_in_one_line_or_a_result(episode):
+    environment = script_environment()
+    run = subprocess.run(
+        [sys.executable, SCRIPT, episode / f'{episode.name}_0.mcap', str(FILES), '7'],
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    assert run.returncode == 0, run.stderr
+    report = json.loads(run.stdout)
+    print(report)
+    assert sum(report['outcomes'].values()) == READERS * FILES
+    assert report['outcomes']['read_episode error'] > 0.8 * FILES
+    assert report['slowest_s'] < 5.0
+
+
+def test_a_pipe_is_no_episode(tmp_path):
+    os.mkfifo(tmp_path / 'pipe.mcap')
+    for read in (read_episode, read_summary, load_episodes):
+        with pytest.raises(EpisodeReadError, match='no regular file'):
+            read(tmp_path / 'pipe.mcap')
+    assert find_episodes(tmp_path) == [tmp_path / 'pipe.mcap']
+
+
+def test_an_empty_file_is_no_episode(tmp_path):
+    (tmp_path / 'empty.mcap').touch()
+    for read in (read_episode, read_summary, load_episodes):
+        with pytest.raises(EpisodeReadError, match=r'empty\.mcap'):
+            read(tmp_path / 'empty.mcap')

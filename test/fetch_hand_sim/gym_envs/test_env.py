@@ -1,0 +1,197 @@
+"""The single Gymnasium environments, as users of Gymnasium and Stable-Baselines3 meet them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3 import DDPG, HerReplayBuffer
+
+from fetch_hand_sim.gym_envs.registration import environment_id
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.tasks import TASKS
+
+# Positions are unbounded, and Gymnasium wonders about it.
+pytestmark = pytest.mark.filterwarnings('ignore:.*Box observation space')
+
+
+def make(task: str, **arguments) -> gymnasium.Env:
+    return gymnasium.make(f'fetch_hand_sim:{environment_id(task)}', **arguments)
+
+
+def state_of(env: gymnasium.Env) -> bytes:
+    generator = env.unwrapped.np_random.bit_generator.state
+    return env.unwrapped.simulation._task.batch.state.tobytes() + repr(generator).encode()
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_gymnasiums_checker_is_content(task):
+    env = make(task)
+    assert env.spec.id == f'fetch_hand_sim/{task}-v0'
+    assert env.spec.max_episode_steps == TASKS[task].episode_ticks
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize('task', ['FetchSlide', 'HandManipulatePenRotate'])
+def test_an_episode_equals_the_simulation_and_is_truncated(task):
+    env, simulation = make(task, reward_type='dense'), Simulation(task, reward_type='dense')
+    observation, info = env.reset(seed=7)
+    expected = simulation.reset(seed=[7])
+    env.action_space.seed(0)
+    truncations = []
+    for _ in range(TASKS[task].episode_ticks):
+        for name, values in expected.items():
+            assert observation[name].tobytes() == values[0].tobytes()
+        action = env.action_space.sample()
+        observation, reward, terminated, truncated, info = env.step(action)
+        result = simulation.step(action[None])
+        expected = result.observation
+        assert (reward, info['is_success']) == (result.reward[0], result.success[0])
+        goals = observation['achieved_goal'], observation['desired_goal']
+        assert env.unwrapped.compute_reward(*goals, info) == reward
+        assert not terminated
+        truncations.append(truncated)
+    assert truncations == [False] * (TASKS[task].episode_ticks - 1) + [True]
+
+
+def test_arguments_reach_the_simulation():
+    env = make('HandReach', reward_type='dense', success_rule='paper', control_hz=50)
+    metric = env.unwrapped.simulation.metric
+    assert (metric.reward_type, metric.success_rule) == ('dense', 'paper')
+    assert env.unwrapped.simulation.tick_duration == pytest.approx(0.02)
+    assert env.metadata['render_fps'] == 50
+    assert gymnasium.spec(environment_id('HandReach')).kwargs == {'task': 'HandReach'}
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        ({'reward_type': 'shaped'}, "reward_type 'shaped'"),
+        ({'success_rule': 'mine'}, "success_rule 'mine'"),
+        ({'control_hz': 26}, 'control_hz 26'),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make('FetchReach', **arguments)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'error', 'message'),
+    [
+        ({'options': 3}, TypeError, 'a dictionary or None, not 3'),
+        ({'options': {'goal': [0, 0, 0]}}, ValueError, "option 'goal' is not known; allowed: none"),
+        ({'seed': -1}, gymnasium.error.Error, 'greater or equal to zero'),
+        ({'seed': 'one'}, gymnasium.error.Error, 'must be a python integer'),
+    ],
+)
+def test_bad_resets_move_nothing(arguments, error, message):
+    env = make('FetchPush').unwrapped
+    env.reset(seed=0)
+    before = state_of(env)
+    with pytest.raises(error, match=message):
+        env.reset(**arguments)
+    assert state_of(env) == before
+
+
+@pytest.mark.parametrize(
+    'action', [np.zeros(3), np.full(4, np.nan), np.full(4, 1.01), np.zeros((1, 4))]
+)
+def test_bad_actions_move_nothing(action):
+    env = make('FetchPush').unwrapped
+    env.reset(seed=0)
+    before = state_of(env)
+    with pytest.raises(ValueError, match='actions'):
+        env.step(action)
+    assert state_of(env) == before
+
+
+def test_a_diverged_episode_is_truncated():
+    env = make('FetchPush')
+    env.reset(seed=0)
+    env.unwrapped.simulation._task.batch.bind('qvel')[0, 0] = np.nan
+    observation, _, terminated, truncated, info = env.step(np.zeros(4))
+    assert (terminated, truncated, info['diverged']) == (False, True, True)
+    assert env.observation_space.contains(observation)
+
+
+def test_the_flat_view_is_the_concatenation():
+    env = gymnasium.wrappers.FlattenObservation(make('FetchPush'))
+    flat, _ = env.reset(seed=0)
+    parts, _ = make('FetchPush').reset(seed=0)
+    names = list(env.unwrapped.observation_space)
+    assert flat.shape == (31,)
+    assert flat.tobytes() == np.concatenate([parts[name] for name in names]).tobytes()
+
+
+def test_stable_baselines3_learns_with_hindsight():
+    torch.set_num_threads(1)
+    env = make('FetchReach')
+    model = DDPG(
+        'MultiInputPolicy',
+        env,
+        replay_buffer_class=HerReplayBuffer,
+        policy_kwargs={'net_arch': [16]},
+        learning_starts=100,
+        batch_size=32,
+        seed=0,
+        device='cpu',
+    )
+    model.learn(150)
+    batch = model.replay_buffer.sample(256)
+    goals = batch.observations['desired_goal'].numpy()
+    reached = np.linalg.norm(batch.next_observations['achieved_goal'].numpy() - goals, axis=1)
+    # Goals were swapped after the fact, and the rewards are those of the new goals.
+    assert len(np.unique(goals, axis=0)) > 3
+    clear = np.abs(reached - 0.05) > 1e-6
+    expected = -(reached > 0.05).astype(np.float32)
+    assert 0.0 in expected
+    assert np.array_equal(batch.rewards.numpy()[clear, 0], expected[clear])
+
+
+def test_importing_the_package_registers_without_mujoco():
+    code = (
+        'import sys, gymnasium, fetch_hand_sim\n'
+        'assert not {"mujoco", "torch", "rclpy"} & set(sys.modules)\n'
+        'print(*(i for i in gymnasium.registry if i.startswith("fetch_hand_sim/")))'
+    )
+    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert result.stdout.split() == [environment_id(task) for task in TASKS], result.stderr
+
+
+RENDER = (
+    'import gymnasium, numpy as np\n'
+    'env = gymnasium.make("fetch_hand_sim:fetch_hand_sim/{task}-v0", render_mode="rgb_array")\n'
+    'env.reset(seed=0)\n'
+    'try:\n'
+    '    picture = env.render()\n'
+    'except RuntimeError as error:\n'
+    '    print(str(error)[:80])\n'
+    'else:\n'
+    '    print(picture.shape, picture.dtype, picture.std() > 10)\n'
+    'env.close()\n'
+)
+
+
+@pytest.mark.parametrize('task', ['FetchReach', 'HandReach', 'HandManipulateEggFull'])
+def test_rendering_gives_a_picture_or_says_what_it_needs(task, monkeypatch):
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    code = RENDER.format(task=task)
+    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    picture = '(480, 640, 3) uint8 True'
+    reason = 'rendering needs OpenGL; without a display set MUJOCO_GL=egl or MUJOCO_GL=osmesa'
+    assert result.stdout.strip() in (picture, reason[:80].strip()), result.stderr
+
+
+def test_without_opengl_rendering_says_what_it_needs(monkeypatch):
+    monkeypatch.delenv('DISPLAY', raising=False)
+    monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
+    monkeypatch.setenv('MUJOCO_GL', 'disabled')
+    code = RENDER.format(task='FetchReach')
+    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert result.stdout.startswith('rendering needs OpenGL'), result.stderr

@@ -1,0 +1,297 @@
+"""Episodes on the graph again: `replay_node`, with `policy_node` and without."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from std_srvs.srv import SetBool
+
+from fetch_hand_sim.episode_log import read_episode
+from fetch_hand_sim.episode_log.ticks import split_ticks
+from fetch_hand_sim.replay_node.schedule import Playhead, ReplaySchedule
+from msgs_spec.codecs import decode, message_stamp
+from msgs_spec.ros import ros_message_class
+from msgs_spec.schemas import deserialize, from_ros, serialize
+from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.topics import topic, topics
+from policy_node.policies import checkpoint
+from policy_node.policies.actor import Actor
+from policy_node.training import generate_episodes
+from support.graph import POLICY_NODE, SIM_NODE, TIMEOUT, client, ros_args
+
+REPLAY_NODE = (*SIM_NODE[:2], 'fetch_hand_sim.replay_node')
+REACH = task_spec('FetchReach')
+# Real time: a slow machine may fall 0.4 s behind, ten messages, before one is lost.
+RATE = 1.0
+
+
+def finish(process, timeout=TIMEOUT):
+    output, errors = process.communicate(timeout=timeout)
+    return process.returncode, output + errors
+
+
+@pytest.fixture(scope='module')
+def episode(tmp_path_factory):
+    """A generated FetchReach episode."""
+    directory = tmp_path_factory.mktemp('episodes')
+    arguments = ['--policy', 'random', '--task', 'FetchReach', '--episodes', '1', '--threads', '1']
+    assert generate_episodes.main([*arguments, '--output', str(directory)]) == 0
+    return min(directory.iterdir())
+
+
+def collect(listener, name):
+    """Receives a topic without loss, whatever depth its contract has."""
+    spec = topic(listener.spec, name)
+    received = []
+    listener.node.create_subscription(
+        ros_message_class(spec.type_name), name, received.append, QoSProfile(depth=1000)
+    )
+    return received
+
+
+def record(start_process, directory, task, actor):
+    """One episode of real nodes in lockstep, so that every tick has its command."""
+    policy = start_process(*POLICY_NODE, *ros_args(checkpoint=actor))
+    arguments = ros_args(
+        task=task,
+        episodes=1,
+        seed=3,
+        mode='lockstep',
+        wait_for_commands=True,
+        log_compiled_model=False,
+        episode_dir=directory,
+    )
+    code, output = finish(start_process(*SIM_NODE, *arguments))
+    assert code == 0, output
+    policy.send_signal(signal.SIGTERM)
+    assert finish(policy)[0] == 0
+    return min(directory.iterdir())
+
+
+def untrained_actor(directory: Path, task: str) -> Path:
+    """A checkpoint with random weights: as good as any for the question whether bits agree."""
+    spec = TASKS[task]
+    info = checkpoint.ActorInfo(
+        task=task,
+        observation_layout=checkpoint.observation_layout(spec),
+        goal_size=spec.goal.size,
+        action_size=spec.robot.action_size,
+        hidden_sizes=(64, 64),
+        layer_norm=False,
+        control_hz=25.0,
+        seed=0,
+    )
+    torch.manual_seed(0)
+    path = directory / 'untrained.safetensors'
+    checkpoint.save(path, Actor(info.shape), info)
+    return path
+
+
+@pytest.mark.parametrize('task', ['FetchReach', 'HandManipulateBlockFull'])
+def test_actor_on_a_replay_repeats_the_recorded_commands(start_process, tmp_path, task):
+    """FetchReach with the shipped actor, a hand task with an untrained one."""
+    actor = 'FetchReach' if task == 'FetchReach' else untrained_actor(tmp_path, task)
+    path = record(start_process, tmp_path / 'episodes', task, actor)
+    spec = task_spec(task)
+    recorded = [m.data for m in read_episode(path).topics['/commands'].messages]
+    assert len(recorded) == spec.episode_ticks
+    with client(spec) as listener:
+        received = collect(listener, 'commands')
+        replay = start_process(
+            *REPLAY_NODE, *ros_args(path=path, rate=RATE, wait_for_commands=True)
+        )
+        start_process(*POLICY_NODE, *ros_args(checkpoint=actor))
+        # The policy also answers the last observation, after which the robot took no command.
+        listener.spin_until(lambda: len(received) > spec.episode_ticks, 'all commands')
+        assert finish(replay)[0] == 0
+    name = topic(spec, 'commands').type_name
+    again = [serialize(name, from_ros(message)) for message in received]
+    assert len(again) == spec.episode_ticks + 1
+    assert again[:-1] == recorded
+
+
+def test_generated_episodes_equal_those_of_the_nodes(start_process, tmp_path):
+    """Same seed, same policy: every message, time and key of the two files is equal."""
+    task = 'FetchPickAndPlace'
+    node = read_episode(record(start_process, tmp_path / 'node', task, 'resting'))
+    arguments = ['--policy', 'resting', '--task', task, '--episodes', '4', '--first-seed', '3']
+    assert generate_episodes.main([*arguments, '--output', str(tmp_path / 'batch')]) == 0
+    batch = read_episode(min((tmp_path / 'batch').iterdir()))
+    assert batch.topics == node.topics
+    assert batch.result == node.result
+    assert batch.attachments == node.attachments
+    # Somebody may commit between the two runs.
+    same = [key for key in node.metadata if key not in ('started', 'source_revision')]
+    assert list(batch.metadata) == list(node.metadata)
+    assert [batch.metadata[key] for key in same] == [node.metadata[key] for key in same]
+
+
+def test_every_message_comes_back_as_recorded_with_its_timing(start_process, episode):
+    logged = read_episode(episode)
+    with client(REACH) as listener:
+        listener.subscribe()
+        replay = start_process(*REPLAY_NODE, *ros_args(path=episode, start_paused=True))
+        listener.spin_until(lambda: bool(listener.received['episode_status']), 'latched status')
+        listener.spin_until(
+            lambda: all(
+                listener.node.count_publishers(s.name)
+                for s in topics(REACH)
+                if s.direction == 'published'
+            ),
+            'all topics',
+        )
+        assert listener.node.count_publishers('commands') == 0
+        assert listener.call(SetBool, 'replay_node/pause', data=False).message == 'running'
+        listener.spin_until(lambda: replay.poll() is not None, 'the end of the replay')
+        listener.spin(0.2)
+        for spec in topics(REACH):
+            if spec.direction == 'published':
+                expected = [m.data for m in logged.topics['/' + spec.name.lstrip('/')].messages]
+                got = [serialize(spec.type_name, from_ros(m)) for m in listener.received[spec.name]]
+                # Latched topics were announced before the start, `/clock` says how long it took.
+                extra = len(got) - len(expected)
+                assert extra == (1 if spec.qos.durability == 'transient_local' else 0), spec.name
+                assert got[extra:] == expected, spec.name
+        times = np.array(listener.received_at['joint_states'])
+    # Two seconds of episode; a busy machine may delay single messages.
+    assert times[-1] - times[0] == pytest.approx(2.0, abs=0.2)
+    assert np.median(np.diff(times)) == pytest.approx(0.04, abs=0.004)
+
+
+def test_late_subscribers_get_the_latched_topics_of_an_offset(start_process, episode):
+    start_process(*REPLAY_NODE, *ros_args(path=episode, start_offset=1.0, start_paused=True))
+    with client(REACH) as listener:
+        listener.subscribe('desired_goal', 'episode_status', 'joint_states')
+        listener.spin_until(lambda: bool(listener.received['desired_goal']), 'the latched goal')
+        listener.spin_until(lambda: bool(listener.received['episode_status']), 'the latched status')
+        assert message_stamp(listener.received['desired_goal'][0]) == 1_960_000_000
+        assert listener.statuses()[0].phase == 'reset'
+        listener.call(SetBool, 'replay_node/pause', data=False)
+        listener.spin_until(lambda: bool(listener.received['joint_states']), 'a tick')
+        assert message_stamp(listener.received['joint_states'][0]) == 2_000_000_000
+
+
+def test_rate_loop_and_pause(start_process, episode):
+    start_process(*REPLAY_NODE, *ros_args(path=episode, rate=2.0, loop=True))
+    with client(REACH) as listener:
+        listener.subscribe('joint_states', '/clock')
+        stamps = []
+
+        def has_looped():
+            stamps[:] = [message_stamp(m) for m in listener.received['joint_states']]
+            return any(later < earlier for earlier, later in itertools.pairwise(stamps))
+
+        listener.spin_until(has_looped, 'a second round')
+        times = np.array(listener.received_at['joint_states'][: len(stamps)])
+        assert np.median(np.diff(times)) == pytest.approx(0.02, abs=0.005)
+        assert 1_000_000_000 in stamps
+        assert listener.call(SetBool, 'replay_node/pause', data=True).message == 'paused'
+        listener.spin(0.2)
+        count, clocks = len(listener.received['joint_states']), len(listener.received['/clock'])
+        listener.spin(0.5)
+        assert len(listener.received['joint_states']) == count
+        assert len(listener.received['/clock']) > clocks, 'the clock stands and is still published'
+        rate = Parameter('rate', value=0.0).to_parameter_msg()
+        (result,) = listener.call(
+            SetParameters, 'replay_node/set_parameters', parameters=[rate]
+        ).results
+        assert not result.successful and '0.01' in result.reason
+
+
+def test_commands_are_published_only_when_asked_for(start_process, episode):
+    with client(REACH) as listener:
+        received = collect(listener, 'commands')
+        arguments = ros_args(path=episode, topics='commands, reward', rate=2.0, start_paused=True)
+        replay = start_process(*REPLAY_NODE, *arguments)
+        for name in ('commands', 'reward'):
+            listener.spin_until(lambda: bool(listener.node.count_publishers(name)), name)  # noqa: B023
+        assert listener.node.count_publishers('joint_states') == 0
+        listener.call(SetBool, 'replay_node/pause', data=False)
+        listener.spin_until(lambda: len(received) == 50, 'commands')
+        assert finish(replay)[0] == 0
+        commands = [decode(topic(REACH, 'commands'), message) for message in received]
+    logged = read_episode(episode).topics['/applied_command'].messages
+    applied = topic(REACH, 'applied_command')
+    expected = [decode(applied, deserialize(applied.type_name, m.data)) for m in logged]
+    np.testing.assert_array_equal(commands, expected)
+
+
+def test_interrupt_ends_a_replay_without_a_word(start_process, episode):
+    replay = start_process(*REPLAY_NODE, *ros_args(path=episode, loop=True))
+    with client(REACH) as listener:
+        listener.subscribe('joint_states')
+        listener.spin_until(lambda: bool(listener.received['joint_states']), 'a tick')
+        replay.send_signal(signal.SIGINT)
+        assert finish(replay) == (0, '')
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'line'),
+    [
+        ({}, 'path is missing; allowed: a bag directory or an MCAP file'),
+        ({'path': '/nowhere'}, '/nowhere: No such file or directory'),
+        ({'topics': 'wheels'}, "no topic 'wheels' in the episode; allowed: /clock, /joint_states"),
+        ({'start_offset': 9.0}, 'start_offset: 9.0 given; allowed: up to 2.000'),
+        ({'rate': 0.0}, '0.01 ... 100'),
+    ],
+)
+def test_bad_parameters_end_with_one_line_and_code_2(start_process, episode, parameters, line):
+    given = {'path': episode, **parameters} if parameters else {}
+    code, output = finish(start_process(*REPLAY_NODE, *ros_args(**given)))
+    assert code == 2
+    assert line in output
+    assert len(output.strip().splitlines()) == 1
+
+
+def test_schedule_holds_what_the_robot_published_in_order(episode):
+    schedule = ReplaySchedule(episode)
+    ticks = split_ticks(read_episode(episode))
+    expected = [m.data for tick in ticks for m in tick.published]
+    assert [message.data for message in schedule.messages] == expected
+    with_inputs = ReplaySchedule(episode, with_inputs=True)
+    assert len(with_inputs.messages) == len(expected) + 50
+    assert schedule.namespace == ''
+    index = schedule.index_at(2_000_000_000)
+    assert schedule.messages[index].name == '/clock'
+    assert schedule.messages[index].time_ns == 2_000_000_000
+
+
+def test_an_episode_with_unreadable_messages_is_refused(episode, tmp_path):
+    from fetch_hand_sim.episode_log import EpisodeReadError, EpisodeWriter
+
+    whole = read_episode(episode)
+    writer = EpisodeWriter(tmp_path, 'broken', whole.metadata)
+    for tick in split_ticks(whole)[:3]:
+        writer.write_tick(tick.stamp_ns, [(m.topic, m.data[:-3]) for m in tick.published])
+    path = writer.finish({})
+    with pytest.raises(EpisodeReadError, match=r'broken'):
+        ReplaySchedule(path)
+    shutil.rmtree(path)
+
+
+def test_playhead_follows_rate_and_pauses():
+    head = Playhead(1_000, 2.0, now=10.0, is_paused=True)
+    assert head.position_ns(99.0) == 1_000
+    assert head.remaining(10**9, 99.0) == float('inf')
+    head.resume(100.0)
+    assert head.position_ns(100.5) == 1_000 + 10**9
+    assert head.remaining(1_000 + 2 * 10**9, 100.5) == pytest.approx(0.5)
+    head.set_rate(0.5, 100.5)
+    assert head.position_ns(101.5) == 1_000 + 1_500_000_000
+    head.pause(101.5)
+    head.pause(110.0)
+    assert head.position_ns(200.0) == 1_000 + 1_500_000_000
+    head.resume(200.0)
+    head.resume(201.0)
+    assert head.position_ns(202.0) == 1_000 + 2_500_000_000
+    head.jump(7, 300.0)
+    assert head.position_ns(300.0) == 7

@@ -1,0 +1,146 @@
+"""Rewards and success rules, recomputed for goals of any shape."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.tasks import make_task
+from msgs_spec.rotations import quaternion_from_axis_angle, quaternion_multiply
+from msgs_spec.tasks import TASKS, GoalKind
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def random_goals(spec, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Goals (count, goal size), near enough for some to be reached."""
+    generator = np.random.default_rng(0)
+    achieved = generator.normal(size=(count, spec.goal.size))
+    scale = spec.distance_threshold * np.geomspace(0.05, 20.0, count)[:, None]
+    desired = achieved + scale * generator.normal(size=achieved.shape)
+    if spec.goal is GoalKind.POSE:
+        for goals in (achieved, desired):
+            goals[:, 3:] /= np.linalg.norm(goals[:, 3:], axis=1, keepdims=True)
+    return achieved, desired
+
+
+def metric(task: str, success_rule='gymnasium', reward_type='sparse'):
+    return make_task(task).goal_metric(success_rule, reward_type)
+
+
+def pose(position=(0.0, 0.0, 0.0), quaternion=IDENTITY) -> np.ndarray:
+    return np.concatenate([position, quaternion])
+
+
+@pytest.mark.parametrize('success_rule', ['gymnasium', 'paper'])
+@pytest.mark.parametrize('reward_type', ['sparse', 'dense'])
+@pytest.mark.parametrize('task', TASKS)
+def test_any_batch_equals_the_single_call_bit_for_bit(task, reward_type, success_rule):
+    measure = metric(task, success_rule, reward_type)
+    achieved, desired = random_goals(TASKS[task], 60)
+    single = np.array([measure.reward(*goals) for goals in zip(achieved, desired, strict=True)])
+    if reward_type == 'sparse':
+        assert set(single) == {-1.0, 0.0}, 'the goals must be a mixture of reached and not'
+    shapes = {
+        'batch': (achieved, desired),
+        'two axes': (achieved.reshape(3, 20, -1), desired.reshape(3, 20, -1)),
+        'column major': (np.asfortranarray(achieved), np.asfortranarray(desired)),
+        'mixed layout': (achieved, np.asfortranarray(desired)),
+        'strided': (np.repeat(achieved, 2, axis=0)[::2], np.repeat(desired, 2, axis=1)[:, ::2]),
+        'lists': (achieved.tolist(), desired.tolist()),
+    }
+    for name, goals in shapes.items():
+        assert measure.reward(*goals, [{}] * 60).tobytes() == single.tobytes(), name
+    reversed_rows = measure.reward(achieved[::-1], desired[::-1])
+    assert reversed_rows[::-1].tobytes() == single.tobytes()
+    assert measure.evaluate(achieved, desired)[0].tobytes() == single.tobytes()
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_float32_goals_count_as_the_float64_values_they_hold(task):
+    measure = metric(task, reward_type='dense')
+    narrow = [goals.astype(np.float32) for goals in random_goals(TASKS[task], 20)]
+    wide = [goals.astype(np.float64) for goals in narrow]
+    assert measure.reward(*narrow).tobytes() == measure.reward(*wide).tobytes()
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_an_empty_batch_has_no_rewards(task):
+    empty = np.zeros((0, TASKS[task].goal.size))
+    assert metric(task).reward(empty, empty).shape == (0,)
+
+
+def test_fetch_is_rewarded_within_five_centimetres():
+    measure = metric('FetchPush')
+    offsets = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.03], [0.0, 0.051, 0.0]])
+    assert measure.reward(offsets, np.zeros((3, 3))).tolist() == [0.0, 0.0, -1.0]
+    dense = metric('FetchPush', reward_type='dense').reward(offsets, np.zeros((3, 3)))
+    assert dense == pytest.approx(-np.linalg.norm(offsets, axis=1))
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_a_goal_that_is_not_a_number_is_never_reached(task):
+    goal = np.full(TASKS[task].goal.size, np.nan)
+    assert metric(task).reward(goal, goal) == -1.0
+    assert not metric(task).success(goal, goal)
+
+
+def test_fingertips_by_the_norm_of_all_or_by_their_mean_distance():
+    desired = np.zeros(15)
+    achieved = np.tile([0.008, 0.0, 0.0], 5)
+    # Norm over all coordinates 1.8 cm, mean distance 0.8 cm; the threshold is 1 cm.
+    assert not metric('HandReach').success(achieved, desired)
+    assert metric('HandReach', 'paper').success(achieved, desired)
+    dense = metric('HandReach', 'paper', 'dense').reward(achieved, desired)
+    assert dense == pytest.approx(-0.008)
+
+
+@pytest.mark.parametrize('task', ['HandManipulateBlockFull', 'HandManipulateEggRotate'])
+def test_opposite_quaternions_are_one_rotation_only_in_the_paper(task):
+    quaternion = quaternion_from_axis_angle([1.0, 2.0, 3.0], 0.7)
+    goals = pose(quaternion=quaternion), pose(quaternion=-quaternion)
+    assert not metric(task).success(*goals)
+    assert metric(task, reward_type='dense').reward(*goals) == pytest.approx(-2 * np.pi)
+    assert metric(task, 'paper').success(*goals)
+
+
+@pytest.mark.parametrize('angle', [0.09, 0.11])
+def test_rotations_count_within_a_tenth_of_a_radian(angle):
+    turned = pose(quaternion=quaternion_from_axis_angle([0.0, 1.0, 0.0], angle))
+    for rule in ('gymnasium', 'paper'):
+        assert metric('HandManipulateEggRotate', rule).success(turned, pose()) == (angle < 0.1)
+
+
+def test_rotate_tasks_ignore_the_position_and_full_tasks_do_not():
+    far = pose((0.5, 0.0, 0.0))
+    assert metric('HandManipulateBlockRotateXYZ').success(far, pose())
+    assert not metric('HandManipulateBlockFull').success(far, pose())
+    dense = metric('HandManipulateBlockFull', reward_type='dense').reward(far, pose())
+    assert dense == pytest.approx(-5.0)
+
+
+def test_the_pen_may_turn_about_its_axis_in_every_row_of_a_batch():
+    # The reference takes the angles of the first rows instead of the last axis (pull request 338).
+    tilt = quaternion_from_axis_angle([1.0, 0.0, 0.0], 0.4)
+    spun = quaternion_multiply(tilt, quaternion_from_axis_angle([0.0, 0.0, 1.0], 1.3))
+    achieved = np.stack([pose(quaternion=tilt), pose(quaternion=spun), pose()])
+    desired = np.stack([pose(quaternion=tilt)] * 3)
+    assert metric('HandManipulatePenRotate').success(achieved, desired).tolist()[0]
+    single = [metric('HandManipulatePenRotate').success(a, desired[0]) for a in achieved]
+    assert metric('HandManipulatePenRotate').success(achieved, desired).tolist() == single
+    assert not single[2]
+
+
+@pytest.mark.parametrize(
+    ('achieved', 'desired', 'message'),
+    [
+        (np.zeros(4), np.zeros(3), 'has 3 values on its last axis, not shape'),
+        (0.0, np.zeros(3), 'has 3 values'),
+        (np.zeros((2, 3)), np.zeros(3), r'\(2, 3\) and desired_goal \(3,\) differ in shape'),
+    ],
+)
+def test_goals_that_do_not_fit_are_refused(achieved, desired, message):
+    simulation = Simulation('FetchPush')
+    with pytest.raises(ValueError, match=message):
+        simulation.compute_reward(achieved, desired)

@@ -1,0 +1,87 @@
+"""The README's interface section is what the package says."""
+
+from __future__ import annotations
+
+import pytest
+
+from msgs_spec.interface_table import END, START, interface_markdown, main, replace_section
+from msgs_spec.parameters import POLICY_NODE, SIM_NODE
+from msgs_spec.robots import SHADOW_HAND
+from msgs_spec.services import SERVICES
+from msgs_spec.tasks import TASKS
+from msgs_spec.topics import topics
+from support import ROOT
+
+README = ROOT / 'README.md'
+
+
+@pytest.mark.skipif(not README.exists(), reason='installed without README.md')
+def test_readme_holds_the_generated_section():
+    text = README.read_text(encoding='utf-8')
+    assert replace_section(text) == text, (
+        'README.md is not up to date: python -m msgs_spec.interface_table --write README.md'
+    )
+
+
+def test_everything_has_its_row():
+    lines = interface_markdown().splitlines()
+    for task in TASKS.values():
+        for spec in topics(task):
+            type_name = spec.type_name.replace('/msg/', '/')
+            assert any(line.startswith(f'| `{spec.name}` | {type_name} |') for line in lines)
+    for node, specs in (('sim_node', SIM_NODE), ('policy_node', POLICY_NODE)):
+        for spec in specs:
+            assert any(
+                line.startswith(f'| {node} | `{spec.name}` | {spec.type} |') for line in lines
+            )
+    for spec in SERVICES:
+        assert any(line.startswith(f'| `{spec.name}` |') for line in lines)
+
+
+def test_hand_commands_are_listed_in_order_with_their_ranges():
+    (line,) = (
+        t for t in interface_markdown().splitlines() if t.startswith('- `commands`') and 'hand' in t
+    )
+    parts = [f'`{p.name[7:]}` {p.lower:g} ... {p.upper:g}' for p in SHADOW_HAND.command]
+    assert line.endswith(f'`robot0:` + {", ".join(parts)} (rad)')
+
+
+def test_tables_are_rectangular():
+    columns = None
+    for line in interface_markdown().splitlines():
+        if not line.startswith('|'):
+            columns = None
+            continue
+        columns = columns or line.count('|')
+        assert line.count('|') == columns, line
+
+
+def test_section_is_replaced_and_the_rest_kept(tmp_path):
+    path = tmp_path / 'README.md'
+    path.write_text(f'# Title\n{START}\nold\n{END}\nrest\n')
+    assert main(['--write', str(path)]) == 0
+    text = path.read_text()
+    assert text == f'# Title\n{START}\n\n{interface_markdown()}\n\n{END}\nrest\n'
+    assert main(['--write', str(path)]) == 0
+    assert path.read_text() == text
+
+
+@pytest.mark.parametrize('text', ['', START, END + START, START + END + END])
+def test_missing_markers_are_one_line_and_change_nothing(text, tmp_path, capsys):
+    path = tmp_path / 'README.md'
+    path.write_text(text)
+    assert main(['--write', str(path)]) == 1
+    assert path.read_text() == text
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1
+    assert f'{path}: allowed: a file with one {START}' in error
+
+
+def test_missing_file_is_one_line(tmp_path, capsys):
+    assert main(['--write', str(tmp_path / 'none.md')]) == 1
+    assert 'No such file' in capsys.readouterr().err
+
+
+def test_without_arguments_it_is_printed(capsys):
+    assert main([]) == 0
+    assert capsys.readouterr().out == interface_markdown() + '\n'

@@ -1,0 +1,148 @@
+"""Observations rebuilt from the bytes of topics against those of the simulation, bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from gymnasium_robotics.utils import rotations as reference
+
+from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.codecs import decode
+from msgs_spec.commands import command_from_action
+from msgs_spec.observations import ObservationAssembler, fetch_observation
+from msgs_spec.schemas import deserialize
+from msgs_spec.tasks import TASKS
+from msgs_spec.tick import TickEncoder
+from support.random_ticks import random_tick
+
+TICKS = 5
+
+
+def vectors_of(task, tick):
+    """What a subscriber that joins topics by stamp has."""
+    messages = TickEncoder(task).encode(tick)
+    return {spec.name: decode(spec, deserialize(spec.type_name, data)) for spec, data in messages}
+
+
+@pytest.mark.parametrize(
+    ('name', 'control_hz'), [*((name, 25.0) for name in TASKS), ('FetchPush', 125.0)]
+)
+def test_topics_give_the_observation_of_the_simulation(name, control_hz):
+    task = TASKS[name]
+    simulation = Simulation(name, control_hz=control_hz)
+    runner = EpisodeRunner(Simulation(name, control_hz=control_hz), first_seed=7)
+    assembler = ObservationAssembler(task, control_hz)
+    generator = np.random.default_rng(0)
+    expected = simulation.reset(seed=[7])
+    tick = runner.advance(runner.resting_command())
+    for _ in range(TICKS):
+        observation = assembler.assemble(vectors_of(task, tick))
+        assert observation.keys() == expected.keys()
+        for key, value in observation.items():
+            assert value.tobytes() == expected[key][0].tobytes(), key
+        action = generator.uniform(-1, 1, size=task.robot.action_size)
+        command = command_from_action(task.robot, action)
+        expected = simulation.step_commands(command[None]).observation
+        tick = runner.advance(command)
+
+
+@pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
+def test_sizes_are_those_of_the_specification(task):
+    observation = ObservationAssembler(task, 25.0).assemble(vectors_of(task, random_tick(task)))
+    assert observation['observation'].shape == (task.observation_size,)
+    assert observation['achieved_goal'].shape == (task.goal.size,)
+    assert observation['desired_goal'].shape == (task.goal.size,)
+
+
+def parts_of(task, observation):
+    """The named parts of an observation vector, as the task's layout has them."""
+    ends = np.cumsum([part.size for part in task.observation])
+    pieces = np.split(observation, ends[:-1])
+    return {part.name: piece for part, piece in zip(task.observation, pieces, strict=True)}
+
+
+@pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
+def test_layout_names_what_the_vector_holds(task):
+    tick = random_tick(task)
+    if task.has_object:
+        turn = tick.object_quaternion / np.linalg.norm(tick.object_quaternion)
+        tick = dataclasses.replace(tick, object_quaternion=turn)
+    observation = ObservationAssembler(task, 50.0).assemble(vectors_of(task, tick))['observation']
+    expected = {
+        'joint_position': tick.joint_position,
+        'joint_velocity': tick.joint_velocity,
+        'fingertip_positions': tick.fingertip_positions,
+        'object_pose': tick.object_qpos,
+        'object_velocity': tick.object_qvel,
+    }
+    if task.robot.has_gripper_command:
+        expected = {
+            'end_effector_position': tick.end_effector_position,
+            'end_effector_velocity': 0.02 * tick.end_effector_linear_velocity,
+            'gripper_state': tick.joint_position[-2:],
+            'gripper_velocity': 0.02 * tick.joint_velocity[-2:],
+        }
+    if task.robot.has_gripper_command and task.has_object:
+        expected |= {
+            'object_position': tick.object_position,
+            'object_relative_position': tick.object_position - tick.end_effector_position,
+            'object_rotation': reference.mat2euler(reference.quat2mat(turn)),
+            'object_relative_velocity': 0.02
+            * (tick.object_linear_velocity - tick.end_effector_linear_velocity),
+            'object_angular_velocity': 0.02 * tick.object_angular_velocity,
+        }
+    for name, piece in parts_of(task, observation).items():
+        np.testing.assert_allclose(piece, expected[name], atol=1e-14, err_msg=name)
+
+
+def test_velocities_scale_with_the_tick():
+    task = TASKS['FetchReach']
+    vectors = vectors_of(task, random_tick(task))
+    slow = ObservationAssembler(task, 25.0).assemble(vectors)['observation']
+    fast = ObservationAssembler(task, 100.0).assemble(vectors)['observation']
+    np.testing.assert_allclose(slow[:5], fast[:5], rtol=0)
+    np.testing.assert_allclose(slow[5:], 4 * fast[5:])
+
+
+def test_batches_equal_single_calls():
+    generator = np.random.default_rng(3)
+    quaternion = generator.normal(size=(6, 4))
+    parts = [generator.normal(size=(6, size)) for size in (3, 3, 15, 15, 3, 3, 3)]
+    *robot, position, linear, angular = parts
+    batch = fetch_observation(*robot, 0.04, position, quaternion, linear, angular)
+    singles = [
+        fetch_observation(
+            *(p[i] for p in robot), 0.04, position[i], quaternion[i], linear[i], angular[i]
+        )
+        for i in range(6)
+    ]
+    assert batch.tobytes() == np.stack(singles).tobytes()
+
+
+def test_object_needs_all_its_values():
+    with pytest.raises(ValueError, match='object_position given without object_quaternion'):
+        fetch_observation([0] * 3, [0] * 3, [0] * 15, [0] * 15, 0.04, object_position=[0] * 3)
+
+
+@pytest.mark.parametrize('name', ['FetchPush', 'HandReach', 'HandManipulatePenRotate'])
+def test_needed_topics_are_needed(name):
+    task = TASKS[name]
+    assembler = ObservationAssembler(task, 25.0)
+    vectors = vectors_of(task, random_tick(task))
+    needed = [spec.name for spec in assembler.topics]
+    assembler.assemble({name: vectors[name] for name in needed})
+    for missing in needed:
+        with pytest.raises(ValueError, match=f'no {missing} for an observation of {name}'):
+            assembler.assemble({key: vectors[key] for key in needed if key != missing})
+        broken = vectors[missing].copy()
+        broken[-1] = np.nan
+        with pytest.raises(ValueError, match=f'{missing}: not every value is finite'):
+            assembler.assemble(vectors | {missing: broken})
+
+
+def test_rate_must_be_possible():
+    with pytest.raises(ValueError, match='control_hz 30 is not a whole number'):
+        ObservationAssembler(TASKS['FetchReach'], 30.0)

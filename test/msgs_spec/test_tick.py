@@ -1,0 +1,161 @@
+"""What a tick says on which topic, in which order."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from msgs_spec.codecs import decode, decode_status, message_stamp
+from msgs_spec.schemas import deserialize
+from msgs_spec.tasks import TASKS, GoalKind
+from msgs_spec.tick import EpisodeStatus, TickEncoder
+from msgs_spec.topics import topic, topics
+from support.random_ticks import STAMP, episode_status, random_tick
+
+every_task = pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
+
+FETCH_TOPICS = ['/clock', 'joint_states', 'end_effector_pose', 'end_effector_twist']
+HAND_TOPICS = ['/clock', 'joint_states', 'fingertip_poses']
+OBJECT_TOPICS = ['object_pose', 'object_twist']
+RESULT_TOPICS = ['desired_goal', 'achieved_goal', 'reward', 'is_success', 'applied_command']
+
+
+def expected_order(task):
+    if task.robot.name == 'fetch':
+        return [*FETCH_TOPICS, *(OBJECT_TOPICS if task.has_object else []), *RESULT_TOPICS]
+    if task.goal is GoalKind.FINGERTIPS:
+        return [*HAND_TOPICS, *RESULT_TOPICS]
+    return [*HAND_TOPICS, *OBJECT_TOPICS, 'object_joint', *RESULT_TOPICS]
+
+
+def decoded(messages):
+    return {
+        spec.name: decode(spec, deserialize(spec.type_name, data))
+        for spec, data in messages
+        if spec.name != 'episode_status'
+    }
+
+
+@every_task
+def test_order_of_a_tick(task):
+    encoder = TickEncoder(task)
+    names = [spec.name for spec, _ in encoder.encode(random_tick(task))]
+    assert names == expected_order(task)
+    names = [spec.name for spec, _ in encoder.encode(random_tick(task), latched=True)]
+    assert names == [*expected_order(task), 'episode_status']
+    assert [spec.name for spec in topics(task) if spec.direction == 'published'] == names
+
+
+@every_task
+def test_every_number_is_on_its_topic(task):
+    tick = random_tick(task)
+    vectors = decoded(TickEncoder(task).encode(tick))
+    expected = {
+        '/clock': [],
+        'joint_states': [tick.joint_position, tick.joint_velocity, tick.joint_effort],
+        'end_effector_pose': [tick.end_effector_position, tick.end_effector_quaternion],
+        'end_effector_twist': [
+            tick.end_effector_linear_velocity,
+            tick.end_effector_angular_velocity,
+        ],
+        'fingertip_poses': [tick.fingertip_positions],
+        'object_pose': [tick.object_position, tick.object_quaternion],
+        'object_twist': [tick.object_linear_velocity, tick.object_angular_velocity],
+        'object_joint': [tick.object_qpos, tick.object_qvel],
+        'desired_goal': [tick.desired_goal],
+        'achieved_goal': [tick.achieved_goal],
+        'reward': [[tick.reward]],
+        'is_success': [[1.0]],
+        'applied_command': [tick.applied_command],
+    }
+    for name, vector in vectors.items():
+        np.testing.assert_array_equal(vector, np.concatenate([[], *expected[name]]), name)
+
+
+@every_task
+def test_one_stamp_and_frames(task):
+    for spec, data in TickEncoder(task).encode(random_tick(task), latched=True):
+        message = deserialize(spec.type_name, data)
+        if hasattr(message, 'header') or hasattr(message, 'clock'):
+            assert message_stamp(message) == STAMP
+        if hasattr(message, 'header'):
+            has_no_frame = spec.name in ('joint_states', 'episode_status')
+            assert message.header.frame_id == ('' if has_no_frame else 'world')
+
+
+@every_task
+def test_names_are_relative_but_for_the_clock(task):
+    names = [spec.name for spec in topics(task)]
+    assert len(set(names)) == len(names)
+    assert [name for name in names if name.startswith(('/', '~'))] == ['/clock']
+
+
+def test_reset_has_neither_reward_nor_command():
+    task = TASKS['HandManipulateEggRotate']
+    tick = dataclasses.replace(random_tick(task), reward=None, applied_command=None)
+    names = {spec.name for spec, _ in TickEncoder(task).encode(tick)}
+    assert set(expected_order(task)) - names == {'reward', 'applied_command'}
+
+
+def test_ticks_do_not_leak_into_each_other():
+    task = TASKS['FetchSlide']
+    encoder = TickEncoder(task)
+    first = encoder.encode(random_tick(task, seed=1), latched=True)
+    encoder.encode(random_tick(task, seed=2), latched=True)
+    assert encoder.encode(random_tick(task, seed=1), latched=True) == first
+
+
+@pytest.mark.parametrize(
+    ('field', 'value', 'message'),
+    [
+        ('fingertip_positions', None, r'fingertip_poses: shape \(0,\) given; allowed: \(15,\)'),
+        ('object_qvel', None, r'object_joint: shape \(7,\) given; allowed: \(13,\)'),
+        ('joint_effort', np.zeros(3), r'joint_states: shape \(51,\) given; allowed: \(72,\)'),
+        ('desired_goal', np.zeros(3), r'desired_goal: shape \(3,\) given; allowed: \(7,\)'),
+    ],
+)
+def test_tick_that_does_not_fit_the_task_is_refused(field, value, message):
+    task = TASKS['HandManipulateBlockFull']
+    tick = dataclasses.replace(random_tick(task), **{field: value})
+    with pytest.raises(ValueError, match=message):
+        TickEncoder(task).encode(tick)
+
+
+def test_status_and_clock_alone():
+    task = TASKS['FetchReach']
+    encoder = TickEncoder(task)
+    tick = random_tick(task)
+    messages = encoder.encode(tick, latched=True)
+    assert encoder.encode_clock(tick.stamp_ns) == messages[0]
+    assert encoder.encode_status(tick.stamp_ns, tick.status) == messages[-1]
+
+
+def test_status_survives_exactly():
+    task = TASKS['HandReach']
+    tick = random_tick(task)
+    spec, data = TickEncoder(task).encode(tick, latched=True)[-1]
+    values = decode_status(deserialize(spec.type_name, data))
+    assert EpisodeStatus.from_values(values | {'later': 'addition'}) == tick.status
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'seed': None}, 'episode_status without seed'),
+        ({'seed': 'seven'}, "episode_status with unreadable value: .*'seven'"),
+        ({'phase': 'dancing'}, "episode_status with unreadable value: 'dancing'"),
+        ({'is_success': 'yes'}, "episode_status with unreadable value: 'yes'"),
+    ],
+)
+def test_unreadable_status_is_refused(change, message):
+    values = episode_status(TASKS['HandReach']).to_values() | change
+    values = {key: value for key, value in values.items() if value is not None}
+    with pytest.raises(ValueError, match=message):
+        EpisodeStatus.from_values(values)
+
+
+def test_unknown_topic_is_named():
+    with pytest.raises(ValueError, match="FetchReach has no topic 'tf'; allowed: /clock, joint"):
+        topic(TASKS['FetchReach'], 'tf')

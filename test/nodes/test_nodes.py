@@ -1,0 +1,373 @@
+"""Real nodes in separate processes on a real ROS graph."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+
+from fetch_hand_sim.episode_log import Episode, find_leftovers, read_episode
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.codecs import build_message, decode, message_stamp
+from msgs_spec.commands import command_from_action
+from msgs_spec.observations import ObservationAssembler
+from msgs_spec.qos import rclpy_profile
+from msgs_spec.schemas import deserialize
+from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.topics import topic, topics
+from support.graph import POLICY_NODE, SIM_NODE, TIMEOUT, client, ros_args
+
+Start = Callable[..., subprocess.Popen[str]]
+REACH = task_spec('FetchReach')
+
+
+def finish(process: subprocess.Popen[str], timeout: float = TIMEOUT) -> tuple[int, str]:
+    """Waits for a process; returns its exit code and all it printed."""
+    output, errors = process.communicate(timeout=timeout)
+    return process.returncode, output + errors
+
+
+def episodes_in(directory: Path) -> list[Episode]:
+    return [read_episode(path) for path in sorted(directory.iterdir()) if path.name[0] != '.']
+
+
+def payload(episode: Episode) -> dict[str, list[tuple[int, int, bytes]]]:
+    """Everything the messages of an episode consist of."""
+    return {
+        name: [(m.log_time_ns, m.sequence, m.data) for m in logged.messages]
+        for name, logged in episode.topics.items()
+    }
+
+
+def send(robot: Any, *values: float) -> None:
+    robot.publish('commands', Float64MultiArray(data=[float(value) for value in values]))
+
+
+def test_actor_in_another_process_reaches_its_goals(start_process: Start, tmp_path: Path) -> None:
+    policy = start_process(*POLICY_NODE)
+    sim = start_process(
+        *SIM_NODE,
+        *ros_args(episodes=2, real_time_factor=4.0, wait_for_commands=True, episode_dir=tmp_path),
+    )
+    code, output = finish(sim)
+    assert code == 0, output
+    policy.send_signal(signal.SIGTERM)
+    assert finish(policy)[0] == 0
+    logged = episodes_in(tmp_path)
+    assert [episode.result['success'] for episode in logged] == ['true', 'true']
+    assert all(len(episode.topics['/commands'].messages) > 25 for episode in logged)
+    assert all(len(e.metadata['checkpoint_sha256']) == 64 for e in logged)
+
+
+def test_rate_seen_by_an_independent_subscriber(start_process: Start) -> None:
+    start_process(*SIM_NODE)
+    with client(REACH) as robot:
+        robot.subscribe('joint_states')
+        robot.spin_until(lambda: len(robot.received['joint_states']) > 2, 'joint_states')
+        robot.spin(6.0)
+        stamps = [message_stamp(message) for message in robot.received['joint_states']]
+        times = np.array(robot.received_at['joint_states'])
+    assert set(np.diff(stamps)) == {40_000_000}
+    # The figure for an idle machine is measured by `make bench-rate`; this one may be busy.
+    assert (len(times) - 1) / (times[-1] - times[0]) == pytest.approx(25.0, abs=0.2)
+
+
+def test_every_topic_has_the_promised_type_and_quality(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(task='HandManipulateBlockFull'))
+    spec = task_spec('HandManipulateBlockFull')
+    with client(spec) as robot:
+        for promised in topics(spec):
+            look = (
+                robot.node.get_publishers_info_by_topic
+                if promised.direction == 'published'
+                else robot.node.get_subscriptions_info_by_topic
+            )
+            robot.spin_until(lambda: bool(look(promised.name)), promised.name)  # noqa: B023
+            (info,) = look(promised.name)
+            offered, wanted = info.qos_profile, rclpy_profile(promised.qos)
+            assert info.topic_type == promised.type_name
+            assert (offered.reliability, offered.durability) == (
+                wanted.reliability,
+                wanted.durability,
+            )
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_every_task_runs_and_logs_its_topics(
+    start_process: Start, tmp_path: Path, task: str
+) -> None:
+    arguments = ros_args(task=task, episodes=1, real_time_factor=0.0, episode_dir=tmp_path)
+    code, output = finish(start_process(*SIM_NODE, *arguments))
+    assert code == 0, output
+    (episode,) = episodes_in(tmp_path)
+    spec = task_spec(task)
+    published = [s for s in topics(spec) if s.direction == 'published']
+    assert {'/' + s.name.lstrip('/') for s in published} == set(episode.topics)
+    for source in published:
+        messages = episode.topics['/' + source.name.lstrip('/')].messages
+        if source.name != 'episode_status':
+            values = [decode(source, deserialize(source.type_name, m.data)) for m in messages]
+            assert np.isfinite(values).all()
+            after_reset_only = source.name in ('reward', 'applied_command')
+            assert len(values) == spec.episode_ticks + (0 if after_reset_only else 1)
+
+
+@pytest.mark.parametrize('task', ['FetchPickAndPlace', 'HandReach', 'HandManipulateEggFull'])
+def test_topics_rebuild_the_observation_bit_for_bit(
+    start_process: Start, tmp_path: Path, task: str
+) -> None:
+    """Lockstep with scripted commands equals the Python simulation, observation by observation."""
+    spec = task_spec(task)
+    generator = np.random.default_rng(5)
+    ticks = 12
+    actions = generator.uniform(-1.0, 1.0, (ticks, spec.robot.action_size))
+    simulation = Simulation(task)
+    expected = [simulation.reset(seed=3)]
+    expected += [simulation.step(action[None]).observation for action in actions]
+    start_process(*SIM_NODE, *ros_args(task=task, seed=3, mode='lockstep', wait_for_commands=True))
+    assembler = ObservationAssembler(spec, 25.0)
+    with client(spec) as robot:
+        robot.subscribe()
+        robot.connect('commands')
+        for tick in range(ticks + 1):
+            names = [source.name for source in assembler.topics]
+            robot.spin_until(
+                lambda: all(len(robot.received[n]) > tick for n in names),  # noqa: B023
+                f'tick {tick}',
+            )
+            messages = {
+                source.name: robot.received[source.name][tick] for source in assembler.topics
+            }
+            assert len({message_stamp(message) for message in messages.values()}) == 1
+            vectors = {s.name: decode(s, messages[s.name]) for s in assembler.topics}
+            for key, values in assembler.assemble(vectors).items():
+                assert values.tobytes() == expected[tick][key][0].tobytes(), (tick, key)
+            if tick < ticks:
+                send(robot, *command_from_action(spec.robot, actions[tick]))
+
+
+def test_equal_seeds_give_equal_bytes(start_process: Start, tmp_path: Path) -> None:
+    runs = []
+    for name in ('first', 'second'):
+        policy = start_process(*POLICY_NODE)
+        arguments = ros_args(
+            episodes=2,
+            seed=7,
+            mode='lockstep',
+            wait_for_commands=True,
+            episode_dir=tmp_path / name,
+        )
+        code, output = finish(start_process(*SIM_NODE, *arguments))
+        assert code == 0, output
+        policy.send_signal(signal.SIGINT)
+        assert finish(policy)[0] == 0
+        runs.append([payload(episode) for episode in episodes_in(tmp_path / name)])
+    assert len(runs[0]) == 2
+    assert runs[0] == runs[1]
+    assert runs[0][0] != runs[0][1]
+
+
+def test_bad_commands_are_dropped_and_good_ones_clipped(
+    start_process: Start, tmp_path: Path
+) -> None:
+    sim = start_process(
+        *SIM_NODE, *ros_args(mode='lockstep', wait_for_commands=True, episode_dir=tmp_path)
+    )
+    with client(REACH) as robot:
+        robot.subscribe('applied_command', 'joint_states')
+        robot.connect('commands')
+        robot.spin_until(lambda: bool(robot.received['joint_states']), 'the reset')
+        for bad in ([0.0] * 3, [0.0] * 5, [], [float('nan'), 0, 0, 0], [0, float('inf'), 0, 0]):
+            send(robot, *bad)
+            robot.spin(0.1)
+        assert robot.received['applied_command'] == []
+        send(robot, 0.25, -7.0, 1e300, 0.5)
+        robot.spin_until(lambda: bool(robot.received['applied_command']), 'a tick')
+        assert list(robot.received['applied_command'][0].data) == [0.25, -1.0, 1.0, 0.5]
+    sim.send_signal(signal.SIGINT)
+    code, output = finish(sim)
+    assert code == 0, output
+    assert 'command of 3 values dropped; allowed: 4' in output
+    assert 'Traceback' not in output
+    (episode,) = episodes_in(tmp_path)
+    assert len(episode.topics['/commands'].messages) == 6
+
+
+def test_robot_rests_before_the_first_command_and_holds_after_the_last(
+    start_process: Start,
+) -> None:
+    start_process(*SIM_NODE, *ros_args(command_timeout=0.2))
+    with client(REACH) as robot:
+        robot.subscribe('applied_command')
+        robot.connect('commands')
+        robot.spin_until(lambda: len(robot.received['applied_command']) > 3, 'ticks')
+        assert list(robot.received['applied_command'][-1].data) == [0.0] * 4
+        send(robot, 0.5, 0.0, 0.0, 1.0)
+        seen = robot.received['applied_command']
+        robot.spin_until(lambda: list(seen[-1].data) == [0.5, 0.0, 0.0, 1.0], 'the command')
+        began = len(seen)
+        robot.spin_until(lambda: list(seen[-1].data) == [0.0, 0.0, 0.0, 1.0], 'the hold', 2.0)
+        assert 3 <= len(seen) - began <= 8
+
+
+def test_clock_never_goes_back_over_resets(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(real_time_factor=8.0))
+    with client(REACH) as robot:
+        robot.subscribe('/clock', 'episode_status')
+        robot.spin_until(lambda: len(robot.received['/clock']) > 200, 'ticks')
+        stamps = np.diff([message_stamp(message) for message in robot.received['/clock']])
+        assert len({status.seed for status in robot.statuses()}) > 1
+    assert (stamps > 0).all()
+    assert set(stamps % 40_000_000) == {0}
+
+
+def test_late_joiner_gets_goal_and_status(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(mode='lockstep'))
+    with client(REACH, 'early') as robot:
+        robot.subscribe('desired_goal')
+        robot.spin_until(lambda: bool(robot.received['desired_goal']), 'a goal')
+    with client(REACH, 'late') as robot:
+        robot.subscribe('desired_goal', 'episode_status', 'achieved_goal')
+        robot.spin_until(lambda: bool(robot.received['desired_goal']), 'the latched goal')
+        robot.spin_until(lambda: bool(robot.received['episode_status']), 'the latched status')
+        assert robot.statuses()[-1].task == 'FetchReach'
+        assert robot.received['achieved_goal'] == []
+
+
+def test_goal_set_by_a_person(start_process: Start) -> None:
+    start_process(*SIM_NODE)
+    wanted = [1.3, 0.7, 0.6]
+    with client(REACH) as robot:
+        robot.subscribe('desired_goal', 'achieved_goal', 'reward')
+        robot.connect('set_goal')
+        robot.spin_until(lambda: len(robot.received['desired_goal']) > 3, 'ticks')
+        message = robot.publisher('set_goal').msg_type()
+        message.point.x, message.point.y, message.point.z = wanted
+        robot.publish('set_goal', message)
+        goal = topic(REACH, 'desired_goal')
+        robot.spin_until(
+            lambda: decode(goal, robot.received['desired_goal'][-1]).tolist() == wanted,
+            'the new goal',
+        )
+
+
+def test_named_joint_commands_move_only_what_they_name(start_process: Start) -> None:
+    spec = task_spec('HandReach')
+    start_process(*SIM_NODE, *ros_args(task='HandReach', mode='lockstep', wait_for_commands=True))
+    with client(spec) as robot:
+        robot.subscribe('applied_command', 'joint_states')
+        robot.connect('joint_commands')
+        robot.spin_until(lambda: bool(robot.received['joint_states']), 'the reset')
+        message = robot.publisher('joint_commands').msg_type()
+        message.name = ['robot0:THJ0', 'robot0:WRJ1']
+        message.position = [-0.5, 0.1]
+        robot.publish('joint_commands', message)
+        robot.spin_until(lambda: bool(robot.received['applied_command']), 'a tick')
+        applied = decode(topic(spec, 'applied_command'), robot.received['applied_command'][0])
+    assert applied[[0, -1]].tolist() == [0.1, -0.5]
+    assert not applied[1:-1].any()
+
+
+def test_pause_step_and_reset(start_process: Start) -> None:
+    start_process(*SIM_NODE)
+    with client(REACH) as robot:
+        robot.subscribe('joint_states', 'episode_status')
+        robot.spin_until(lambda: len(robot.received['joint_states']) > 2, 'ticks')
+        assert not robot.call(Trigger, 'sim_node/step').success
+        assert robot.call(SetBool, 'sim_node/pause', data=True).success
+        robot.spin(0.2)
+        count = len(robot.received['joint_states'])
+        robot.spin(0.3)
+        assert len(robot.received['joint_states']) == count
+        assert robot.call(Trigger, 'sim_node/step').success
+        robot.spin(0.4)
+        assert len(robot.received['joint_states']) == count + 1
+        episode = robot.statuses()[-1].episode
+        assert robot.call(Trigger, 'sim_node/reset').success
+        assert robot.call(SetBool, 'sim_node/pause', data=False).success
+        robot.spin_until(lambda: robot.statuses()[-1].episode > episode, 'the next episode')
+        assert robot.statuses()[-1].tick == 0
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signals_close_the_running_episode(
+    start_process: Start, tmp_path: Path, number: signal.Signals
+) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path))
+    with client(REACH) as robot:
+        robot.subscribe('reward')
+        robot.spin_until(lambda: len(robot.received['reward']) > 5, 'ticks')
+        sim.send_signal(number)
+        code, output = finish(sim)
+    assert code == 0, output
+    assert 'Traceback' not in output
+    # The client may have found the robot only in its second episode.
+    *complete, episode = episodes_in(tmp_path)
+    assert all(each.is_complete for each in complete)
+    assert not episode.is_complete
+    assert episode.result['reason'] == number.name
+
+
+def test_killed_simulation_leaves_finished_episodes_and_a_marked_rest(
+    start_process: Start, tmp_path: Path
+) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path, real_time_factor=4.0))
+    deadline = time.monotonic() + TIMEOUT
+    while len(list(tmp_path.glob('FetchReach_*'))) < 2 or not list(tmp_path.glob('.*.active')):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    sim.kill()
+    sim.wait()
+    assert all(episode.is_complete for episode in episodes_in(tmp_path))
+    (leftover,) = find_leftovers(tmp_path)
+    again = start_process(
+        *SIM_NODE, *ros_args(episode_dir=tmp_path, episodes=1, real_time_factor=0.0)
+    )
+    code, output = finish(again)
+    assert code == 0
+    assert leftover.name in output
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'line'),
+    [
+        ({'task': 'FetchFly'}, "'FetchFly' given; allowed: 'FetchReach', 'FetchPush'"),
+        ({'control_hz': 30.0}, 'nearest: 29.4117647 and 31.25'),
+        ({'seed': -1}, '0 ... 4294967295'),
+        ({'seed': 'seven'}, '0 ... 4294967295'),
+        ({'mode': 'warp'}, "'realtime', 'lockstep'"),
+        ({'real_time_factor': -1.0}, '0 ... 1000'),
+    ],
+)
+def test_bad_parameters_end_with_one_line_and_code_2(
+    start_process: Start, parameters: dict[str, object], line: str
+) -> None:
+    code, output = finish(start_process(*SIM_NODE, *ros_args(**parameters)))
+    assert code == 2
+    assert line in output
+    assert len(output.strip().splitlines()) == 1
+
+
+def test_policy_refuses_an_actor_of_another_task(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(task='HandReach', mode='lockstep'))
+    policy = start_process(*POLICY_NODE, *ros_args(checkpoint='FetchReach'))
+    code, output = finish(policy)
+    assert code == 1
+    assert re.search(r'FetchReach\.safetensors was trained on FetchReach, not on HandReach', output)
+
+
+def test_set_goal_round_trip_of_message_types() -> None:
+    """The message a person sends for each kind of goal decodes to the vector they meant."""
+    for spec in (REACH, task_spec('HandReach'), task_spec('HandManipulatePenFull')):
+        target = topic(spec, 'set_goal')
+        vector = np.arange(1.0, spec.goal.size + 1.0)
+        assert decode(target, build_message(target, 0, vector)).tolist() == vector.tolist()

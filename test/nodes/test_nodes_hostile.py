@@ -1,0 +1,285 @@
+"""What a graph does to nodes: floods, stops, bad parameters, several robots, Ctrl-C at any time."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from std_msgs.msg import Float64MultiArray
+from test_nodes import episodes_in, finish
+
+from msgs_spec.cdr import TopicEncoder
+from msgs_spec.codecs import decode_status
+from msgs_spec.qos import QosSpec, rclpy_profile
+from msgs_spec.tasks import task_spec
+from msgs_spec.topics import topic
+from support.graph import POLICY_NODE, SIM_NODE, TIMEOUT, client, ros_args
+
+Start = Callable[..., subprocess.Popen[str]]
+REACH = task_spec('FetchReach')
+
+
+def resident_kilobytes(process: subprocess.Popen[str]) -> int:
+    status = Path(f'/proc/{process.pid}/status').read_text()
+    return int(re.search(r'VmRSS:\s+(\d+) kB', status)[1])
+
+
+def end(process: subprocess.Popen[str]) -> str:
+    """Ends a node as Ctrl-C does; returns what it printed."""
+    process.send_signal(signal.SIGINT)
+    code, output = finish(process)
+    assert code == 0, output
+    assert 'Traceback' not in output
+    return output
+
+
+def reports(robot, node: str = '/sim_node') -> list[dict[str, str]]:
+    found = robot.received['/diagnostics']
+    return [decode_status(message) for message in found if message.status[0].name == node]
+
+
+def test_flood_of_commands_neither_delays_nor_grows_the_robot(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE)
+    source = topic(REACH, 'commands')
+    good = TopicEncoder(source).encode(0, np.full(4, 0.1))
+    bad = TopicEncoder(source).encode(0, np.full(4, np.nan))
+    with client(REACH) as robot:
+        robot.subscribe('joint_states', '/diagnostics')
+        robot.connect('commands')
+        robot.spin_until(lambda: len(robot.received['joint_states']) > 5, 'ticks')
+        robot.publish('commands', Float64MultiArray(data=np.zeros(1_000_000)))
+        robot.spin(0.5)
+        before, sent = resident_kilobytes(sim), 0
+        began = time.monotonic()
+        while (elapsed := time.monotonic() - began) < 3.0:
+            while sent < 20_000 * elapsed:
+                robot.publish('commands', (good, bad)[sent % 2])
+                sent += 1
+            robot.spin(0.0005)
+        assert sent > 20_000
+        grown = resident_kilobytes(sim) - before
+        robot.spin_until(lambda: len(reports(robot)) > 2, 'reports')
+        robot.spin(1.2)
+        report = reports(robot)[-1]
+        ticks = np.array(robot.received_at['joint_states'])
+        rate = ((ticks > began) & (ticks < began + 3.0)).sum() / 3.0
+    assert int(report['rejected: wrong size']) == 1
+    # On a busy machine most push each other out before they are read.
+    assert int(report['rejected: not finite']) > 100
+    assert int(report['commands accepted']) > 100
+    assert rate == pytest.approx(25.0, abs=3.0)
+    assert grown < 20_000
+    end(sim)
+
+
+def random_value(generator: np.random.Generator) -> ParameterValue:
+    number = float(generator.choice([np.nan, np.inf, -np.inf, 5e-324, 1e308, -1.0, 0.0, 2.0]))
+    return [
+        ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=number),
+        ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=-(2**63)),
+        ParameterValue(type=ParameterType.PARAMETER_STRING, string_value='x' * 100_000),
+        ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True),
+        ParameterValue(
+            type=ParameterType.PARAMETER_DOUBLE_ARRAY, double_array_value=[number] * 1000
+        ),
+        ParameterValue(),
+    ][generator.integers(6)]
+
+
+def test_random_parameters_are_answered_and_only_allowed_ones_applied(
+    start_process: Start,
+) -> None:
+    sim = start_process(*SIM_NODE)
+    generator = np.random.default_rng(4)
+    names = ['real_time_factor', 'command_timeout', 'task', 'seed', 'no_such', '', 'mode']
+    with client(REACH) as robot:
+        robot.subscribe('joint_states')
+        for _ in range(100):
+            name = str(generator.choice(names))
+            parameter = Parameter(name=name, value=random_value(generator))
+            answer = robot.call(SetParameters, 'sim_node/set_parameters', parameters=[parameter])
+            (result,) = answer.results
+            value = parameter.value
+            settable = value.type == ParameterType.PARAMETER_DOUBLE and (
+                (name == 'real_time_factor' and value.double_value in (0.0, 2.0))
+                or (name == 'command_timeout' and 0.0 <= value.double_value <= 3600.0)
+            )
+            # Names that were never declared are rclpy's own affair.
+            if name not in ('', 'no_such'):
+                assert result.successful == settable, (name, value.type, result)
+            assert result.successful or result.reason
+        count = len(robot.received['joint_states'])
+        robot.spin_until(lambda: len(robot.received['joint_states']) > count + 20, 'ticks')
+    end(sim)
+
+
+def test_best_effort_commander_is_named(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE)
+    with client(REACH) as robot:
+        robot.subscribe('/diagnostics')
+        robot.node.create_publisher(
+            Float64MultiArray, 'commands', rclpy_profile(QosSpec(1, 'best_effort', 'volatile'))
+        )
+
+        def named() -> bool:
+            found = robot.received['/diagnostics']
+            return bool(found) and 'best effort; offer reliable' in found[-1].status[0].message
+
+        robot.spin_until(named, 'warning')
+    assert '/commands of /client is not received' in end(sim)
+
+
+def test_stopped_simulation_counts_what_it_missed_and_never_makes_up_for_it(
+    start_process: Start,
+) -> None:
+    sim = start_process(*SIM_NODE)
+    with client(REACH) as robot:
+        robot.subscribe('joint_states', '/diagnostics')
+        robot.spin_until(lambda: bool(reports(robot)), 'a report')
+        before = int(reports(robot)[-1]['missed ticks'])
+        sim.send_signal(signal.SIGSTOP)
+        robot.spin(2.0)
+        sim.send_signal(signal.SIGCONT)
+        robot.spin(0.05)
+        began, count = time.monotonic(), len(robot.received['joint_states'])
+        robot.spin(2.0)
+        rate = (len(robot.received['joint_states']) - count) / (time.monotonic() - began)
+        missed = int(reports(robot)[-1]['missed ticks']) - before
+    assert 45 <= missed <= 60
+    assert 20.0 < rate < 27.0
+    end(sim)
+
+
+def test_two_arms_and_two_hands_in_one_graph(start_process: Start, tmp_path: Path) -> None:
+    robots = {
+        'arm1': 'FetchReach',
+        'arm2': 'FetchReach',
+        'hand1': 'HandReach',
+        'hand2': 'HandReach',
+    }
+    sims, policies = {}, []
+    for index, (name, task) in enumerate(robots.items()):
+        namespace = ['-r', f'__ns:=/{name}']
+        policies.append(start_process(*POLICY_NODE, *ros_args(checkpoint='random'), *namespace))
+        arguments = ros_args(
+            task=task,
+            mode='lockstep',
+            seed=3,
+            episodes=2,
+            wait_for_commands=True,
+            publish_clock=index == 0,
+            episode_dir=tmp_path / name,
+        )
+        sims[name] = start_process(*SIM_NODE, *arguments, *namespace)
+    outputs = {}
+    for name, sim in sims.items():
+        code, outputs[name] = finish(sim, timeout=90.0)
+        assert code == 0, outputs[name]
+    assert not any('/clock has' in output for output in outputs.values())
+    logged = {name: episodes_in(tmp_path / name) for name in robots}
+    for name, episodes in logged.items():
+        assert [episode.is_complete for episode in episodes] == [True, True]
+        others = [t for t in episodes[0].topics if t != '/clock' and not t.startswith(f'/{name}/')]
+        assert others == []
+
+    def states(name: str) -> list[bytes]:
+        return [m.data for m in logged[name][0].topics[f'/{name}/joint_states'].messages]
+
+    # Alone in their namespaces: equal robots with equal commanders do the same.
+    assert states('arm1') == states('arm2')
+    assert states('hand1') == states('hand2')
+    for policy in policies:
+        end(policy)
+
+
+def test_a_second_source_of_time_is_named(start_process: Start) -> None:
+    first = start_process(*SIM_NODE, *ros_args(), '-r', '__ns:=/a')
+    second = start_process(*SIM_NODE, *ros_args(), '-r', '__ns:=/b')
+    with client(REACH) as robot:
+        robot.subscribe('/diagnostics')
+
+        def named() -> bool:
+            found = robot.received['/diagnostics']
+            return any('publish_clock:=false' in m.status[0].message for m in found)
+
+        robot.spin_until(named, 'error')
+    for sim in (first, second):
+        sim.send_signal(signal.SIGINT)
+    outputs = [finish(sim)[1] for sim in (first, second)]
+    line = '/clock has 2 publishers: /a/sim_node, /b/sim_node'
+    assert any(line in output for output in outputs)
+
+
+def test_memory_stays_flat_at_twenty_times_real_time(
+    start_process: Start, soak_seconds: float
+) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(real_time_factor=20.0))
+    policy = start_process(*POLICY_NODE, *ros_args(checkpoint='random'))
+    with client(REACH) as robot:
+        robot.subscribe('/diagnostics')
+        robot.spin_until(
+            lambda: any(
+                int(values['commands']) > 100
+                for values in reports(robot, '/policy_node')
+                if 'commands' in values
+            ),
+            'commands',
+        )
+        robot.spin_until(lambda: bool(reports(robot)), 'a report')
+        robot.spin(2.0)
+        before = [resident_kilobytes(process) for process in (sim, policy)]
+        ticks = int(reports(robot)[-1]['ticks'])
+        deadline = time.monotonic() + soak_seconds
+        while time.monotonic() < deadline:
+            robot.spin(1.0)
+            robot.received.clear()
+            robot.received_at.clear()
+        robot.spin_until(lambda: bool(reports(robot)), 'a report')
+        after = [resident_kilobytes(process) for process in (sim, policy)]
+        ticks = int(reports(robot)[-1]['ticks']) - ticks
+    print(f'{ticks} ticks; kB before {before}, after {after}')
+    assert ticks > 100 * soak_seconds
+    assert max(b - a for a, b in zip(before, after, strict=True)) < 4_000
+    for process in (sim, policy):
+        end(process)
+
+
+def wait_for_handler(process: subprocess.Popen[str]) -> None:
+    """Waits until a process catches SIGTERM: Python itself catches SIGINT from its start."""
+    deadline = time.monotonic() + TIMEOUT
+    while time.monotonic() < deadline and process.poll() is None:
+        status = Path(f'/proc/{process.pid}/status').read_text()
+        if int(re.search(r'SigCgt:\s+(\w+)', status)[1], 16) >> (signal.SIGTERM - 1) & 1:
+            return
+        time.sleep(0.001)
+    raise AssertionError('no signal handler')
+
+
+@pytest.mark.parametrize('command', [SIM_NODE, POLICY_NODE], ids=['sim_node', 'policy_node'])
+def test_ctrl_c_at_any_moment_ends_with_0_and_no_traceback(
+    start_process: Start, command: tuple[str, ...]
+) -> None:
+    arguments = ros_args(checkpoint='FetchReach') if command is POLICY_NODE else ros_args()
+    robot = start_process(*SIM_NODE, *ros_args(mode='lockstep'))
+    delays = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.8, 1.2, 2.0, 3.0, 4.0)
+    for group in (delays[::2], delays[1::2]):
+        processes = [start_process(*command, *arguments) for _ in group]
+        for process in processes:
+            wait_for_handler(process)
+        began = time.monotonic()
+        for process, delay in zip(processes, group, strict=True):
+            time.sleep(max(0.0, began + delay - time.monotonic()))
+            process.send_signal(signal.SIGINT)
+        for process, delay in zip(processes, group, strict=True):
+            code, output = finish(process)
+            assert code == 0, (delay, output)
+            assert 'Traceback' not in output, (delay, output)
+    end(robot)

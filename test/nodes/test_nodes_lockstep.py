@@ -1,0 +1,168 @@
+"""Lockstep on a real graph: equal bytes everywhere, stalls that say why, commanders that return."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from std_msgs.msg import Float64MultiArray
+from test_nodes import episodes_in, finish, payload
+
+from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.codecs import decode_status
+from msgs_spec.schemas import deserialize
+from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.tick import TickEncoder
+from msgs_spec.topics import topics
+from policy_node.node.responder import Responder
+from policy_node.policies.commander import make_commander
+from support.graph import POLICY_NODE, SIM_NODE, client, ros_args
+
+Start = Callable[..., subprocess.Popen[str]]
+REACH = task_spec('FetchReach')
+SEED = 7
+
+
+def logged_run(start: Start, directory: Path, **parameters: object):
+    """Episodes of one run of two nodes, each a dict of all message bytes."""
+    policy = start(*POLICY_NODE)
+    arguments = ros_args(seed=SEED, wait_for_commands=True, episode_dir=directory, **parameters)
+    code, output = finish(start(*SIM_NODE, *arguments), timeout=60.0)
+    assert code == 0, output
+    policy.send_signal(signal.SIGINT)
+    assert finish(policy)[0] == 0
+    return [payload(episode) for episode in episodes_in(directory)]
+
+
+def batch_run(spec: TaskSpec, episodes: int) -> list[dict[str, list[bytes]]]:
+    """The same without ROS: bytes by topic for each episode."""
+    runner = EpisodeRunner(Simulation(spec.name, num_threads=1), first_seed=SEED, episodes=episodes)
+    encoder, buffer = TickEncoder(spec), CommandBuffer(spec.robot, 0.0)
+    status = runner.waiting_status()
+    sent: list[bytes] = []
+    responder = Responder(
+        make_commander('', status), status, lambda data: sent.append(data) or True
+    )
+    result: list[dict[str, list[bytes]]] = []
+    while not runner.is_done:
+        tick = runner.advance(buffer.take(0.0).values)
+        messages = encoder.encode(tick, latched=tick.status.phase != 'running')
+        if tick.status.phase == 'reset':
+            buffer.start_episode(runner.resting_command())
+            result.append({})
+        for source, data in messages:
+            result[-1].setdefault('/' + source.name.lstrip('/'), []).append(data)
+        published = {source.name: data for source, data in messages}
+        for source in responder.topics:
+            responder.receive(source.name, published[source.name])
+        command = deserialize('std_msgs/msg/Float64MultiArray', sent[-1])
+        buffer.accept(command.data, 0.0)
+        if tick.status.phase != 'finished':
+            result[-1].setdefault('/commands', []).append(sent[-1])
+    return result
+
+
+def without_times(episode) -> dict[str, list[bytes]]:
+    return {name: [data for _, _, data in messages] for name, messages in episode.items()}
+
+
+def test_bytes_are_equal_between_runs_in_real_time_and_without_ros(
+    start_process: Start, tmp_path: Path
+) -> None:
+    first = logged_run(start_process, tmp_path / '1', mode='lockstep', episodes=2)
+    second = logged_run(start_process, tmp_path / '2', mode='lockstep', episodes=2)
+    assert first == second
+    assert [without_times(episode) for episode in first] == batch_run(REACH, 2)
+    assert first[0]['/joint_states'] != first[1]['/joint_states']
+    for attempt in range(3):
+        # Half speed: even a busy machine answers within 80 ms, mostly.
+        (paced,) = logged_run(
+            start_process, tmp_path / f'paced{attempt}', real_time_factor=0.5, episodes=1
+        )
+        # A command is logged behind the tick it answers: equal log times mean none was late.
+        if [m[0] for m in paced['/commands']] == [m[0] for m in first[0]['/commands']]:
+            break
+    assert paced == first[0]
+
+
+def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(mode='lockstep'))
+    with client(REACH) as robot:
+        robot.subscribe('reward', 'joint_states')
+        robot.connect('set_goal')
+        # The reset tick is long gone when the first commander appears.
+        policy = start_process(*POLICY_NODE, *ros_args(checkpoint='resting'))
+        ticks = robot.received['reward']
+        robot.spin_until(lambda: len(ticks) > 20, 'ticks')
+        policy.kill()
+        policy.wait()
+        robot.spin(0.2)
+        count = len(ticks)
+        robot.spin(6.0)
+        assert len(ticks) == count
+        assert len({str(m.header.stamp) for m in robot.received['joint_states']}) <= count + 9
+        again = start_process(*POLICY_NODE, *ros_args(checkpoint='resting'))
+        robot.spin_until(lambda: len(ticks) > count + 20, 'ticks of the next commander')
+        again.send_signal(signal.SIGSTOP)
+        robot.spin(0.2)
+        count = len(ticks)
+        robot.spin(1.0)
+        assert len(ticks) == count
+        again.send_signal(signal.SIGCONT)
+        robot.spin_until(lambda: len(ticks) > count + 20, 'ticks after the stop')
+    sim.send_signal(signal.SIGINT)
+    code, output = finish(sim)
+    assert code == 0
+    assert 'of episode' in output
+    assert 'waits for a valid command; /policy_node sends none' in output
+
+
+def test_two_commanders_are_named_and_health_is_published(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(real_time_factor=4.0))
+    policy = start_process(*POLICY_NODE, *ros_args(checkpoint='random'))
+    with client(REACH) as robot:
+        robot.subscribe('/diagnostics', 'real_time_factor')
+        robot.connect('commands')
+
+        def status(node: str):
+            found = [m for m in robot.received['/diagnostics'] if m.status[0].name == node]
+            return found[-1] if found else None
+
+        def message(node: str) -> str:
+            return status(node).status[0].message if status(node) else ''
+
+        robot.spin_until(lambda: '/client' in message('/sim_node'), 'a report')
+        assert '2 publish commands: /client, /policy_node' in message('/sim_node')
+        robot.publish('commands', Float64MultiArray(data=[0.0] * 3))
+        robot.spin_until(lambda: '1 commands rejected' in message('/sim_node'), 'the rejection')
+        assert status('/sim_node').status[0].level == b'\x01'
+        values = decode_status(status('/sim_node'))
+        assert values['rejected: wrong size'] == '1'
+        assert values['log'] == 'off'
+        assert float(values['tick time p99 (ms)']) > 0.0
+        robot.spin_until(lambda: 'commands per second' in message('/policy_node'), 'a policy')
+        assert float(decode_status(status('/policy_node'))['inference p50 (ms)']) > 0.0
+        factors = robot.received['real_time_factor']
+        robot.spin_until(lambda: any(abs(m.data - 4.0) < 0.4 for m in factors), 'factor of 4')
+        changed = Parameter(name='real_time_factor', value=ParameterValue(type=3, double_value=0.1))
+        robot.call(SetParameters, 'sim_node/set_parameters', parameters=[changed])
+        factors.clear()
+        robot.spin_until(lambda: any(abs(m.data - 0.1) < 0.05 for m in factors), 'factor of 0.1')
+    for process in (sim, policy):
+        process.send_signal(signal.SIGTERM)
+    code, output = finish(sim)
+    assert code == 0
+    assert '2 publish commands: /client, /policy_node' in output
+    assert finish(policy)[0] == 0
+
+
+def test_topics_of_the_batch_are_those_of_a_log() -> None:
+    (episode,) = batch_run(REACH, 1)
+    published = {'/' + s.name.lstrip('/') for s in topics(REACH) if s.direction == 'published'}
+    assert set(episode) == published | {'/commands'}

@@ -1,0 +1,210 @@
+"""What the policy does with a robot's bytes, without ROS: joins, answers, refuses, keeps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.cdr import TopicEncoder
+from msgs_spec.cdr_decoder import TopicDecoder
+from msgs_spec.codecs import build_message, decode, message_stamp
+from msgs_spec.commands import command_from_action
+from msgs_spec.diagnostics import Level
+from msgs_spec.observations import ObservationAssembler
+from msgs_spec.schemas import deserialize, serialize
+from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.tick import TickEncoder
+from msgs_spec.topics import topic
+from policy_node.node.health import Health
+from policy_node.node.responder import Responder
+from policy_node.node.stamp_join import StampJoin
+from policy_node.policies.commander import RandomCommander, RestingCommander
+
+REACH = task_spec('FetchReach')
+
+
+class Wire:
+    """Takes commands while it is connected."""
+
+    def __init__(self):
+        self.sent, self.is_connected = [], True
+
+    def __call__(self, data):
+        if self.is_connected:
+            self.sent.append(data)
+        return self.is_connected
+
+
+@pytest.fixture(scope='module')
+def episode():
+    """Status and the messages of a few ticks."""
+    runner = EpisodeRunner(Simulation('FetchReach', num_threads=1))
+    encoder = TickEncoder(REACH)
+    status = runner.waiting_status()
+    ticks = [encoder.encode(runner.advance(np.full(4, 0.1))) for _ in range(5)]
+    return status, [{spec.name: data for spec, data in messages} for messages in ticks]
+
+
+@pytest.fixture
+def case(episode):
+    wire = Wire()
+    return Responder(RestingCommander(REACH), episode[0], wire, lambda: 7.0), wire, episode[1]
+
+
+def feed(responder, tick):
+    for source in responder.topics:
+        responder.receive(source.name, tick[source.name])
+
+
+def test_each_tick_gets_one_command_whatever_the_order(case):
+    responder, wire, ticks = case
+    for index, tick in enumerate(ticks):
+        names = [source.name for source in responder.topics]
+        for name in np.random.default_rng(index).permutation(names):
+            responder.receive(str(name), tick[str(name)])
+        feed(responder, tick)  # once more, as a robot in lockstep may send it
+    assert len(wire.sent) == len(ticks) == responder.answered
+    message = deserialize('std_msgs/msg/Float64MultiArray', wire.sent[0])
+    assert decode(topic(REACH, 'commands'), message).tolist() == [0.0] * 4
+
+
+def test_a_command_nobody_hears_is_kept_and_sent_once(case):
+    responder, wire, ticks = case
+    wire.is_connected = False
+    feed(responder, ticks[0])
+    assert wire.sent == []
+    wire.is_connected = True
+    responder.send_unsent()
+    responder.send_unsent()
+    assert len(wire.sent) == responder.answered == 1
+
+
+def test_state_that_is_not_finite_is_refused_and_the_next_tick_answered(case):
+    responder, wire, ticks = case
+    source = topic(REACH, 'end_effector_pose')
+    bad = dict(ticks[0])
+    stamp, vector = TopicDecoder(source).decode(bad[source.name])
+    bad[source.name] = TopicEncoder(source).encode(stamp, [math.nan, *vector[1:]])
+    with pytest.raises(ValueError, match='end_effector_pose: not every value is finite'):
+        feed(responder, bad)
+    feed(responder, ticks[1])
+    assert (responder.unusable, len(wire.sent)) == (1, 1)
+
+
+def test_clock_jumps(case):
+    responder, wire, ticks = case
+
+    def at(stamp, tick):
+        sources = {s.name: s for s in responder.topics}
+        return {
+            name: TopicEncoder(sources[name]).encode(
+                stamp, TopicDecoder(sources[name]).decode(tick[name])[1]
+            )
+            for name in sources
+        }
+
+    second = 10**9
+    for stamp in (second, 2_000_000_000 * second, 5 * second, 5 * second + 40_000_000):
+        feed(responder, at(stamp, ticks[0]))
+    assert len(wire.sent) == 4
+    feed(responder, at(5 * second - 40_000_000, ticks[0]))  # late, not a new beginning
+    assert len(wire.sent) == 4
+    responder.forget()  # the robot says that it starts
+    feed(responder, at(5 * second - 40_000_000, ticks[0]))
+    assert len(wire.sent) == 5
+
+
+def test_hostile_bytes_are_refused_in_one_line_and_counted(case, hostile_count):
+    responder, wire, ticks = case
+    generator = np.random.default_rng(3)
+    names = [source.name for source in responder.topics]
+    refused = 0
+    for _ in range(hostile_count):
+        name = names[generator.integers(len(names))]
+        data = bytearray(ticks[generator.integers(len(ticks))][name])
+        for _ in range(generator.integers(0, 6)):
+            data[generator.integers(len(data))] = generator.integers(256)
+        if generator.random() < 0.2:
+            data = data[: generator.integers(len(data))]
+        elif generator.random() < 0.1:
+            data += bytes(generator.integers(0, 256, generator.integers(1, 2000)).tolist())
+        try:
+            responder.receive(name, bytes(data))
+        except ValueError as error:
+            refused += 1
+            assert len(str(error)) < 1000
+    assert responder.unusable == refused > hostile_count / 10
+    command = TopicEncoder(topic(REACH, 'commands')).encode(0, np.zeros(4))
+    assert set(wire.sent) <= {command}
+    responder.forget()
+    before = responder.answered
+    feed(responder, ticks[-1])
+    assert responder.answered == before + 1
+
+
+def test_join_keeps_a_bounded_number_of_incomplete_stamps():
+    join = StampJoin(['a', 'b'])
+    for stamp in range(10_000):
+        assert join.add('a', stamp, np.zeros(1)) is None
+    assert join.dropped == 10_000 - 8
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_decoder_equals_the_long_way_bit_for_bit(task):
+    generator = np.random.default_rng(2)
+    for source in ObservationAssembler(TASKS[task], 25.0).topics:
+        decoder = TopicDecoder(source)
+        vector = generator.normal(size=source.size) * 10.0 ** generator.integers(-300, 300)
+        stamp = int(generator.integers(2**31)) * 10**9 + int(generator.integers(10**9))
+        data = serialize(source.type_name, build_message(source, stamp, vector))
+        found_stamp, found = decoder.decode(data)
+        message = deserialize(source.type_name, data)
+        assert (found_stamp, found.tobytes()) == (stamp, decode(source, message).tobytes())
+        assert message_stamp(message) == stamp
+
+
+def test_decoder_reads_other_layouts_too():
+    source = topic(REACH, 'joint_states')
+    vector = np.arange(45.0)
+    message = build_message(source, 5, vector)
+    message.header.frame_id = 'somewhere'
+    message.name = message.name[::-1]
+    for part in ('position', 'velocity', 'effort'):
+        setattr(message, part, getattr(message, part)[::-1].copy())
+    stamp, found = TopicDecoder(source).decode(serialize(source.type_name, message))
+    assert (stamp, found.tolist()) == (5, vector.tolist())
+
+
+def test_random_commander_draws_valid_commands_and_starts_alike():
+    first, second = (RandomCommander(task_spec('HandReach')) for _ in range(2))
+    commands = [first.command({}) for _ in range(3)]
+    assert [c.tolist() for c in commands] == [second.command({}).tolist() for _ in range(3)]
+    low, high = (command_from_action(first.spec.robot, np.full(20, x)) for x in (-1.0, 1.0))
+    assert all(((c >= low) & (c <= high)).all() for c in commands)
+
+
+def test_report_says_what_is_wrong(case, episode):
+    responder, _, ticks = case
+    health = Health('/policy_node')
+    assert health.report(7.0, 0).message == 'waits for a robot'
+    health.start(RestingCommander(REACH), responder, episode[0])
+    feed(responder, ticks[0])
+    health.report(7.0, 1)
+    feed(responder, ticks[1])
+    report = health.report(8.0, 1)
+    assert (report.level, report.message) == (Level.OK, 'FetchReach: 1.0 commands per second')
+    report = health.report(12.0, 1)
+    assert report.message == 'no state: the last one is 5 s old'
+    assert health.news(report) == ['no state: the last one is 5 s old']
+    assert health.news(health.report(13.0, 1)) == []
+    responder.inference.add(0.1)
+    responder.inference.add(0.1)
+    responder.inference.add(0.1)
+    message = health.report(14.0, 2).message
+    assert 'slow inference: 100.000 ms, a tick is 40.0 ms' in message
+    assert '2 robots publish here' in message
+    assert 'no robot publishes episode_status' in health.report(15.0, 0).message

@@ -1,0 +1,115 @@
+"""The actor: normalisation, predict, and finding a checkpoint."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from policy_node import load_actor
+from policy_node.policies.actor import Actor, NetworkShape, Normalizer, actor_path, shipped_actors
+
+SHAPE = NetworkShape(observation_size=10, goal_size=3, action_size=4, hidden_sizes=(16, 16))
+
+
+def make_actor(layer_norm: bool = False) -> Actor:
+    torch.manual_seed(3)
+    actor = Actor(NetworkShape(10, 3, 4, (16, 16), layer_norm)).eval()
+    actor.observation_normalizer.mean.copy_(torch.linspace(-1, 1, 10))
+    actor.goal_normalizer.std.fill_(0.5)
+    return actor
+
+
+def make_observation(count: int) -> dict[str, np.ndarray]:
+    generator = np.random.default_rng(0)
+    return {
+        'observation': generator.normal(size=(count, 10)),
+        'achieved_goal': generator.normal(size=(count, 3)),
+        'desired_goal': generator.normal(size=(count, 3)),
+    }
+
+
+def test_normalizer_clips_input_then_scales_then_clips() -> None:
+    normalizer = Normalizer(4)
+    normalizer.mean.copy_(torch.tensor([0.0, 1.0, 150.0, 0.0]))
+    normalizer.std.copy_(torch.tensor([1.0, 2.0, 25.0, 0.01]))
+    values = normalizer(torch.tensor([-3.0, 2.0, 1e9, 1.0]))
+    assert values.tolist() == [-3.0, 0.5, 2.0, 5.0]
+
+
+def test_predict_is_the_network_written_out() -> None:
+    actor = make_actor()
+    observation = make_observation(7)
+    mean, std = np.linspace(-1, 1, 10), 0.5
+    layer = np.concatenate(
+        [
+            np.clip(observation['observation'] - mean, -5, 5),
+            np.clip(observation['desired_goal'] / std, -5, 5),
+        ],
+        axis=1,
+    )
+    linear = [m for m in actor.network.modules() if isinstance(m, torch.nn.Linear)]
+    for index, module in enumerate(linear):
+        layer = layer @ module.weight.detach().numpy().T + module.bias.detach().numpy()
+        layer = np.tanh(layer) if index == len(linear) - 1 else np.maximum(layer, 0.0)
+    action, state = actor.predict(observation)
+    assert state is None
+    assert action.dtype == np.float32 and action.shape == (7, 4)
+    np.testing.assert_allclose(action, layer, atol=1e-5)
+
+
+@pytest.mark.parametrize('layer_norm', [False, True])
+def test_one_observation_gives_the_row_of_the_batch(layer_norm: bool) -> None:
+    actor = make_actor(layer_norm)
+    observation = make_observation(5)
+    batch, _ = actor.predict(observation)
+    for row in range(5):
+        single, _ = actor.predict({key: value[row] for key, value in observation.items()})
+        assert single.shape == (4,)
+        np.testing.assert_allclose(single, batch[row], atol=1e-6)
+
+
+def test_layer_norm_changes_the_function_and_the_parameters() -> None:
+    plain, normalized = make_actor(), make_actor(layer_norm=True)
+    assert any(isinstance(module, torch.nn.LayerNorm) for module in normalized.modules())
+    assert len(normalized.state_dict()) == len(plain.state_dict()) + 4
+
+
+def test_predict_refuses_what_does_not_fit() -> None:
+    actor, observation = make_actor(), make_observation(2)
+    with pytest.raises(ValueError, match="no 'desired_goal'; given: observation, achi"):
+        actor.predict({k: v for k, v in observation.items() if k != 'desired_goal'})
+    with pytest.raises(ValueError, match=r'has shape \(2, 9\); allowed: \(\.\.\., 10\)'):
+        actor.predict({**observation, 'observation': observation['observation'][:, :9]})
+
+
+def test_an_unknown_actor_is_refused_with_the_names_of_the_shipped(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"no actor 'FetchFly'; shipped: .*FetchReach") as caught:
+        load_actor('FetchFly')
+    assert '\n' not in str(caught.value)
+    with pytest.raises(ValueError, match='no actor'):
+        load_actor(tmp_path)
+
+
+def test_every_shipped_actor_loads_and_is_bounded() -> None:
+    assert 'FetchReach' in shipped_actors()
+    for name, path in shipped_actors().items():
+        assert actor_path(name) == path
+        actor = load_actor(name, task=name)
+        observation = {
+            'observation': np.full((3, actor.shape.observation_size), 1e6),
+            'desired_goal': np.zeros((3, actor.shape.goal_size)),
+        }
+        action, _ = actor.predict(observation)
+        assert action.shape == (3, actor.shape.action_size)
+        assert (np.abs(action) <= 1.0).all()
+
+
+def test_importing_the_package_does_not_load_torch() -> None:
+    code = 'import sys, policy_node; assert "torch" not in sys.modules; policy_node.load_actor'
+    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr

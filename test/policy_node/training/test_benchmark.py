@@ -1,0 +1,275 @@
+"""The benchmark: its jobs, how they go on, statistics over seeds, report and bad usage."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import importlib.util
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from msgs_spec.tasks import TASKS
+from policy_node.training import train_her
+from policy_node.training.benchmark import published
+from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
+from policy_node.training.benchmark.jobs import ARMS, LOCK_FILE, _start_arguments, list_jobs
+from policy_node.training.benchmark.results import Curve, aggregate, read_curve, summarize
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.run_log import COLUMNS
+
+torch.set_num_threads(1)
+
+# Jobs of a second or two: 8 simulations, 3 cycles, 2 of them evaluated.
+SMALL = [
+    *['--seeds', '0', '--steps', '1200', '--threads', '1', '--torch-threads', '1'],
+    *['--set', 'num_envs=8', '--set', 'updates_per_cycle=4', '--set', 'batch_size=64'],
+    *['--set', 'evaluate_every=400', '--set', 'evaluation_episodes=8'],
+]
+
+
+def small(output: Path, *more: str) -> list[str]:
+    return [*SMALL, '--output', str(output), *more]
+
+
+def write_progress(path: Path, evaluations: dict[int, float | None]) -> Path:
+    """A log as `train_her` writes it; None is a cycle without an evaluation."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open('w', newline='') as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        for steps, success in evaluations.items():
+            found = {} if success is None else {'eval_success': success, 'eval_episodes': 50}
+            writer.writerow({'seconds': 1.0, 'env_steps': steps, 'train_success': 0.0, **found})
+    return path
+
+
+def curve(*success: float) -> Curve:
+    return Curve(100.0 * np.arange(1, len(success) + 1), np.array(success), 50)
+
+
+def test_jobs_come_seed_by_seed_with_all_arms(tmp_path: Path) -> None:
+    jobs = list_jobs(['FetchReach', 'FetchPush'], list(ARMS), [3, 4], 'paper', {}, tmp_path)
+    assert [job.name for job in jobs[:5]] == [
+        'FetchReach/her_sparse/seed3',
+        'FetchReach/her_dense/seed3',
+        'FetchReach/ddpg_sparse/seed3',
+        'FetchReach/ddpg_dense/seed3',
+        'FetchReach/her_sparse/seed4',
+    ]
+    assert len({job.folder for job in jobs}) == len(jobs) == 16
+    assert jobs[-1].folder == tmp_path / 'FetchPush' / 'ddpg_dense' / 'seed4'
+    arms = {(job.arm.name, job.config.reward_type, job.config.strategy) for job in jobs}
+    assert arms == {
+        ('her_sparse', 'sparse', 'future'),
+        ('her_dense', 'dense', 'future'),
+        ('ddpg_sparse', 'sparse', 'none'),
+        ('ddpg_dense', 'dense', 'none'),
+    }
+
+
+@pytest.mark.parametrize('recipe', ['paper', 'best'])
+@pytest.mark.parametrize('task', TASKS)
+def test_the_command_line_of_a_job_stands_for_its_configuration(
+    task: str, recipe: str, tmp_path: Path
+) -> None:
+    arguments = ['--tasks', task, '--recipe', recipe, '--set', 'hidden_sizes=64,32']
+    for job in jobs_from_arguments(parse_arguments([*arguments, '--output', str(tmp_path)])):
+        parsed = train_her.parse_arguments(_start_arguments(job))
+        assert train_her.config_from_arguments(parsed) == job.config
+
+
+def test_all_jobs_but_for_arm_and_seed_have_one_configuration(tmp_path: Path) -> None:
+    jobs = jobs_from_arguments(parse_arguments(['--output', str(tmp_path)]))
+    assert len(jobs) == 20
+
+    def shared(config: TrainConfig) -> list[object]:
+        own = ('seed', 'reward_type', 'strategy')
+        return [getattr(config, name) for name in TrainConfig.__slots__ if name not in own]
+
+    assert all(shared(job.config) == shared(jobs[0].config) for job in jobs)
+    assert jobs[0].config.evaluation_episodes <= jobs[0].config.num_envs, 'else cut short'
+
+
+def test_a_curve_holds_the_evaluations_of_a_log(tmp_path: Path) -> None:
+    read = read_curve(write_progress(tmp_path / 'p.csv', {100: None, 200: 0.5, 250: 0.6}))
+    assert read.env_steps.tolist() == [200, 250]
+    assert read.success.tolist() == [0.5, 0.6]
+
+
+def test_a_run_without_evaluation_has_no_curve(tmp_path: Path) -> None:
+    path = write_progress(tmp_path / 'progress.csv', {100: None})
+    with pytest.raises(ValueError, match='holds no evaluation'):
+        read_curve(path)
+
+
+def test_median_and_quartiles_over_seeds() -> None:
+    band = aggregate(
+        [curve(0.0, 0.1), curve(0.2, 0.5), curve(0.4, 0.6), curve(0.6, 0.7), curve(1, 1)]
+    )
+    assert band.env_steps.tolist() == [100, 200]
+    np.testing.assert_allclose(band.lower, [0.2, 0.5])
+    np.testing.assert_allclose(band.median, [0.4, 0.6])
+    np.testing.assert_allclose(band.upper, [0.6, 0.7])
+
+
+def test_curves_evaluated_at_other_steps_meet_on_common_ones() -> None:
+    late = Curve(np.array([150.0, 250.0]), np.array([0.0, 1.0]), 50)
+    band = aggregate([curve(0.0, 0.2, 0.4), late])
+    assert band.env_steps.tolist() == [150, 200, 250]
+    np.testing.assert_allclose(band.median, [(0.1 + 0) / 2, (0.2 + 0.5) / 2, (0.3 + 1) / 2])
+
+
+def test_a_summary_is_about_the_last_evaluations() -> None:
+    row = summarize(
+        'FetchPush', 'her_sparse', [curve(0.5, 0.9), curve(0.96, 0.94), curve(0.2, 1.0)]
+    )
+    assert (row['final_median'], row['seeds'], row['env_steps']) == (0.94, 3, 200)
+    assert row['final_lower_quartile'] == pytest.approx(0.92)
+    assert row['final_upper_quartile'] == pytest.approx(0.97)
+    assert row['median_steps_to_0.95'] == 200
+    assert row['published_rerun'].startswith('about 0.99 (quoted; ')
+    never = summarize('HandReach', 'ddpg_dense', [curve(0.0), curve(1.0), curve(0.0)])
+    assert never['median_steps_to_0.95'] is None
+    assert never['published_rerun'] is None
+
+
+def test_published_numbers_name_tasks_arms_kind_and_source() -> None:
+    numbers = published
+    for task, arm in numbers.RERUN:
+        assert task in TASKS and arm in ARMS
+    assert numbers.BEST.keys() <= TASKS.keys()
+    for number in [*numbers.RERUN.values(), *numbers.BEST.values()]:
+        assert number.kind in (numbers.EXACT, numbers.QUOTED, numbers.FIGURE)
+        assert number.success and number.source
+
+
+def test_a_benchmark_runs_reports_and_is_not_run_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = small(tmp_path / 'runs', '--arms', 'her_sparse', 'ddpg_dense')
+    arguments += ['--report', str(tmp_path / 'report')]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert 'job 2 of 2: FetchReach/ddpg_dense/seed0' in printed
+    assert 'DDPG+HER, sparse' in printed and 'by all four arms' in printed
+    report = tmp_path / 'report'
+    assert (report / 'benchmark.png').read_bytes()[:4] == b'\x89PNG'
+    assert (report / 'benchmark.txt').read_text() in printed
+    stored = json.loads((report / 'benchmark.json').read_text())
+    assert stored['command'].startswith('benchmark --seeds 0 --steps 1200')
+    assert len(stored['source_revisions']) == 1 and stored['machine']
+    assert [row['arm'] for row in stored['results']] == ['her_sparse', 'ddpg_dense']
+    assert {row['env_steps'] for row in stored['results']} == {1200}
+    assert len(list(csv.DictReader((report / 'benchmark.csv').open()))) == 2
+    steps = [row['env_steps'] for row in csv.DictReader((report / 'benchmark_curves.csv').open())]
+    assert steps == ['400', '800', '1200'] * 2
+    logs = sorted((tmp_path / 'runs').rglob('progress.csv'))
+    assert len(logs) == 2
+    before = [path.read_bytes() for path in logs]
+    assert main(arguments) == 0
+    assert 'job ' not in capsys.readouterr().out
+    assert [path.read_bytes() for path in logs] == before
+
+
+def test_ctrl_c_keeps_what_there_is_and_the_same_command_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = small(tmp_path, '--arms', 'her_sparse', 'her_dense', '--steps', '4000')
+    first = tmp_path / 'FetchReach' / 'her_sparse' / 'seed0'
+
+    def interrupt() -> None:
+        deadline = time.monotonic() + 60
+        log = first / 'progress.csv'
+        while time.monotonic() < deadline:
+            if log.is_file() and log.read_text().count('\n') >= 3:
+                return os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.005)
+
+    handler = signal.getsignal(signal.SIGINT)
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    assert main(arguments) == 0
+    thread.join()
+    assert '0 of 2 jobs are finished; the same command goes on' in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert not (tmp_path / 'FetchReach' / 'her_dense').exists()
+    assert main(arguments) == 0
+    commands = (first / 'command.txt').read_text().splitlines()
+    assert [command.split()[1] for command in commands] == ['--task', '--resume']
+    assert read_curve(first / 'progress.csv').env_steps[-1] == 4_000
+    assert 'goes on' not in capsys.readouterr().out
+
+
+def test_a_job_of_another_process_is_left_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = tmp_path / 'FetchReach' / 'her_sparse' / 'seed0'
+    taken.mkdir(parents=True)
+    with (taken / LOCK_FILE).open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert main(small(tmp_path, '--arms', 'her_sparse', 'ddpg_dense')) == 0
+    printed = capsys.readouterr().out
+    assert 'FetchReach/her_sparse/seed0 is being run by another process' in printed
+    assert '1 of 2 jobs are finished' in printed
+    assert not (taken / 'progress.csv').exists()
+
+
+def test_another_budget_in_the_same_folder_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(small(tmp_path, '--arms', 'her_sparse')) == 0
+    capsys.readouterr()
+    assert main(small(tmp_path, '--arms', 'her_sparse', '--set', 'batch_size=32')) == 2
+    error = capsys.readouterr().err
+    assert 'holds a run with batch_size 64, now 32: choose another --output' in error
+    assert error.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--set', 'gama=1'], "'gama=1' is not name=value; names: "),
+        (['--set', 'seed=1'], '--set seed is not possible: jobs differ in it'),
+        (['--set', 'strategy=none'], '--set strategy=none is not possible: choose --arms'),
+        (['--seeds', '-1'], 'seed -1; allowed: 0 ... '),
+        (['--steps', '0'], 'total_steps 0; allowed: 1 ... '),
+    ],
+)
+def test_bad_usage_is_one_line_and_exit_status_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main([*arguments, '--output', str(tmp_path / 'runs')]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
+    assert not (tmp_path / 'runs').exists()
+
+
+def test_an_unknown_arm_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        main(['--arms', 'td3'])
+    assert exit_info.value.code == 2
+    assert 'ddpg_sparse' in capsys.readouterr().err
+
+
+@pytest.mark.skipif(importlib.util.find_spec('ray') is not None, reason='Ray is installed')
+def test_a_missing_ray_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['--ray']) == 2
+    assert "pip install 'fetch_hand_sim[cluster]'" in capsys.readouterr().err
+
+
+def test_ray_runs_the_jobs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ray = pytest.importorskip('ray')
+    try:
+        assert main(small(tmp_path, '--ray', '--arms', 'her_sparse', 'ddpg_dense')) == 0
+    finally:
+        ray.shutdown()
+    assert 'is finished; 0 to go' in capsys.readouterr().out
+    assert len(list(tmp_path.rglob('latest.safetensors'))) == 2

@@ -1,0 +1,94 @@
+"""Collection of episodes from the real simulation."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node.policies.actor import Actor, NetworkShape
+from policy_node.training.evaluation.floors import RestingPolicy
+from policy_node.training.learning.collector import Collector
+from policy_node.training.learning.replay import Episodes
+
+torch.set_num_threads(1)
+
+
+def make_collector(noise_std: float = 0.2, random_epsilon: float = 0.3, envs: int = 4) -> Collector:
+    simulation = Simulation('FetchReach', num_envs=envs, num_threads=1)
+    return Collector(simulation, [10 * i for i in range(envs)], noise_std, random_epsilon)
+
+
+def make_actor() -> Actor:
+    torch.manual_seed(0)
+    return Actor(NetworkShape(10, 3, 4, (16,))).eval()
+
+
+def assert_equal(first: Episodes, second: Episodes) -> None:
+    for name in Episodes.__slots__:
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_episodes_are_what_the_simulation_does_with_the_actions() -> None:
+    collector = make_collector()
+    episodes, success = collector.collect(make_actor())
+    assert (len(episodes), episodes.ticks) == (4, 50)
+    simulation = Simulation('FetchReach', num_envs=4, num_threads=1)
+    observation = simulation.reset(seed=[0, 10, 20, 30])
+    reached = np.zeros(4, bool)
+    for tick in range(50):
+        expected = observation['observation'].astype(np.float32)
+        np.testing.assert_array_equal(episodes.observation[:, tick], expected)
+        result = simulation.step(episodes.action[:, tick])
+        observation, reached = result.observation, result.success
+    np.testing.assert_array_equal(
+        episodes.achieved_goal[:, 50], observation['achieved_goal'].astype(np.float32)
+    )
+    np.testing.assert_array_equal(
+        episodes.desired_goal, observation['desired_goal'].astype(np.float32)
+    )
+    assert success == reached.mean()
+
+
+def test_without_noise_the_policy_acts_alone() -> None:
+    actor = make_actor()
+    episodes, _ = make_collector(0.0, 0.0).collect(actor)
+    inputs = {
+        'observation': episodes.observation[:, 7],
+        'desired_goal': episodes.desired_goal,
+    }
+    np.testing.assert_allclose(episodes.action[:, 7], actor.predict(inputs)[0], atol=1e-5)
+
+
+@pytest.mark.parametrize('epsilon', [0.0, 0.3])
+def test_noise_has_the_spread_and_the_share_asked_for(epsilon: float) -> None:
+    episodes, _ = make_collector(0.1, epsilon, envs=40).collect(RestingPolicy(4))
+    actions = episodes.action.reshape(-1, 4)
+    assert np.abs(actions).max() <= 1.0
+    # Five standard deviations of the Gaussian; a uniform action stays inside with 0.5 ** 4.
+    outside = (np.abs(actions) > 0.5).any(axis=1).mean()
+    assert outside == pytest.approx(epsilon * (1 - 0.5**4), abs=0.04)
+    inside = actions[(np.abs(actions) <= 0.5).all(axis=1)]
+    assert inside.std() == pytest.approx(0.1, abs=0.012)
+
+
+def test_random_actions_ignore_the_policy() -> None:
+    episodes, _ = make_collector(0.0, 0.0).collect(RestingPolicy(4), random=True)
+    assert episodes.action.std() == pytest.approx(1 / np.sqrt(3), abs=0.03)
+
+
+def test_the_second_cycle_has_new_goals() -> None:
+    collector = make_collector()
+    first, _ = collector.collect(make_actor())
+    second, _ = collector.collect(make_actor())
+    assert (first.desired_goal != second.desired_goal).all()
+
+
+def test_the_same_seeds_give_the_same_episodes_in_any_thread() -> None:
+    here, _ = make_collector().collect(make_actor())
+    with ThreadPoolExecutor(1) as executor:
+        there, _ = executor.submit(make_collector().collect, make_actor()).result()
+    assert_equal(here, there)

@@ -1,0 +1,117 @@
+"""The configuration: the paper's values, parsing, and refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from msgs_spec.tasks import TASKS
+from policy_node.training.learning import config as config_module
+from policy_node.training.learning.config import (
+    RECIPES,
+    TrainConfig,
+    config_from_dict,
+    parse_assignment,
+    recipe_config,
+)
+from policy_node.training.learning.threads import split_threads
+
+
+def test_the_paper_recipe_is_appendix_b() -> None:
+    push = recipe_config('FetchPush', 'paper')
+    block = recipe_config('HandManipulateBlockFull', 'paper')
+    assert push.hidden_sizes == (256, 256, 256) and not push.layer_norm
+    assert push.learning_rate == 1e-3
+    assert (push.strategy, push.hindsight_k, push.reward_type) == ('future', 4, 'sparse')
+    assert (push.num_envs, push.batch_size, push.updates_per_cycle) == (38, 4864, 40)
+    assert (push.polyak, push.target_update_interval) == (0.95, 40)
+    assert (push.action_l2, push.random_epsilon, push.noise_std) == (1.0, 0.3, 0.2)
+    assert push.gamma == pytest.approx(0.98) and block.gamma == pytest.approx(0.99)
+    assert (push.total_steps, block.total_steps) == (4_750_000, 38_000_000)
+    assert push.evaluation_episodes == 380
+    assert (push.overlap, push.precision) == (False, 'float32')
+
+
+@pytest.mark.parametrize('task', TASKS)
+@pytest.mark.parametrize('recipe', RECIPES)
+def test_recipes_exist_for_every_task_and_survive_json(task: str, recipe: str) -> None:
+    config = recipe_config(task, recipe, seed=3)
+    assert (config.task, config.recipe, config.seed) == (task, recipe, 3)
+    stored = json.loads(json.dumps(dataclasses.asdict(config)))
+    assert config_from_dict(stored) == config
+
+
+def test_every_field_is_explained() -> None:
+    source = Path(config_module.__file__).read_text()
+    for field in dataclasses.fields(TrainConfig):
+        assert re.search(rf'    {field.name}: .*\n    """[^"]+\."""\n', source), field.name
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'),
+    [
+        ('gamma=0.95', ('gamma', 0.95)),
+        ('total_steps=1_000', ('total_steps', 1000)),
+        ('layer_norm=true', ('layer_norm', True)),
+        ('hidden_sizes=512,256', ('hidden_sizes', (512, 256))),
+        ('strategy=final', ('strategy', 'final')),
+    ],
+)
+def test_assignments_take_the_type_of_the_field(text: str, expected: tuple[str, object]) -> None:
+    assert parse_assignment(text) == expected
+
+
+@pytest.mark.parametrize(
+    ('text', 'match'),
+    [
+        ('gamma', 'is not name=value; names: task, '),
+        ('speed=1', 'is not name=value; names: task, '),
+        ('gamma=high', "gamma 'high' is not of type float"),
+        ('layer_norm=maybe', "layer_norm 'maybe' is not of type bool"),
+        ('num_envs=1.5', "num_envs '1.5' is not of type int"),
+        ('hidden_sizes=wide', "hidden_sizes 'wide' is not of type"),
+    ],
+)
+def test_bad_assignments_are_refused(text: str, match: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(match) if '.' in match else match):
+        parse_assignment(text)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'match'),
+    [
+        ({'task': 'FetchFly'}, "unknown task 'FetchFly'"),
+        ({'strategy': 'past'}, "strategy 'past'; allowed: final, future"),
+        ({'gamma': 1.0}, 'gamma 1.0; allowed: 0 ... 0.999999'),
+        ({'batch_size': 0}, 'batch_size 0; allowed: 1'),
+        ({'hidden_sizes': ()}, 'hidden_sizes'),
+        ({'hidden_sizes': (0,)}, 'hidden_sizes'),
+    ],
+)
+def test_bad_values_are_refused(changes: dict[str, object], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        recipe_config(**{'task': 'FetchPush', 'recipe': 'best', **changes})
+
+
+def test_an_unknown_recipe_or_stored_field_is_refused() -> None:
+    with pytest.raises(ValueError, match="recipe 'good'; allowed: paper, best"):
+        recipe_config('FetchPush', 'good')
+    stored = dataclasses.asdict(recipe_config('FetchPush', 'best'))
+    with pytest.raises(ValueError, match='unknown configuration fields: colour'):
+        config_from_dict({**stored, 'colour': 1})
+
+
+def test_threads_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda _: set(range(8)), raising=False)
+    small = recipe_config('FetchPush', 'best', batch_size=1024)
+    assert split_threads(small) == (7, 1)
+    assert split_threads(dataclasses.replace(small, batch_size=4096)) == (4, 4)
+    assert split_threads(dataclasses.replace(small, overlap=False)) == (8, 1)
+    assert split_threads(dataclasses.replace(small, simulation_threads=2)) == (2, 1)
+    monkeypatch.setenv('LOCAL_WORLD_SIZE', '16')
+    assert split_threads(small) == (1, 1)

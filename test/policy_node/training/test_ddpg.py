@@ -1,0 +1,166 @@
+"""The DDPG update against its definition, and on a problem with a known answer."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+from policy_node.policies.actor import MLP, NetworkShape
+from policy_node.training.learning.config import recipe_config
+from policy_node.training.learning.ddpg import DDPG, choose_device, uses_bfloat16
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.hindsight import Transitions
+
+# Small products: more threads only wait for each other, and on a busy machine for very long.
+torch.set_num_threads(1)
+
+SHAPE = NetworkShape(observation_size=3, goal_size=2, action_size=2, hidden_sizes=(32, 32))
+CPU = torch.device('cpu')
+
+
+def make_learner(layer_norm: bool = False, **changes: object) -> DDPG:
+    torch.manual_seed(0)
+    options = {'precision': 'float32', 'gamma': 0.9, **changes}
+    config = recipe_config('FetchReach', 'paper', **options)
+    shape = NetworkShape(3, 2, 2, (32, 32), layer_norm)
+    return DDPG(shape, config, CPU, Workers())
+
+
+def make_batch(count: int = 64, seed: int = 0, reward: float | None = None) -> Transitions:
+    generator = np.random.default_rng(seed)
+
+    def normal(*shape: int) -> np.ndarray:
+        return generator.normal(size=shape).astype(np.float32)
+
+    rewards = -generator.integers(0, 2, count).astype(np.float32)
+    return Transitions(
+        observation=normal(count, 3),
+        next_observation=normal(count, 3),
+        goal=normal(count, 2),
+        action=np.tanh(normal(count, 2)),
+        reward=rewards if reward is None else np.full(count, reward, np.float32),
+    )
+
+
+def forward(module: MLP, inputs: np.ndarray) -> np.ndarray:
+    """The network in numpy."""
+    layer = inputs
+    for part in module.hidden:
+        if isinstance(part, torch.nn.Linear):
+            layer = layer @ part.weight.detach().numpy().T + part.bias.detach().numpy()
+        else:
+            layer = np.maximum(layer, 0.0)
+    return layer @ module.output.weight.detach().numpy().T + module.output.bias.detach().numpy()
+
+
+def test_targets_are_clipped_bootstrapped_values() -> None:
+    learner = make_learner()
+    with torch.no_grad():
+        learner.target_critic.network.output.weight.mul_(40.0)
+    batch = make_batch(512)
+    features = np.concatenate([batch.next_observation, batch.goal], axis=1).clip(-5, 5)
+    action = np.tanh(forward(learner.target_actor, features))
+    value = forward(learner.target_critic.network, np.concatenate([features, action], axis=1))
+    expected = np.clip(batch.reward + 0.9 * value[:, 0], -10.0, 0.0)
+    with torch.no_grad():
+        found = learner.targets(torch.from_numpy(batch.reward), torch.from_numpy(features))
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert (expected == 0).any() and (expected == -10).any()
+
+
+def test_the_first_losses_are_those_of_the_definition() -> None:
+    learner = make_learner(action_l2=0.7)
+    before = copy.deepcopy(learner)
+    batch = make_batch()
+    losses = learner.update(batch)
+    features = np.concatenate([batch.observation, batch.goal], axis=1).clip(-5, 5)
+    next_features = np.concatenate([batch.next_observation, batch.goal], axis=1).clip(-5, 5)
+    with torch.no_grad():
+        target = before.targets(torch.from_numpy(batch.reward), torch.from_numpy(next_features))
+    value = forward(before.critic.network, np.concatenate([features, batch.action], axis=1))
+    critic_loss = np.square(value[:, 0] - target.numpy()).mean()
+    assert losses.critic.item() == pytest.approx(critic_loss, rel=1e-4)
+    action = np.tanh(forward(before.actor.network, features))
+    value = forward(learner.critic.network, np.concatenate([features, action], axis=1)).mean()
+    assert losses.value.item() == pytest.approx(value, rel=1e-4, abs=1e-6)
+    actor_loss = -value + 0.7 * np.square(action).mean()
+    assert losses.actor.item() == pytest.approx(actor_loss, rel=1e-4, abs=1e-6)
+
+
+def test_targets_move_by_the_share_and_at_the_interval_asked_for() -> None:
+    learner = make_learner(polyak=0.75, target_update_interval=3)
+    start = copy.deepcopy(learner.target_critic.state_dict())
+    for _ in range(2):
+        learner.update(make_batch())
+    moved = learner.target_critic.state_dict()
+    assert all(torch.equal(start[name], moved[name]) for name in start)
+    learner.update(make_batch())
+    for name, value in learner.target_critic.state_dict().items():
+        expected = 0.75 * start[name] + 0.25 * learner.critic.state_dict()[name]
+        torch.testing.assert_close(value, expected)
+
+
+def test_the_actor_update_leaves_the_critic_alone_and_normalizers_untouched() -> None:
+    learner = make_learner(learning_rate=0.0)
+    learner.actor_optimizer.param_groups[0]['lr'] = 0.1
+    critic = copy.deepcopy(learner.critic.state_dict())
+    actor = copy.deepcopy(learner.actor.state_dict())
+    learner.update(make_batch())
+    assert all(torch.equal(critic[name], v) for name, v in learner.critic.state_dict().items())
+    for name, value in learner.actor.state_dict().items():
+        assert torch.equal(actor[name], value) == ('normalizer' in name), name
+
+
+@pytest.mark.parametrize('layer_norm', [False, True])
+@pytest.mark.parametrize('precision', ['float32', 'bfloat16'])
+def test_it_finds_the_best_action(layer_norm: bool, precision: str) -> None:
+    """Reward -|a - g|^2 without a future: the best action is the goal itself."""
+    learner = make_learner(
+        layer_norm, precision=precision, gamma=0.0, action_l2=0.0, learning_rate=3e-3
+    )
+    generator = np.random.default_rng(0)
+    for _ in range(600):
+        goal = generator.uniform(-0.7, 0.7, (256, 2)).astype(np.float32)
+        action = generator.uniform(-1, 1, (256, 2)).astype(np.float32)
+        nothing = np.zeros((256, 3), np.float32)
+        reward = -np.square(action - goal).sum(axis=1).clip(0, 1)
+        learner.update(Transitions(nothing, nothing, goal, action, reward))
+    goal = generator.uniform(-0.7, 0.7, (256, 2))
+    action, _ = learner.actor.predict({'observation': np.zeros((256, 3)), 'desired_goal': goal})
+    assert np.abs(action - goal).mean() < 0.2
+
+
+def test_action_l2_keeps_actions_small() -> None:
+    sizes = []
+    for weight in (0.0, 10.0):
+        learner = make_learner(action_l2=weight, learning_rate=3e-3)
+        for seed in range(100):
+            learner.update(make_batch(seed=seed))
+        batch = make_batch(seed=1000)
+        inputs = {'observation': batch.observation, 'desired_goal': batch.goal}
+        sizes.append(float(np.abs(learner.actor.predict(inputs)[0]).mean()))
+    assert sizes[1] < 0.1 < sizes[0]
+
+
+def test_under_bfloat16_the_output_layer_stays_float32() -> None:
+    network = MLP(4, 1, SHAPE)
+    with torch.no_grad():
+        network.output.bias.fill_(-49.9)
+        network.output.weight.mul_(1e-3)
+    with torch.autocast('cpu', torch.bfloat16):
+        hidden, value = network.hidden(torch.randn(8, 4)), network(torch.randn(8, 4))
+    assert hidden.dtype == torch.bfloat16 and value.dtype == torch.float32
+    assert not torch.equal(value, value.bfloat16().float())
+    np.testing.assert_allclose(value.detach(), -49.9, atol=0.02)
+
+
+def test_precision_and_device_choices() -> None:
+    assert uses_bfloat16('bfloat16', CPU) and not uses_bfloat16('float32', CPU)
+    assert choose_device('cpu') == CPU
+    if not torch.cuda.is_available():
+        assert choose_device('auto') == CPU
+        with pytest.raises(ValueError, match='torch sees no GPU'):
+            choose_device('cuda')

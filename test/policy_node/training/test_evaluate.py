@@ -1,0 +1,152 @@
+"""Evaluation: intervals, floors, and the command line, on the real simulation."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node.training.evaluate_policy import main
+from policy_node.training.evaluation.episodes import (
+    EpisodeOutcomes,
+    evaluate,
+    run_episodes,
+    summarize,
+    wilson_interval,
+)
+from policy_node.training.evaluation.floors import RandomPolicy, RestingPolicy
+
+torch.set_num_threads(1)
+
+
+class TowardsGoal:
+    """Moves the gripper straight to the goal of FetchReach: always succeeds."""
+
+    def predict(
+        self, observation: dict[str, np.ndarray], *, deterministic: bool = True
+    ) -> tuple[np.ndarray, None]:
+        offset = observation['desired_goal'] - observation['achieved_goal']
+        action = np.zeros((len(offset), 4))
+        action[:, :3] = np.clip(10.0 * offset, -1, 1)
+        return action, None
+
+
+def simulation(num_envs: int, task: str = 'FetchReach') -> Simulation:
+    return Simulation(task, num_envs=num_envs, num_threads=1)
+
+
+@pytest.mark.parametrize(
+    ('successes', 'episodes', 'interval'),
+    # Newcombe 1998, table I, method 3 (Wilson without continuity correction).
+    [(81, 263, (0.2553, 0.3662)), (15, 148, (0.0624, 0.1605)), (0, 20, (0.0, 0.1611))],
+)
+def test_wilson_interval(successes: int, episodes: int, interval: tuple[float, float]) -> None:
+    assert wilson_interval(successes, episodes) == pytest.approx(interval, abs=5e-5)
+
+
+def test_wilson_interval_needs_episodes() -> None:
+    with pytest.raises(ValueError, match='0 episodes'):
+        wilson_interval(0, 0)
+
+
+def test_a_good_policy_succeeds_and_a_resting_one_does_not() -> None:
+    good = evaluate(simulation(10), TowardsGoal(), 20, first_seed=0)
+    assert good.success_gymnasium.all() and good.success_paper.all() and good.touched.all()
+    assert (good.episode_return > -15).all() and (good.episode_return < 0).any()
+    rest = evaluate(simulation(10), RestingPolicy(4), 20, first_seed=0)
+    assert rest.success_gymnasium.mean() < 0.3
+    assert rest.episode_return.mean() < -35
+
+
+def test_an_episode_depends_on_its_seed_alone() -> None:
+    one = evaluate(simulation(1), TowardsGoal(), 6, first_seed=40)
+    many = evaluate(simulation(4), TowardsGoal(), 6, first_seed=40)
+    assert len(one) == len(many) == 6
+    for name in EpisodeOutcomes.__slots__:
+        np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
+    assert one.seed.tolist() == list(range(40, 46))
+    other = evaluate(simulation(4), TowardsGoal(), 6, first_seed=50)
+    assert (other.episode_return != one.episode_return).any()
+
+
+def test_hopeless_evaluations_end_early() -> None:
+    asked = []
+
+    def hopeless(outcomes: EpisodeOutcomes) -> bool:
+        asked.append(len(outcomes))
+        return len(outcomes) >= 8
+
+    outcomes = evaluate(simulation(4), RestingPolicy(4), 100, 0, hopeless)
+    assert asked == [4, 8] and len(outcomes) == 8
+
+
+def test_both_rules_are_applied_whatever_the_rule_of_the_simulation() -> None:
+    """3 mm in every coordinate: 11.6 mm over all fifteen, but 5.2 mm per fingertip."""
+
+    class GoalNearby(RestingPolicy):
+        def predict(self, observation: dict[str, np.ndarray], **options: bool) -> tuple:
+            hand.set_goal(observation['achieved_goal'] + 0.003)
+            return super().predict(observation, **options)
+
+    for rule in ('gymnasium', 'paper'):
+        hand = Simulation('HandReach', num_envs=3, num_threads=1, success_rule=rule)
+        outcomes = run_episodes(hand, GoalNearby(20), [1, 2, 3])
+        assert outcomes.success_paper.all() and not outcomes.success_gymnasium.any()
+
+
+def test_summary() -> None:
+    flags = np.array([True, False, True, False])
+    outcomes = EpisodeOutcomes(
+        np.arange(4) + 7, flags, ~flags, flags | True, np.arange(4) * -1.0, ~flags
+    )
+    summary = summarize(outcomes)
+    assert (summary['episodes'], summary['first_seed'], summary['diverged']) == (4, 7, 2)
+    assert (summary['success_gymnasium'], summary['touched']) == (0.5, 1.0)
+    assert summary['success_gymnasium_interval_95'] == list(wilson_interval(2, 4))
+    assert summary['mean_return'] == -1.5
+
+
+def test_random_policy_is_seeded_and_bounded() -> None:
+    observation = {'observation': np.zeros((1000, 10))}
+    first, _ = RandomPolicy(4, seed=1).predict(observation)
+    again, _ = RandomPolicy(4, seed=1).predict(observation)
+    assert (first == again).all() and first.shape == (1000, 4)
+    assert -1 <= first.min() < -0.99 and 0.99 < first.max() <= 1
+
+
+def test_command_line_writes_table_json_and_csv(tmp_path: Path, capsys: object) -> None:
+    json_file, csv_file = tmp_path / 'a' / 'e.json', tmp_path / 'e.csv'
+    arguments = ['--actor', 'FetchReach', '--episodes', '20', '--threads', '1', '--num-envs', '8']
+    assert main([*arguments, '--json', str(json_file), '--csv', str(csv_file)]) == 0
+    report = json.loads(json_file.read_text())
+    assert report['task'] == 'FetchReach' and report['episodes'] == 20
+    assert report['success_gymnasium'] == 1.0
+    assert len(report['sha256']) == 64
+    rows = list(csv.DictReader(csv_file.open()))
+    assert len(rows) == 20 and {row['success_gymnasium'] for row in rows} == {'1'}
+    returns = [float(row['episode_return']) for row in rows]
+    assert report['mean_return'] == pytest.approx(np.mean(returns))
+    assert 'gymnasium rule' in capsys.readouterr().out  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--actor', 'Nobody'], "no actor 'Nobody'; shipped: "),
+        (['--actor', 'random'], '--task is missing for --actor random'),
+        (['--actor', 'FetchReach', '--task', 'FetchPush'], 'trained on FetchReach, not on FetchPu'),
+        (['--actor', 'FetchReach', '--episodes', '0'], '--episodes 0'),
+        (['--actor', 'sb3:SAC', '--task', 'FetchReach'], "'sb3:SAC' is not sb3:<class>"),
+    ],
+)
+def test_bad_usage_is_one_line_and_exit_status_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1

@@ -1,0 +1,131 @@
+"""Hindsight relabelling on episodes whose goals say where they come from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from policy_node.training.learning.hindsight import goal_mixture, relabel, sample_transitions
+from policy_node.training.learning.replay import Episodes
+
+COUNT, TICKS = 6, 10
+
+
+@pytest.fixture
+def episodes() -> Episodes:
+    """Achieved goals are (episode, state), desired goals (100 + episode, 0)."""
+    row, state = np.meshgrid(np.arange(COUNT), np.arange(TICKS + 1), indexing='ij')
+    achieved = np.stack([row, state], axis=-1).astype(np.float32)
+    desired = np.stack([100 + np.arange(COUNT), np.zeros(COUNT)], axis=-1).astype(np.float32)
+    action = achieved[:, :TICKS] + 0.5
+    return Episodes(np.concatenate([achieved, achieved], axis=-1), achieved, desired, action)
+
+
+def draw(episodes: Episodes, strategy: str, k: int = 4) -> tuple[np.ndarray, ...]:
+    generator = np.random.default_rng(1)
+    row = generator.integers(COUNT, size=20_000)
+    tick = generator.integers(TICKS, size=20_000)
+    goal = relabel(episodes, row, tick, goal_mixture(strategy, k), generator)
+    is_desired = goal[:, 0] >= 100
+    return row, tick, goal, is_desired
+
+
+@pytest.mark.parametrize(
+    ('strategy', 'k', 'mixture'),
+    [
+        ('none', 4, {'real': 1.0}),
+        ('future', 4, {'future': 0.8, 'real': 0.2}),
+        ('final', 1, {'final': 0.5, 'real': 0.5}),
+        ('futureactual', 4, {'future': 0.4, 'actual': 0.4, 'real': 0.2}),
+    ],
+)
+def test_mixtures(strategy: str, k: int, mixture: dict[str, float]) -> None:
+    assert goal_mixture(strategy, k) == pytest.approx(mixture)
+
+
+def test_an_unknown_strategy_is_refused() -> None:
+    with pytest.raises(ValueError, match="strategy 'real'; allowed: none, futureactual"):
+        goal_mixture('real')
+
+
+def test_none_keeps_every_goal(episodes: Episodes) -> None:
+    row, _, goal, _ = draw(episodes, 'none')
+    assert (goal == episodes.desired_goal[row]).all()
+
+
+@pytest.mark.parametrize('strategy', ['future', 'final', 'episode', 'random'])
+def test_the_share_of_relabelled_goals_is_k_of_k_plus_1(episodes: Episodes, strategy: str) -> None:
+    row, _, goal, is_desired = draw(episodes, strategy, k=4)
+    assert is_desired.mean() == pytest.approx(0.2, abs=0.01)
+    assert (goal[is_desired] == episodes.desired_goal[row[is_desired]]).all()
+
+
+def test_future_goals_come_later_in_the_same_episode(episodes: Episodes) -> None:
+    row, tick, goal, is_desired = draw(episodes, 'future')
+    row, tick, goal = row[~is_desired], tick[~is_desired], goal[~is_desired]
+    assert (goal[:, 0] == row).all()
+    assert (goal[:, 1] > tick).all()
+    for start in range(TICKS):
+        seen = goal[tick == start, 1]
+        assert set(seen.tolist()) == set(range(start + 1, TICKS + 1))
+        assert seen.mean() == pytest.approx((start + 1 + TICKS) / 2, abs=0.25)
+
+
+def test_final_goals_are_the_last_of_the_same_episode(episodes: Episodes) -> None:
+    row, _, goal, is_desired = draw(episodes, 'final')
+    assert (goal[~is_desired, 0] == row[~is_desired]).all()
+    assert (goal[~is_desired, 1] == TICKS).all()
+
+
+def test_episode_goals_are_any_of_the_same_episode(episodes: Episodes) -> None:
+    row, tick, goal, is_desired = draw(episodes, 'episode')
+    assert (goal[~is_desired, 0] == row[~is_desired]).all()
+    assert set(goal[~is_desired, 1].tolist()) == set(range(1, TICKS + 1))
+    assert (goal[~is_desired, 1] <= tick[~is_desired]).any()
+
+
+def test_random_goals_are_achieved_anywhere_in_the_replay(episodes: Episodes) -> None:
+    row, _, goal, is_desired = draw(episodes, 'random')
+    same = (goal[~is_desired, 0] == row[~is_desired]).mean()
+    assert same == pytest.approx(1 / COUNT, abs=0.02)
+    assert set(goal[~is_desired, 1].tolist()) == set(range(1, TICKS + 1))
+
+
+def test_futureactual_mixes_future_with_desired_goals_of_any_episode(episodes: Episodes) -> None:
+    row, tick, goal, is_desired = draw(episodes, 'futureactual')
+    assert is_desired.mean() == pytest.approx(0.6, abs=0.015)
+    assert (goal[~is_desired, 0] == row[~is_desired]).all()
+    assert (goal[~is_desired, 1] > tick[~is_desired]).all()
+    own = (goal[is_desired, 0] == 100 + row[is_desired]).mean()
+    assert own == pytest.approx(1 / 3 + 2 / 3 / COUNT, abs=0.02)
+
+
+def test_batches_are_consistent_transitions_with_recomputed_rewards(episodes: Episodes) -> None:
+    def reward(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+        assert achieved.dtype == desired.dtype == np.float64
+        return -(np.abs(achieved - desired).sum(axis=-1) > 0).astype(np.float64)
+
+    mixture = goal_mixture('future')
+    generator = np.random.default_rng(2)
+    chosen = generator.integers(COUNT, size=5000)
+    batch = sample_transitions(episodes, chosen, mixture, reward, generator)
+    row, tick = batch.observation[:, 0], batch.observation[:, 1]
+    assert (batch.next_observation[:, 0] == row).all()
+    assert (row == chosen).all()
+    assert (batch.next_observation[:, 1] == tick + 1).all()
+    assert (batch.action == np.stack([row, tick], axis=-1) + 0.5).all()
+    assert set(tick.tolist()) == set(range(TICKS))
+    reached = (batch.goal == batch.next_observation[:, :2]).all(axis=1)
+    assert 0.1 < reached.mean() < 0.5
+    assert (batch.reward == np.where(reached, 0.0, -1.0)).all()
+    assert all(getattr(batch, name).dtype == np.float32 for name in type(batch).__slots__)
+
+
+def test_the_same_generator_gives_the_same_batch(episodes: Episodes) -> None:
+    def sample() -> np.ndarray:
+        generator = np.random.default_rng(5)
+        reward = lambda achieved, desired: np.zeros(len(achieved))  # noqa: E731
+        row = np.arange(COUNT)
+        return sample_transitions(episodes, row, goal_mixture('random'), reward, generator).goal
+
+    assert (sample() == sample()).all()

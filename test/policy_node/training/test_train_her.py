@@ -1,0 +1,375 @@
+"""Training runs from the command line, end to end on the real simulation."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from msgs_spec.tasks import task_spec
+from policy_node.policies import checkpoint
+from policy_node.training.evaluation.episodes import EpisodeOutcomes
+from policy_node.training.generate_episodes import main as generate_episodes
+from policy_node.training.learning.config import TrainConfig, recipe_config
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.logged_episodes import read_experience
+from policy_node.training.learning.run_log import read_progress
+from policy_node.training.learning.trainer import Collected, Trainer, TrainingError, scale_distance
+from policy_node.training.learning.training_state import read_extra
+from policy_node.training.ship_actor import main as ship_actor
+from policy_node.training.train_her import main
+
+torch.set_num_threads(1)
+
+THREADS = ['--threads', '1', '--torch-threads', '1']
+# A run of seconds: 8 simulations, 3 cycles.
+SMALL = [
+    *['--task', 'FetchReach', '--num-envs', '8', '--steps', '1200', *THREADS],
+    *['--set', 'updates_per_cycle=4', '--set', 'batch_size=64', '--set', 'evaluate_every=400'],
+    *['--set', 'evaluation_episodes=8'],
+]
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return checkpoint.read_tensors(path)[0]
+
+
+def same(first: Path, second: Path) -> bool:
+    one, two = weights(first), weights(second)
+    return one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
+
+
+def small_config(**changes: object) -> TrainConfig:
+    options = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'simulation_threads': 1}
+    return recipe_config('FetchReach', 'best', torch_threads=1, **{**options, **changes})
+
+
+def test_fetch_reach_is_learnt_from_nothing(tmp_path: Path) -> None:
+    arguments = ['--task', 'FetchReach', '--success-target', '1', '--steps', '40000']
+    assert main([*arguments, *THREADS, '--output', str(tmp_path / 'run')]) == 0
+    _, info = checkpoint.load(tmp_path / 'run' / 'best.safetensors', task='FetchReach')
+    assert info.success == {'last_step': 1.0, 'episodes': 200, 'rule': 'gymnasium'}
+    assert info.command.startswith('train_her --task FetchReach --success-target 1')
+    assert info.source_revision and 0 < info.env_steps <= 40_000
+    rows = read_progress(tmp_path / 'run' / 'progress.csv')
+    assert rows[-1]['eval_success'] == 1.0
+    assert rows[0]['train_success'] < 0.5 < rows[-1]['train_success']
+    assert (tmp_path / 'run' / 'curve.png').read_bytes()[:4] == b'\x89PNG'
+    assert (
+        ship_actor(
+            [
+                str(tmp_path / 'run'),
+                '--episodes',
+                '50',
+                '--threads',
+                '1',
+                '--actors',
+                str(tmp_path / 'actors'),
+            ]
+        )
+        == 0
+    )
+    assert sorted(path.suffix for path in (tmp_path / 'actors').iterdir()) == [
+        '.json',
+        '.png',
+        '.safetensors',
+    ]
+    assert (
+        ship_actor(
+            [
+                str(tmp_path / 'run'),
+                '--episodes',
+                '50',
+                '--threads',
+                '1',
+                '--actors',
+                str(tmp_path / 'actors'),
+            ]
+        )
+        == 1
+    )
+
+
+@pytest.mark.parametrize('overlap', ['true', 'false'])
+def test_the_same_seed_gives_the_same_weights_bit_for_bit(tmp_path: Path, overlap: str) -> None:
+    for name, seed in (('a', '5'), ('b', '5'), ('c', '6')):
+        extra = ['--seed', seed, '--set', f'overlap={overlap}', '--output', str(tmp_path / name)]
+        assert main([*SMALL, *extra]) == 0
+    latest, state = 'latest.safetensors', 'training_state.safetensors'
+    assert same(tmp_path / 'a' / latest, tmp_path / 'b' / latest)
+    assert same(tmp_path / 'a' / state, tmp_path / 'b' / state)
+    assert not same(tmp_path / 'a' / latest, tmp_path / 'c' / latest)
+
+
+@pytest.mark.parametrize(
+    'arm',
+    [
+        ['--her', '--reward-type', 'sparse', '--strategy', 'futureactual'],
+        ['--her', '--reward-type', 'dense', '--strategy', 'final'],
+        ['--no-her', '--reward-type', 'sparse'],
+        ['--no-her', '--reward-type', 'dense'],
+    ],
+)
+def test_the_four_arms_run(tmp_path: Path, arm: list[str]) -> None:
+    assert main([*SMALL, *arm, '--output', str(tmp_path / 'run')]) == 0
+    config = read_extra(tmp_path / 'run' / 'training_state.safetensors')['config']
+    assert config['reward_type'] == arm[arm.index('--reward-type') + 1]
+    assert (config['strategy'] == 'none') == ('--no-her' in arm)
+
+
+def test_resume_goes_on_where_the_run_stopped(tmp_path: Path) -> None:
+    run = tmp_path / 'run'
+    assert main([*SMALL, '--output', str(run)]) == 0
+    before = weights(run / 'training_state.safetensors')
+    assert main(['--resume', str(run), '--steps', '3200']) == 0
+    rows = list(csv.DictReader((run / 'progress.csv').open()))
+    steps = [int(row['env_steps']) for row in rows]
+    assert steps == [400, 800, 1200, 1600, 2000, 2400, 2800, 3200]
+    # The replay is refilled with as many steps as it had before learning goes on.
+    updates = [int(row['updates']) for row in rows]
+    assert updates == [4, 8, 12, 12, 12, 16, 20, 24]
+    after = weights(run / 'training_state.safetensors')
+    count = 'observation_statistics.count'
+    assert before[count] == 1200 and after[count] == 3200
+    assert checkpoint.read_info(run / 'latest.safetensors').env_steps == 3200
+
+
+def test_a_training_state_restores_everything(tmp_path: Path) -> None:
+    config = small_config(total_steps=1200)
+    first = Trainer(config, tmp_path, Workers())
+    first.train()
+    second = Trainer(dataclasses.replace(config, seed=9), tmp_path, Workers())
+    fresh = second.collector.collect(second.learner.actor)[0]
+    second.resume(tmp_path / 'training_state.safetensors')
+    assert second.counters == first.counters
+    resumed = second.collector.collect(second.learner.actor)[0]
+    assert (resumed.desired_goal != fresh.desired_goal).all(), 'episodes would come twice'
+    second.save()
+    tensors = weights(tmp_path / 'training_state.safetensors')
+    assert any(name.startswith('critic_optimizer.0.exp_avg') for name in tensors)
+    first.save()
+    again = weights(tmp_path / 'training_state.safetensors')
+    assert all(torch.equal(tensors[name], again[name]) for name in again)
+
+
+@pytest.fixture(scope='module')
+def logged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve logged FetchReach episodes of random actions and one of another task."""
+    folder = tmp_path_factory.mktemp('logged')
+    for task, count in (('FetchReach', 12), ('FetchPush', 1)):
+        arguments = ['--policy', 'random', '--task', task, '--threads', '1']
+        arguments += ['--episodes', str(count), '--output', str(folder)]
+        assert generate_episodes(arguments) == 0
+    return folder
+
+
+def test_logged_episodes_are_learnt_from_before_any_step(
+    tmp_path: Path, logged: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, extra in (('with', ['--from-episodes', str(logged)]), ('without', [])):
+        waits = ['--set', 'learning_starts=1000', '--output', str(tmp_path / name)]
+        assert main([*SMALL, *waits, *extra]) == 0
+    said = capsys.readouterr().err
+    assert f'12 episodes from {logged}; 1 left out, first: ' in said
+    assert 'FetchPush, not FetchReach' in said
+    with_logs, without = (
+        read_progress(tmp_path / name / 'progress.csv') for name in ('with', 'without')
+    )
+    # 600 transitions of the logs and 400 of the first cycle make the 1,000.
+    assert [row['updates'] for row in with_logs] == [4, 8, 12]
+    assert [row['updates'] for row in without] == [0, 0, 4]
+    assert [row['env_steps'] for row in with_logs] == [400, 800, 1200]
+    state = weights(tmp_path / 'with' / 'training_state.safetensors')
+    assert state['observation_statistics.count'] == 1200 + 600
+
+
+def test_workers_share_logged_episodes_and_a_resumed_run_counts_them_once(
+    tmp_path: Path, logged: Path
+) -> None:
+    episodes, _ = read_experience(logged, task_spec('FetchReach'))
+    trainer = Trainer(small_config(total_steps=400), tmp_path, Workers())
+    trainer.train()
+    before = trainer.experience.statistics['observation_statistics'].state()
+    resumed = Trainer(small_config(), tmp_path, Workers())
+    resumed.resume(tmp_path / 'training_state.safetensors')
+    resumed.workers = dataclasses.replace(resumed.workers, rank=1, world_size=3)
+    resumed.add_experience(episodes)
+    assert len(resumed.experience.replay) == 4
+    held = resumed.experience.replay.episodes
+    np.testing.assert_array_equal(held.action, episodes.action[1::3])
+    after = resumed.experience.statistics['observation_statistics'].state()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_logs_that_cannot_be_learnt_from_are_refused(
+    tmp_path: Path, logged: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = ['--output', str(tmp_path / 'run')]
+    small = ['--from-episodes', str(logged), '--set', 'replay_transitions=500', *output]
+    assert main([*SMALL, *small]) == 2
+    assert 'holds 600 transitions, the replay 500; allow more with' in capsys.readouterr().err
+    assert main([*SMALL, '--from-episodes', str(tmp_path), *output]) == 2
+    assert 'holds no usable episode of FetchReach' in capsys.readouterr().err
+    assert main([*SMALL, '--from-episodes', str(logged), '--set', 'control_hz=50', *output]) == 2
+    assert 'holds no usable episode of FetchReach' in capsys.readouterr().err
+    assert not (tmp_path / 'run').exists(), 'refused before anything was written'
+
+
+def test_training_may_ask_for_less_distance_than_the_task(tmp_path: Path) -> None:
+    """FetchReach succeeds within 0.05 m; at half of it a goal 0.03 m away is not reached."""
+    goals = np.zeros((2, 3))
+    achieved = np.array([[0.02, 0.0, 0.0], [0.03, 0.0, 0.0]])
+    trainer = Trainer(small_config(reward_distance=0.5), tmp_path, Workers())
+    closer = scale_distance(trainer.simulation.metric, 0.5)
+    assert closer.reward(achieved, goals).tolist() == [0.0, -1.0]
+    assert trainer.simulation.compute_reward(achieved, goals).tolist() == [0.0, 0.0]
+    trainer.experience.replay.add(trainer.collector.collect(trainer.learner.actor)[0])
+    batch = trainer.experience.batch(env_steps=0)
+    position = batch.next_observation[:, :3].astype(np.float64)
+    distance = np.linalg.norm(position - batch.goal, axis=-1)
+    clear = np.abs(distance - 0.025) > 1e-4
+    np.testing.assert_array_equal(batch.reward[clear] == 0.0, distance[clear] < 0.025)
+    assert ((0.025 < distance) & (distance < 0.05)).any()
+
+
+def test_an_unfitting_state_is_refused_in_one_line(tmp_path: Path) -> None:
+    Trainer(small_config(), tmp_path, Workers()).save()
+    wide = Trainer(small_config(hidden_sizes=(32,)), tmp_path, Workers())
+    with pytest.raises(ValueError, match='does not fit this configuration') as caught:
+        wide.resume(tmp_path / 'training_state.safetensors')
+    assert '\n' not in str(caught.value)
+    with pytest.raises(ValueError, match='no training state of version 1'):
+        wide.resume(tmp_path / 'latest.safetensors')
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(tmp_path: Path) -> None:
+    trainer = Trainer(small_config(total_steps=10_000, checkpoint_seconds=0), tmp_path, Workers())
+    update, count = trainer.learner.update, 0
+
+    def poisoned(batch: object) -> object:
+        nonlocal count
+        count += 1
+        if count == 10:
+            with torch.no_grad():
+                trainer.learner.critic.network.output.bias.fill_(float('nan'))
+        return update(batch)  # type: ignore[arg-type]
+
+    trainer.learner.update = poisoned  # type: ignore[method-assign,assignment]
+    with pytest.raises(TrainingError, match='critic loss is nan in update 10, after 1200 env'):
+        trainer.train()
+    kept = weights(tmp_path / 'training_state.safetensors')
+    assert all(torch.isfinite(value.float()).all() for value in kept.values())
+    assert read_extra(tmp_path / 'training_state.safetensors')['config']['num_envs'] == 8
+
+
+def test_an_observation_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
+    trainer = Trainer(small_config(), tmp_path, Workers())
+    collect = trainer.collector.collect
+
+    def broken(*arguments: object) -> object:
+        episodes, success = collect(*arguments)  # type: ignore[arg-type]
+        episodes.observation[3, 20, 1] = np.inf
+        return episodes, success
+
+    trainer.collector.collect = broken  # type: ignore[method-assign,assignment]
+    with pytest.raises(TrainingError, match='observation is not finite after 0 environment steps'):
+        trainer.train()
+
+
+def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path: Path) -> None:
+    trainer = Trainer(small_config(evaluation_episodes=4), tmp_path, Workers())
+    episodes, success = trainer.collector.collect(trainer.learner.actor)
+
+    def evaluated(steps: int, successes: int, mean_return: float, count: int = 4) -> int:
+        flags = np.arange(count) < successes
+        returns = np.full(count, mean_return)
+        outcomes = EpisodeOutcomes(np.arange(count), flags, flags, flags, returns, ~flags)
+        trainer.counters.env_steps = steps
+        actor = trainer.learner.evaluation_actor()
+        trainer._keep_best(Collected(episodes, success, outcomes, actor))
+        return checkpoint.read_info(tmp_path / 'best.safetensors').env_steps
+
+    assert evaluated(1, 2, -9.0) == 1
+    assert evaluated(2, 1, -1.0) == 1
+    assert evaluated(3, 2, -8.0) == 3
+    assert evaluated(4, 2, -8.5) == 3
+    assert evaluated(5, 2, -1.0, count=2) == 3, 'an evaluation cut short decides nothing'
+    assert evaluated(6, 3, -20.0) == 6
+
+
+def test_sigterm_writes_a_checkpoint(tmp_path: Path) -> None:
+    run = tmp_path / 'run'
+    arguments = [*SMALL, '--steps', '100000000', '--output', str(run)]
+    command = [sys.executable, '-m', 'policy_node.training.train_her', *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 90
+        while not (run / 'progress.csv').is_file() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        while len((run / 'progress.csv').read_text().splitlines()) < 3:
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+        assert not (run / 'latest.safetensors').exists()
+        process.send_signal(signal.SIGTERM)
+        output, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    assert 'stopped by SIGTERM' in output
+    assert checkpoint.load(run / 'latest.safetensors')[1].env_steps >= 800
+    assert (run / 'training_state.safetensors').is_file()
+
+
+def test_two_workers_train_together(tmp_path: Path) -> None:
+    run = tmp_path / 'run'
+    arguments = ['--task', 'FetchReach', '--success-target', '1', '--steps', '60000', *THREADS]
+    command = [sys.executable, '-m', 'torch.distributed.run', '--nproc-per-node', '2']
+    command += ['--master-port', '0', '--rdzv-backend', 'c10d', '--rdzv-endpoint', 'localhost:0']
+    command += ['-m', 'policy_node.training.train_her', *arguments, '--output', str(run)]
+    environment = {**os.environ, 'OMP_NUM_THREADS': '1'}
+    result = subprocess.run(command, capture_output=True, text=True, timeout=150, env=environment)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count('success target 1 reached') == 1
+    info = checkpoint.read_info(run / 'best.safetensors')
+    assert info.success['last_step'] == 1.0
+    rows = read_progress(run / 'progress.csv')
+    # 64 simulations in all: 32 episodes of 50 steps from each worker and cycle.
+    assert [row['env_steps'] for row in rows[:2]] == [3200, 6400]
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        ([], '--task is missing; allowed: FetchReach, '),
+        (['--task', 'FetchReach', '--set', 'gama=1'], "'gama=1' is not name=value; names: "),
+        (['--task', 'FetchReach', '--no-her', '--strategy', 'final'], '--no-her excludes'),
+        (['--task', 'FetchReach', '--strategy', 'past'], "strategy 'past'; allowed: "),
+        (['--resume', 'nowhere'], 'nowhere/training_state.safetensors is not a readable'),
+    ],
+)
+def test_bad_usage_is_one_line_and_exit_status_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    output = [] if '--resume' in arguments else ['--output', str(tmp_path)]
+    assert main([*arguments, *output]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
+
+
+def test_a_folder_with_a_run_is_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Trainer(small_config(), tmp_path, Workers()).save()
+    before = (tmp_path / 'training_state.safetensors').read_bytes()
+    assert main([*SMALL, '--output', str(tmp_path)]) == 2
+    assert 'holds a run; continue it with --resume' in capsys.readouterr().err
+    assert (tmp_path / 'training_state.safetensors').read_bytes() == before

@@ -1,0 +1,81 @@
+"""`make bench-her`: when a run counts as there, the table, and a real run of each kind."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from support import ROOT
+
+BENCH = ROOT / 'bench' / 'bench_her.py'
+
+
+@pytest.fixture(scope='module')
+def bench_her() -> ModuleType:
+    spec = importlib.util.spec_from_file_location('bench_her', BENCH)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def evaluations(competitor: str, *points: tuple[float, int, float]) -> list[dict[str, object]]:
+    run = {'task': 'FetchPush', 'competitor': competitor, 'seed': 0, 'threads': 1}
+    run |= {'limit': 100.0, 'target': 0.95, 'episodes': 100}
+    return [run | {'seconds': s, 'env_steps': n, 'success': r} for s, n, r in points]
+
+
+OURS = evaluations('this_project', (10.0, 1000, 0.5), (20.0, 2000, 0.95))
+SLOW = evaluations('sb3_sac', (40.0, 3000, 0.1), (100.1, 6000, 0.94))
+
+
+def test_the_first_evaluation_with_the_target_counts(bench_her: ModuleType) -> None:
+    back = evaluations('sb3_tqc', (50.0, 700, 0.96), (60.0, 800, 0.2))
+    summary = bench_her.summarize([*OURS, *SLOW, *back])
+    assert [row['reached'] for row in summary] == [True, False, True]
+    assert [row['seconds'] for row in summary] == [20.0, None, 50.0]
+    assert [row['env_steps'] for row in summary] == [2000, None, 700]
+    assert [row['times_ours'] for row in summary] == [1.0, 5.0, 2.5]
+
+
+def test_what_was_not_reached_is_said(bench_her: ModuleType) -> None:
+    lines = bench_her.table(bench_her.summarize([*OURS, *SLOW])).splitlines()
+    assert '| 20 | 2,000 | 1.0 | 0.95, 2,000 |' in lines[2]
+    assert '| > 100 | > 6,000 | > 5.0 | 0.94, 6,000 |' in lines[3]
+
+
+def test_there_is_no_ratio_to_a_run_that_failed(bench_her: ModuleType) -> None:
+    failed = evaluations('this_project', (100.0, 5000, 0.4))
+    summary = bench_her.summarize([*failed, *SLOW])
+    assert [row['times_ours'] for row in summary] == [None, None]
+
+
+@pytest.mark.parametrize(
+    'arguments', [['--limit', '0'], ['--threads', '-1'], ['--competitors', 'ppo']]
+)
+def test_bad_usage_ends_with_status_2(
+    bench_her: ModuleType, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        bench_her.main(arguments)
+    assert exit_info.value.code == 2
+    assert 'allowed: above 0' in (error := capsys.readouterr().err) or 'this_project' in error
+
+
+def test_competitors_train_on_the_same_task(
+    bench_her: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip('sb3_contrib')
+    arguments = ['--tasks', 'FetchReach', '--competitors', 'this_project', 'sb3_sac']
+    arguments += ['--limit', '1', '--episodes', '5', '--evaluate-every', '500', '--threads', '1']
+    assert bench_her.main([*arguments, '--side-by-side', '--output', str(tmp_path)]) == 0
+    assert 'Stable-Baselines3, SAC + HER | 1 | > 1 |' in capsys.readouterr().out
+    with (tmp_path / 'bench_her.csv').open() as file:
+        assert file.readline().startswith('# ')
+        rows = list(csv.DictReader(file))
+    assert [row['competitor'] for row in rows] == ['this_project', 'sb3_sac']
+    assert all(int(row['last_env_steps']) >= 400 for row in rows)
+    assert (tmp_path / 'bench_her.png').read_bytes()[:4] == b'\x89PNG'

@@ -1,0 +1,189 @@
+"""What `colcon build` installs: the layout ROS tools look for, and nodes that start from it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import shlex
+import shutil
+import stat
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+import yaml
+
+from msgs_spec.parameters import POLICY_NODE, SIM_NODE, validate
+from support import ROOT
+
+PACKAGE = 'fetch_hand_sim'
+PYTHON_PACKAGES = ('msgs_spec', 'fetch_hand_sim', 'policy_node')
+BIN = Path(sys.prefix) / 'bin'
+
+
+def tracked_files() -> list[str]:
+    """The files git tracks: a forgotten `git add` must break the build here, not elsewhere."""
+    # A build machine may run the tests as another user than the one who cloned.
+    command = ['git', '-c', f'safe.directory={ROOT}', 'ls-files', '-z']
+    listing = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    return [name for name in listing.stdout.split('\0') if name and (ROOT / name).exists()]
+
+
+@pytest.fixture(scope='module')
+def workspace(tmp_path_factory):
+    """A colcon workspace with the package in `src`, built into `install`."""
+    workspace = tmp_path_factory.mktemp('workspace')
+    for name in tracked_files():
+        target = workspace / 'src' / PACKAGE / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, target)
+    environment = os.environ | {
+        'PATH': f'{BIN}{os.pathsep}{os.environ["PATH"]}',
+        'COLCON_HOME': str(workspace / 'home'),
+        'COLCON_LOG_PATH': str(workspace / 'log'),
+    }
+    build = subprocess.run(
+        [BIN / 'colcon', 'build'], cwd=workspace, env=environment, capture_output=True, text=True
+    )
+    assert build.returncode == 0, build.stdout + build.stderr
+    # colcon repairs an incomplete `data_files` and says so; pip would not.
+    assert 'WARNING' not in build.stderr
+    return workspace
+
+
+@pytest.fixture(scope='module')
+def prefix(workspace):
+    """The install prefix of the package."""
+    return workspace / 'install' / PACKAGE
+
+
+@pytest.fixture
+def in_install(workspace, ros_environment):
+    """Returns the command that runs a line of shell with the workspace sourced.
+
+    The installed scripts start `/usr/bin/env python3`, so the environment comes first on the path,
+    as it does for a user who activated it.
+    """
+    path = f'{BIN}{os.pathsep}{ros_environment["PATH"]}'
+    setup = shlex.quote(str(workspace / 'install' / 'setup.sh'))
+    return lambda line: ['env', f'PATH={path}', 'sh', '-c', f'. {setup} && exec {line}']
+
+
+@pytest.fixture(scope='module')
+def distribution(prefix):
+    """What setup.py declares, as installed."""
+    (site_packages,) = prefix.glob('lib/python3*/site-packages')
+    (found,) = importlib.metadata.distributions(name=PACKAGE, path=[str(site_packages)])
+    return found
+
+
+@pytest.fixture(scope='module')
+def executables(distribution):
+    """The names of the executables setup.py declares."""
+    return {point.name for point in distribution.entry_points.select(group='console_scripts')}
+
+
+def test_every_executable_is_where_ros2_run_looks(prefix, executables):
+    folder = prefix / 'lib' / PACKAGE
+    assert executables >= {'sim_node', 'policy_node'}
+    assert {path.name for path in folder.iterdir()} == executables
+    for path in folder.iterdir():
+        assert path.stat().st_mode & stat.S_IXUSR, path
+        # Not the interpreter of the build: the node must find the packages of whoever starts it.
+        assert path.read_text().startswith('#!/usr/bin/env python3\n'), path
+
+
+def test_the_package_is_in_the_ament_index(prefix):
+    assert (prefix / 'share/ament_index/resource_index/packages' / PACKAGE).is_file()
+    assert (prefix / 'share' / PACKAGE / 'package.xml').read_bytes() == (
+        ROOT / 'package.xml'
+    ).read_bytes()
+
+
+@pytest.mark.parametrize('folder', ['launch', 'config'])
+def test_data_files_are_all_installed(prefix, folder):
+    tracked = sorted(Path(name).name for name in tracked_files() if name.startswith(f'{folder}/'))
+    assert tracked
+    assert sorted(path.name for path in (prefix / 'share' / PACKAGE / folder).iterdir()) == tracked
+
+
+@pytest.mark.parametrize('package', PYTHON_PACKAGES)
+def test_every_tracked_file_of_a_python_package_is_installed(distribution, package):
+    site_packages = Path(distribution.locate_file(''))
+    tracked = {name for name in tracked_files() if name.startswith(f'{package}/')}
+    installed = {
+        str(path.relative_to(site_packages))
+        for path in (site_packages / package).rglob('*')
+        if path.is_file() and path.suffix != '.pyc'
+    }
+    assert tracked
+    assert installed == tracked
+
+
+def test_package_xml_and_setup_py_say_the_same(distribution):
+    package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    metadata = distribution.metadata
+    assert package.findtext('name') == metadata['Name']
+    assert package.findtext('version') == metadata['Version']
+    assert package.findtext('license') == (metadata['License-Expression'] or metadata['License'])
+    assert 'Apache License' in (ROOT / 'LICENSE').read_text()
+
+
+def test_launch_files_name_installed_executables_and_files(prefix, executables):
+    launch_files = list((prefix / 'share' / PACKAGE / 'launch').glob('*.launch.xml'))
+    for path in launch_files:
+        text = path.read_text()
+        launched = ElementTree.fromstring(text).findall('node')
+        assert {node.get('pkg') for node in launched} == {PACKAGE}
+        assert {node.get('exec') for node in launched} <= executables
+        for part in text.split(f'$(find-pkg-share {PACKAGE})/')[1:]:
+            assert (prefix / 'share' / PACKAGE / part.partition('"')[0]).is_file(), part
+    assert launch_files
+
+
+@pytest.mark.parametrize(('node', 'specs'), [('sim_node', SIM_NODE), ('policy_node', POLICY_NODE)])
+def test_parameter_file_holds_every_parameter_with_an_allowed_value(node, specs):
+    nodes = yaml.safe_load((ROOT / 'config' / 'sim_node.yaml').read_text())
+    parameters = nodes[f'/**/{node}']['ros__parameters']
+    assert sorted(parameters) == sorted(spec.name for spec in specs)
+    for spec in specs:
+        validate(spec, parameters[spec.name])
+
+
+def test_the_install_is_what_python_imports(workspace, prefix, in_install):
+    files = ', '.join(f'{name}.__file__' for name in PYTHON_PACKAGES)
+    code = f'import {", ".join(PYTHON_PACKAGES)}; print({files}, sep="\\n")'
+    # Not from the repository, whose folder Python would search first.
+    result = subprocess.run(
+        in_install(f"python3 -c '{code}'"), cwd=workspace, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    for path in result.stdout.splitlines():
+        assert Path(path).is_relative_to(prefix), path
+
+
+def test_installed_sim_node_runs_an_episode(prefix, in_install, start_process, tmp_path):
+    """With the installed parameter file, as a user starts it, and as fast as it goes."""
+    line = (
+        f'{prefix}/lib/{PACKAGE}/sim_node --ros-args '
+        f'--params-file {prefix}/share/{PACKAGE}/config/sim_node.yaml '
+        '-p task:=FetchReach -p episodes:=1 -p real_time_factor:=0.0 -p episode_dir:=episodes'
+    )
+    node = start_process(*in_install(line), cwd=tmp_path)
+    output, errors = node.communicate(timeout=60)
+    assert node.returncode == 0, output + errors
+    (episode,) = (tmp_path / 'episodes').glob('FetchReach_*')
+    assert {path.suffix for path in episode.iterdir()} == {'.mcap', '.yaml'}
+
+
+def test_installed_sim_node_refuses_an_unknown_task(prefix, in_install, start_process, tmp_path):
+    line = f'{prefix}/lib/{PACKAGE}/sim_node --ros-args -p task:=NoSuchTask'
+    node = start_process(*in_install(line), cwd=tmp_path)
+    output, errors = node.communicate(timeout=60)
+    assert node.returncode == 2, output + errors
+    (message,) = (output + errors).strip().splitlines()
+    for name in ('NoSuchTask', 'FetchReach', 'HandManipulatePenFull'):
+        assert name in message
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,35 @@
+"""The README's tables say what the evaluation files and the benchmark say."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+
+from support import ROOT
+
+ACTORS = ROOT / 'policy_node' / 'actors'
+TOOL = runpy.run_path(str(ROOT / 'tools' / 'readme_tables.py'))
+
+
+def test_readme_has_the_present_tables() -> None:
+    readme = (ROOT / 'README.md').read_text(encoding='utf-8')
+    assert TOOL['with_tables'](readme) == readme, (
+        'run: python tools/readme_tables.py --write README.md'
+    )
+
+
+def test_readme_without_markers_is_refused() -> None:
+    with pytest.raises(ValueError, match='no <!-- results -->'):
+        TOOL['with_tables']('# nothing')
+
+
+@pytest.mark.parametrize('path', sorted(ACTORS.glob('*.safetensors')), ids=lambda path: path.stem)
+def test_each_actor_is_the_one_that_was_evaluated(path: Path) -> None:
+    report = json.loads(path.with_suffix('.json').read_text())
+    assert report['sha256'] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert report['episodes'] >= 1000
+    assert path.with_suffix('.png').is_file()

@@ -1,0 +1,15 @@
+"""Helpers of the tests, and where things are."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+SUPPORT = Path(__file__).resolve().parent
+ROOT = SUPPORT.parents[1]
+
+
+def script_environment(environment: dict[str, str] | None = None) -> dict[str, str]:
+    """The environment in which a script of this folder finds this folder and the packages."""
+    paths = os.pathsep.join(str(path) for path in (ROOT, SUPPORT.parent))
+    return dict(os.environ if environment is None else environment) | {'PYTHONPATH': paths}

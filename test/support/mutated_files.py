@@ -1,0 +1,322 @@
+"""Damages episode files in every way a seed can think of and gives them to everything that reads.
+
+    python test/support/mutated_files.py EPISODE COUNT SEED
+
+Runs with a limit on memory. Prints a JSON object that counts outcomes by reader, and ends with 1 at
+the first one that is neither a result nor a one-line error. Every file is read within a second of
+processor time, or a signal ends the process.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import resource
+import shutil
+import signal
+import struct
+import sys
+import tempfile
+import time
+import zlib
+from collections import Counter
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from fetch_hand_sim.commands import list_episodes
+from fetch_hand_sim.episode_log import (
+    EpisodeLogError,
+    EpisodeReadError,
+    load_episodes,
+    read_episode,
+    read_summary,
+    recover_episode,
+)
+from fetch_hand_sim.episode_log.arrays import EpisodeArrays
+from fetch_hand_sim.episode_log.summary import EpisodeSummary
+from fetch_hand_sim.replay_node.schedule import ReplaySchedule
+
+# Beyond what the interpreter with all libraries has mapped when the first file is read.
+MEMORY_BYTES = 768 * 2**20
+CPU_SECONDS = 10
+MAGIC = bytes([137, 77, 67, 65, 80, 48, 13, 10])
+LENGTHS = (0, 1, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63 - 1, 2**63, 2**64 - 1)
+
+
+class Mutator:
+    """Makes damaged files of a whole one.
+
+    Args:
+        whole: The file.
+        seed: Of the damage.
+    """
+
+    def __init__(self, whole: bytes, seed: int) -> None:
+        self.whole = whole
+        self.random = np.random.default_rng(seed)
+        self.records = _record_offsets(whole)
+        self.kinds = (
+            self.flip_bits,
+            self.truncate,
+            self.oversize_a_record,
+            self.oversize_inside,
+            self.drop_a_record,
+            self.swap_records,
+            self.overwrite,
+            self.insert,
+            self.foreign_bytes,
+            self.foreign_bag,
+            self.damage_in_a_valid_chunk,
+            self.bomb,
+        )
+
+    def make(self, number: int) -> tuple[str, bytes]:
+        kind = self.kinds[number % len(self.kinds)]
+        return kind.__name__, kind()
+
+    def _position(self) -> int:
+        return int(self.random.integers(len(self.whole)))
+
+    def flip_bits(self) -> bytes:
+        data = bytearray(self.whole)
+        for _ in range(int(self.random.integers(1, 9))):
+            data[self._position()] ^= 1 << int(self.random.integers(8))
+        return bytes(data)
+
+    def truncate(self) -> bytes:
+        return self.whole[: self._position()]
+
+    def oversize_a_record(self) -> bytes:
+        data = bytearray(self.whole)
+        offset = int(self.random.choice(self.records))
+        struct.pack_into('<Q', data, offset + 1, LENGTHS[int(self.random.integers(len(LENGTHS)))])
+        return bytes(data)
+
+    def oversize_inside(self) -> bytes:
+        """A length of four or eight bytes near the start of a record, such as that of a string."""
+        data = bytearray(self.whole)
+        offset = int(self.random.choice(self.records)) + 9 + int(self.random.integers(48))
+        value = LENGTHS[int(self.random.integers(len(LENGTHS)))]
+        if self.random.random() < 0.5:
+            struct.pack_into('<I', data, min(offset, len(data) - 4), value & 0xFFFFFFFF)
+        else:
+            struct.pack_into('<Q', data, min(offset, len(data) - 8), value)
+        return bytes(data)
+
+    def drop_a_record(self) -> bytes:
+        index = int(self.random.integers(len(self.records) - 1))
+        return self.whole[: self.records[index]] + self.whole[self.records[index + 1] :]
+
+    def swap_records(self) -> bytes:
+        edges = [*self.records, len(self.whole) - len(MAGIC)]
+        parts = [self.whole[a:b] for a, b in itertools.pairwise(edges)]
+        first, second = self.random.integers(len(parts), size=2)
+        parts[first], parts[second] = parts[second], parts[first]
+        return MAGIC + b''.join(parts) + MAGIC
+
+    def overwrite(self) -> bytes:
+        data, start = bytearray(self.whole), self._position()
+        size = int(self.random.integers(1, 512))
+        data[start : start + size] = self.random.bytes(size)
+        return bytes(data)
+
+    def insert(self) -> bytes:
+        start = self._position()
+        return self.whole[:start] + self.random.bytes(64) + self.whole[start:]
+
+    def foreign_bytes(self) -> bytes:
+        body = self.random.bytes(int(self.random.integers(4096)))
+        return MAGIC + body + MAGIC if self.random.random() < 0.5 else body
+
+    def foreign_bag(self) -> bytes:
+        """A valid MCAP file with the records of an episode and messages of its own."""
+        content = {'task': 'FetchReach', 'control_hz': '25', 'seed': '0', 'episode': '0'}
+        messages = [self.random.bytes(int(self.random.integers(200))) for _ in range(20)]
+        return _bag(content, messages, self.random)
+
+    def damage_in_a_valid_chunk(self) -> bytes:
+        """Flipped bits under a right CRC: somebody made them."""
+        data = bytearray()
+        position = 0
+        for offset, chunk in _chunks(self.whole, self.records):
+            content = bytearray(lz4.frame.decompress(chunk.data))
+            for _ in range(int(self.random.integers(3))):
+                content[int(self.random.integers(len(content)))] ^= 1 << int(
+                    self.random.integers(8)
+                )
+            end = offset + 9 + struct.unpack_from('<Q', self.whole, offset + 1)[0]
+            data += self.whole[position:offset] + _chunk_record(chunk, bytes(content))
+            position = end
+        return bytes(data + self.whole[position:])
+
+    def bomb(self) -> bytes:
+        """Little that unpacks to much, told or not."""
+        size = int(2 ** self.random.integers(20, 31))
+        told = int(self.random.choice([size, 2**12, 2**40]))
+        zeros = bytes(min(size, 2**26))
+        if self.random.random() < 0.5:
+            packed, name = zstandard.ZstdCompressor(level=1).compress(zeros), 'zstd'
+        else:
+            packed, name = lz4.frame.compress(zeros), 'lz4'
+        chunk = Chunk(name, packed, 0, 0, 0, told)
+        record = _raw_chunk(chunk) * int(self.random.integers(1, 30))
+        offset = next(offset for offset, _ in _chunks(self.whole, self.records))
+        return self.whole[:offset] + record + self.whole[offset:]
+
+
+def _record_offsets(data: bytes) -> list[int]:
+    offsets, position = [], len(MAGIC)
+    while position < len(data) - len(MAGIC):
+        offsets.append(position)
+        position += 9 + struct.unpack_from('<Q', data, position + 1)[0]
+    return offsets
+
+
+def _chunks(data: bytes, offsets: list[int]) -> list[tuple[int, Chunk]]:
+    found = [offset for offset in offsets if data[offset] == 6]
+    with tempfile.TemporaryFile() as stream:
+        stream.write(data)
+        stream.seek(0)
+        records = StreamReader(stream, emit_chunks=True).records
+        chunks = [record for record in records if isinstance(record, Chunk)]
+    return list(zip(found, chunks, strict=True))
+
+
+def _chunk_record(chunk: Chunk, content: bytes) -> bytes:
+    return _raw_chunk(
+        Chunk(
+            'lz4',
+            lz4.frame.compress(content),
+            chunk.message_end_time,
+            chunk.message_start_time,
+            zlib.crc32(content),
+            len(content),
+        )
+    )
+
+
+def _raw_chunk(chunk: Chunk) -> bytes:
+    name = chunk.compression.encode()
+    body = struct.pack(
+        '<QQQII',
+        chunk.message_start_time,
+        chunk.message_end_time,
+        chunk.uncompressed_size,
+        chunk.uncompressed_crc,
+        len(name),
+    )
+    body += name + struct.pack('<Q', len(chunk.data)) + chunk.data
+    return struct.pack('<BQ', 6, len(body)) + body
+
+
+def _bag(content: dict[str, str], messages: list[bytes], random: np.random.Generator) -> bytes:
+    with tempfile.TemporaryFile() as stream:
+        writer = Writer(stream, compression=CompressionType.LZ4)
+        writer.start(profile='ros2')
+        writer.add_metadata('episode', content)
+        writer.add_metadata('episode_result', {'complete': 'true'})
+        types = {
+            '/clock': 'rosgraph_msgs/msg/Clock',
+            '/joint_states': 'sensor_msgs/msg/JointState',
+            '/reward': 'std_msgs/msg/Float64',
+        }
+        channels = []
+        for topic, type_name in types.items():
+            schema = writer.register_schema(name=type_name, encoding='ros2msg', data=b'')
+            channels.append(
+                writer.register_channel(topic=topic, message_encoding='cdr', schema_id=schema)
+            )
+        for time_ns, data in enumerate(messages):
+            channel = channels[int(random.integers(len(channels)))]
+            writer.add_message(channel_id=channel, log_time=time_ns, publish_time=0, data=data)
+        writer.finish()
+        stream.seek(0)
+        return stream.read()
+
+
+def _list(path: Path) -> object:
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as errors:
+        code = list_episodes.main([str(path.parent)])
+    if code:
+        raise EpisodeReadError(errors.getvalue().strip())
+    return read_summary(path)
+
+
+def _recover(path: Path) -> object:
+    leftover = path.parent / '.episode.active'
+    leftover.mkdir()
+    shutil.copy(path, leftover / 'episode_0.mcap')
+    try:
+        return read_episode(recover_episode(leftover))
+    finally:
+        shutil.rmtree(leftover, ignore_errors=True)
+        shutil.rmtree(path.parent / 'episode', ignore_errors=True)
+
+
+READERS = {
+    'read_episode': read_episode,
+    'read_summary': read_summary,
+    'load_episodes': load_episodes,
+    'list_episodes': _list,
+    'ReplaySchedule': ReplaySchedule,
+    'recover_episode': _recover,
+}
+
+
+def outcome(read: object, path: Path) -> str:
+    """What a reader did; whatever else it raises comes through and fails the run."""
+    try:
+        result = read(path)
+    except (EpisodeReadError, EpisodeLogError) as error:
+        text = str(error)
+        assert '\n' not in text and len(text) < 600 and text.isprintable(), repr(text)
+        return 'error'
+    if isinstance(result, list):
+        assert all(isinstance(each, EpisodeArrays) for each in result)
+        assert all(np.isfinite(each.observations['observation']).all() for each in result)
+    elif isinstance(result, EpisodeSummary):
+        assert result.message_count >= 0
+    return 'read'
+
+
+def main() -> int:
+    source, count, seed = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    mutator = Mutator(source.read_bytes(), seed)
+    counts: Counter[str] = Counter()
+    slowest = 0.0
+    with tempfile.TemporaryDirectory() as directory:
+        path = Path(directory) / 'x.mcap'
+        path.write_bytes(mutator.whole)
+        for read in READERS.values():
+            assert outcome(read, path) == 'read'
+        mapped = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (mapped + MEMORY_BYTES,) * 2)
+        for number in range(count):
+            kind, data = mutator.make(number)
+            path.write_bytes(data)
+            for name, read in READERS.items():
+                signal.alarm(CPU_SECONDS)
+                began = time.process_time()
+                try:
+                    counts[f'{name} {outcome(read, path)}'] += 1
+                except BaseException:
+                    print(f'file {number} ({kind}), {name}', file=sys.stderr)
+                    Path(tempfile.gettempdir(), 'mutated_file.mcap').write_bytes(data)
+                    raise
+                slowest = max(slowest, time.process_time() - began)
+                signal.alarm(0)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    print(json.dumps({'outcomes': counts, 'slowest_s': slowest, 'peak_bytes': peak}))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
