@@ -62,6 +62,8 @@ class TaskSpec:
         achieved_goal: Name of the part of the observation that is the achieved goal.
         position_counts: Whether the position of a pose goal counts (False for the Rotate tasks).
         ignores_z_rotation: Whether the rotation about the object's own z axis does not count (pen).
+        object_symmetry: `cube`, or `revolution` for an object that is the same turned about its z
+            axis or upside down; None where the goal is no pose.
     """
 
     name: str
@@ -76,6 +78,7 @@ class TaskSpec:
     achieved_goal: str
     position_counts: bool = True
     ignores_z_rotation: bool = False
+    object_symmetry: str | None = None
 
     @property
     def achieved_goal_start(self) -> int:
@@ -162,6 +165,7 @@ def _hand_manipulate(
         achieved_goal='object_pose',
         position_counts=position_counts,
         ignores_z_rotation=ignores_z_rotation,
+        object_symmetry='cube' if 'Block' in name else 'revolution',
     )
 
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from policy_node.policies.goal_features import RelativeGoal
+from policy_node.policies.goal_features import GoalFeatures
 
 # Plappert et al. 2018, appendix B.
 INPUT_CLIP = 200.0
@@ -29,7 +29,7 @@ class NetworkShape:
         action_size: Length of the action.
         hidden_sizes: Width of each hidden layer.
         layer_norm: Whether a LayerNorm precedes each activation.
-        relative_goal: Additional inputs: how far the goal is; None for none.
+        goal_features: How observation and goal become inputs; None for both as they are.
     """
 
     observation_size: int
@@ -37,13 +37,14 @@ class NetworkShape:
     action_size: int
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     layer_norm: bool = False
-    relative_goal: RelativeGoal | None = None
+    goal_features: GoalFeatures | None = None
 
     @property
     def feature_size(self) -> int:
-        """Length of the network input: observation, goal and the additional inputs."""
-        relative = 0 if self.relative_goal is None else self.relative_goal.size
-        return self.observation_size + self.goal_size + relative
+        """Length of the network input."""
+        if self.goal_features is None:
+            return self.observation_size + self.goal_size
+        return self.goal_features.size(self.observation_size, self.goal_size)
 
 
 class MLP(nn.Module):
@@ -113,10 +114,10 @@ class Actor(nn.Module):
 
     def features(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Normalised network input (..., feature_size)."""
-        parts = [self.observation_normalizer(observation), self.goal_normalizer(goal)]
-        if self.shape.relative_goal is not None:
-            parts.append(self.shape.relative_goal(observation, goal))
-        return torch.cat(parts, dim=-1)
+        normalized = self.observation_normalizer(observation), self.goal_normalizer(goal)
+        if self.shape.goal_features is None:
+            return torch.cat(normalized, dim=-1)
+        return self.shape.goal_features.inputs(observation, goal, *normalized)
 
     def forward(self, features: Tensor) -> Tensor:
         """Actions (..., action_size) in [-1, 1] for `features`."""

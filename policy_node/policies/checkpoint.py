@@ -16,7 +16,7 @@ from torch import Tensor
 
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from policy_node.policies.actor import Actor, NetworkShape
-from policy_node.policies.goal_features import GOAL_FEATURES, relative_goal
+from policy_node.policies.goal_features import goal_features
 
 FORMAT = 'fetch_hand_actor'
 FORMAT_VERSION = 1
@@ -40,7 +40,7 @@ class ActorInfo:
         env_steps: Environment steps behind the weights.
         config: The training configuration.
         success: Measured success and how it was measured; empty if unmeasured.
-        goal_features: `plain`, or `relative` where the network also sees how far the goal is.
+        goal_features: How observation and goal become inputs: `plain`, `relative`, `symmetric`.
     """
 
     task: str
@@ -67,9 +67,7 @@ class ActorInfo:
             action_size=self.action_size,
             hidden_sizes=self.hidden_sizes,
             layer_norm=self.layer_norm,
-            relative_goal=(
-                relative_goal(task_spec(self.task)) if self.goal_features == 'relative' else None
-            ),
+            goal_features=goal_features(self.goal_features, task_spec(self.task)),
         )
 
 
@@ -175,10 +173,11 @@ def _info(path: str | Path, metadata: dict[str, str]) -> ActorInfo:
 def _check_sizes(path: str | Path, info: ActorInfo) -> None:
     if info.task not in TASKS:
         raise ValueError(f'{path} was trained on unknown task {info.task!r}')
-    if info.goal_features not in GOAL_FEATURES:
-        allowed = ', '.join(GOAL_FEATURES)
-        raise ValueError(f'{path} has goal features {info.goal_features!r}; allowed: {allowed}')
     spec = TASKS[info.task]
+    try:
+        goal_features(info.goal_features, spec)
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
     expected = (observation_layout(spec), spec.goal.size, spec.robot.action_size)
     found = (info.observation_layout, info.goal_size, info.action_size)
     for name, given, wanted in zip(('observation', 'goal', 'action'), found, expected, strict=True):

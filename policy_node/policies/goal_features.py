@@ -1,25 +1,48 @@
-"""How far the goal is, as additional inputs of actor and critic.
+"""Inputs of actor and critic that know geometry: how far the goal is, how the object is symmetric.
 
-A function of observation and goal alone, so an actor with these inputs sees no more than one
-without them; it only need not learn to multiply quaternions.
+They are functions of observation and goal alone, so an actor with them sees no more than one
+without them; it only need not learn to multiply quaternions, nor that a cube has no front.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from msgs_spec.tasks import GoalKind, TaskSpec
 
-GOAL_FEATURES = ('plain', 'relative')
+GOAL_FEATURES = ('plain', 'relative', 'symmetric')
 
 # Near the goal the difference is magnified until the success threshold is about one half, and
 # clipped as normalised inputs are (paper, appendix B).
 _CLIP = 5.0
 _ROTATION_SCALE = 10.0
+# World frame; its standard deviation in a run is about 2 rad/s.
+_ANGULAR_VELOCITY_SCALE = 0.5
 _POSITION_SCALES = {GoalKind.POINT: 10.0, GoalKind.POSE: 50.0, GoalKind.FINGERTIPS: 50.0}
+
+
+class GoalFeatures(Protocol):
+    """What turns an observation and a goal into inputs of the networks."""
+
+    def size(self, observation_size: int, goal_size: int) -> int:
+        """Number of inputs."""
+        ...
+
+    def inputs(
+        self,
+        observation: Tensor,
+        goal: Tensor,
+        normalized_observation: Tensor,
+        normalized_goal: Tensor,
+    ) -> Tensor:
+        """Inputs (..., size), from both in the units of the task and both normalised."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +70,27 @@ class RelativeGoal:
     ignores_z_rotation: bool = False
 
     @property
-    def size(self) -> int:
-        """Number of features."""
+    def difference_size(self) -> int:
+        """Number of values of `difference`."""
         return {GoalKind.POINT: 6, GoalKind.FINGERTIPS: 15, GoalKind.POSE: 10}[self.goal]
 
-    def __call__(self, observation: Tensor, goal: Tensor) -> Tensor:
-        """Features (..., size) of observations and goals in the units of the task."""
+    def size(self, observation_size: int, goal_size: int) -> int:
+        """Observation, goal and the difference."""
+        return observation_size + goal_size + self.difference_size
+
+    def inputs(
+        self,
+        observation: Tensor,
+        goal: Tensor,
+        normalized_observation: Tensor,
+        normalized_goal: Tensor,
+    ) -> Tensor:
+        """Normalised observation and goal, then the difference."""
+        difference = self.difference(observation, goal)
+        return torch.cat([normalized_observation, normalized_goal, difference], -1)
+
+    def difference(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """The difference (..., difference_size) of both in the units of the task."""
         achieved = observation[..., self.start : self.start + self.goal.size]
         scale = _POSITION_SCALES[self.goal]
         if self.goal is not GoalKind.POSE:
@@ -67,11 +105,110 @@ class RelativeGoal:
         return torch.cat([scalar, vector, near, position], -1)
 
 
-def relative_goal(spec: TaskSpec) -> RelativeGoal:
-    """Returns the relative features of a task."""
-    return RelativeGoal(
+@dataclass(frozen=True, slots=True)
+class SymmetricObject:
+    """Inputs that are the same for poses which no contact can tell apart.
+
+    A cube turned onto another face is the same cube, an egg or a pen turned about its axis or
+    upside down the same egg or pen. Instead of the object's quaternion the networks see polynomials
+    of its rotation matrix that its symmetry leaves as they are and that determine it up to that
+    symmetry: of a cube the sum of the fourth tensor powers of its three axes, of a body of
+    revolution the second power of its axis. Its angular velocity is in the world frame, the goal is
+    seen as `RelativeGoal.difference` alone.
+
+    Attributes:
+        relative: The difference to the goal.
+        symmetry: `cube`, or `revolution` for a body that also looks alike upside down.
+    """
+
+    relative: RelativeGoal
+    symmetry: str
+
+    def size(self, observation_size: int, goal_size: int) -> int:
+        """Observation with shape and world velocity instead of 7 values, and the difference."""
+        del goal_size
+        shape_size = 15 if self.symmetry == 'cube' else 6
+        return observation_size - 7 + shape_size + 3 + self.relative.difference_size
+
+    def inputs(
+        self,
+        observation: Tensor,
+        goal: Tensor,
+        normalized_observation: Tensor,
+        normalized_goal: Tensor,
+    ) -> Tensor:
+        """Inputs (..., size); the object's velocity must precede its pose in the observation."""
+        del normalized_goal
+        start = self.relative.start
+        rotation = _rotation_matrix(observation[..., start + 3 : start + 7])
+        angular_velocity = (rotation @ observation[..., start - 3 : start, None]).squeeze(-1)
+        shape = _cube_shape(rotation) if self.symmetry == 'cube' else _axis_shape(rotation)
+        return torch.cat(
+            [
+                normalized_observation[..., : start - 3],
+                normalized_observation[..., start : start + 3],
+                (_ANGULAR_VELOCITY_SCALE * angular_velocity).clamp(-_CLIP, _CLIP),
+                shape,
+                self.relative.difference(observation, goal),
+            ],
+            -1,
+        )
+
+
+def goal_features(kind: str, spec: TaskSpec) -> GoalFeatures | None:
+    """Returns the features `kind` of a task; None for `plain`, observation and goal as they are.
+
+    Raises:
+        ValueError: If there is no such kind, or the task has no symmetric object.
+    """
+    if kind not in GOAL_FEATURES:
+        raise ValueError(f'goal_features {kind!r}; allowed: {", ".join(GOAL_FEATURES)}')
+    if kind == 'plain':
+        return None
+    relative = RelativeGoal(
         spec.goal, spec.achieved_goal_start, spec.position_counts, spec.ignores_z_rotation
     )
+    if kind == 'relative':
+        return relative
+    if spec.object_symmetry is None:
+        raise ValueError(f'goal_features symmetric: {spec.name} has no object pose as its goal')
+    return SymmetricObject(relative, spec.object_symmetry)
+
+
+def _rotation_matrix(quaternion: Tensor) -> Tensor:
+    """Matrices (..., 3, 3) of unit quaternions wxyz."""
+    w, x, y, z = quaternion.unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def _cube_shape(rotation: Tensor) -> Tensor:
+    """Sum over the axes a of the products a_i a_j a_k a_l, (..., 15), centred and about +-1."""
+    second = _second_powers(rotation)
+    xx, xy, xz, yy, yz, zz = second.unbind(-2)
+    products = [xx * second[..., i, :] for i in range(6)]
+    products += [yy * part for part in (xy, xz, yy, yz, zz)]
+    products += [zz * part for part in (xy, xz, yz, zz)]
+    sums = torch.stack([reduce(add, product.unbind(-1)) for product in products], -1)
+    # Means over all rotations: 3/5 of fourth powers, 3/15 of products of two squares.
+    means = sums.new_tensor([0.6, 0, 0, 0.2, 0, 0.2, 0, 0, 0.6, 0, 0.2, 0, 0, 0, 0.6])
+    return 3.0 * (sums - means)
+
+
+def _axis_shape(rotation: Tensor) -> Tensor:
+    """Products a_i a_j of the z axis a, (..., 6), centred and about +-1."""
+    second = _second_powers(rotation[..., 2:]).squeeze(-1)
+    return 1.5 * (second - second.new_tensor([1 / 3, 0, 0, 1 / 3, 0, 1 / 3]))
+
+
+def _second_powers(axes: Tensor) -> Tensor:
+    """Products xx, xy, xz, yy, yz, zz (..., 6, n) of the columns of (..., 3, n)."""
+    x, y, z = axes.unbind(-2)
+    return torch.stack([x * x, x * y, x * z, y * y, y * z, z * z], -2)
 
 
 def _relative_quaternion(achieved: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
-from policy_node.policies.goal_features import GOAL_FEATURES
+from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
 
 RECIPES = ('paper', 'best')
 
@@ -67,8 +67,8 @@ class TrainConfig:
     """Steps during which futureactual is replaced by future."""
 
     goal_features: str = 'plain'
-    """Inputs of actor and critic: `plain` (observation and goal) or `relative` (how far
-    the goal is as well)."""
+    """Inputs of actor and critic: `plain` (observation and goal), `relative` (how far
+    the goal is as well) or `symmetric` (alike poses are one, of the goal only the distance)."""
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     """Width of each hidden layer of actor and critic."""
     layer_norm: bool = False
@@ -116,7 +116,7 @@ class TrainConfig:
     """`auto`, `cpu` or `cuda`."""
 
     def __post_init__(self) -> None:
-        task_spec(self.task)
+        spec = task_spec(self.task)
         for name, allowed in _CHOICES.items():
             value = getattr(self, name)
             if value not in allowed:
@@ -125,6 +125,7 @@ class TrainConfig:
             value = getattr(self, name)
             if not lowest <= value <= highest:
                 raise ValueError(f'{name} {value}; allowed: {lowest:.6g} ... {highest:.6g}')
+        goal_features(self.goal_features, spec)
         if not self.hidden_sizes or min(self.hidden_sizes) < 1:
             raise ValueError(f'hidden_sizes {self.hidden_sizes}; allowed: one or more widths >= 1')
 

@@ -16,7 +16,7 @@ import torch
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from policy_node.policies.actor import Actor, NetworkShape
-from policy_node.policies.goal_features import relative_goal
+from policy_node.policies.goal_features import goal_features
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
 from policy_node.training.learning.collector import Collector
@@ -116,7 +116,7 @@ class Trainer:
             action_size=spec.robot.action_size,
             hidden_sizes=config.hidden_sizes,
             layer_norm=config.layer_norm,
-            relative_goal=relative_goal(spec) if config.goal_features == 'relative' else None,
+            goal_features=goal_features(config.goal_features, spec),
         )
         self.learner = DDPG(shape, config, self.device, self.workers)
         compute_reward = scale_distance(self.simulation.metric, config.reward_distance).reward
