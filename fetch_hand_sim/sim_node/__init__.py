@@ -1,6 +1,6 @@
 """`sim_node`: one simulated robot on the network.
 
-`robot.py` holds what a robot does and how it answers, without ROS; `shell.py` is the node around
+`robot.py` holds what a robot does and how it answers, without ROS; `node.py` is the node around
 it. Nothing is imported here that takes long, so that Ctrl-C finds its handler in place.
 """
 

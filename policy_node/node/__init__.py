@@ -1,7 +1,7 @@
 """`policy_node`: joins the topics of a robot by stamp, runs an actor, publishes its commands.
 
 It knows the robot by topics alone, so it runs as well on another machine or against a replayed
-episode. `responder.py` holds what it does with a message, without ROS; `shell.py` is the node.
+episode. `responder.py` holds what it does with a message, without ROS; `node.py` is the node.
 Nothing is imported here that takes long, so that Ctrl-C finds its handler in place.
 """
 
