@@ -85,5 +85,7 @@ setup(
             'export_episodes = fetch_hand_sim.commands.export_episodes:main',
             'generate_episodes = policy_node.training.generate_episodes:main',
         ],
+        # Whoever ships actors says for which tasks; the demo asks without knowing the package.
+        'fetch_hand_sim.actors': ['shipped = policy_node.policies.shipped:shipped_actors'],
     },
 )

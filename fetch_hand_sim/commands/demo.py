@@ -16,7 +16,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import util
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,6 +24,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from fetch_hand_sim.commands.executables import executable, is_actor_shipped
 from fetch_hand_sim.episode_log import EpisodeReadError, read_episode
 from msgs_spec.codecs import decode_status
 from msgs_spec.qos import rclpy_profile
@@ -124,8 +124,8 @@ class Demo:
         watcher = Watcher(self._spec)
         began = time.monotonic()
         with _logs() as logs:
-            policy = self._start('policy_node.node', [f'checkpoint:={self._checkpoint()}'], logs)
-            sim = self._start('fetch_hand_sim.sim_node', self._sim_parameters(), logs)
+            policy = self._start('policy_node', [f'checkpoint:={self._checkpoint()}'], logs)
+            sim = self._start('sim_node', self._sim_parameters(), logs)
             try:
                 self._watch(watcher, sim, policy, stop)
             finally:
@@ -142,9 +142,7 @@ class Demo:
     def _checkpoint(self) -> str:
         if self._options.checkpoint:
             return str(self._options.checkpoint)
-        package = util.find_spec('policy_node')
-        folder = Path(package.origin).parent if package and package.origin else Path()
-        if (folder / 'actors' / f'{self._spec.name}.safetensors').exists():
+        if is_actor_shipped(self._spec.name):
             return self._spec.name
         self._console.print(f'No actor is shipped for {self._spec.name} yet: commands are random.')
         return 'random'
@@ -158,13 +156,11 @@ class Demo:
             'wait_for_commands:=true',
         ]
 
-    def _start(
-        self, module: str, parameters: Sequence[str], logs: IO[str]
-    ) -> subprocess.Popen[str]:
+    def _start(self, name: str, parameters: Sequence[str], logs: IO[str]) -> subprocess.Popen[str]:
         pairs = [word for parameter in parameters for word in ('-p', parameter)]
         # A process group of its own: Ctrl-C reaches the demo, which ends its nodes in order.
         return subprocess.Popen(
-            [sys.executable, '-m', module, '--ros-args', *pairs],
+            [*executable(name), '--ros-args', *pairs],
             stdout=logs,
             stderr=subprocess.STDOUT,
             text=True,

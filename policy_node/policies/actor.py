@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from policy_node.policies.goal_features import GoalFeatures
+from policy_node.policies.shipped import shipped_actors
 
 # Plappert et al. 2018, appendix B.
 INPUT_CLIP = 200.0
@@ -161,12 +162,6 @@ class Actor(nn.Module):
         if values.ndim == 0 or values.shape[-1] != size:
             raise ValueError(f'{key} has shape {values.shape}; allowed: (..., {size})')
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.goal_normalizer.mean.device)
-
-
-def shipped_actors() -> dict[str, Path]:
-    """Returns task name -> checkpoint of the actors that come with the package."""
-    folder = Path(__file__).parents[1] / 'actors'
-    return {path.stem: path for path in sorted(folder.glob('*.safetensors'))}
 
 
 def actor_path(name_or_path: str | Path) -> Path:

@@ -119,7 +119,7 @@ def make_commander(checkpoint: str, status: EpisodeStatus) -> Commander:
 
 
 def _shipped_commander(status: EpisodeStatus) -> Commander:
-    from policy_node.policies.actor import shipped_actors
+    from policy_node.policies.shipped import shipped_actors
 
     shipped = shipped_actors()
     if status.task not in shipped:

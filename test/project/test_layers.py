@@ -1,12 +1,14 @@
-"""Knowledge flows one way: msgs_spec <- fetch_hand_sim, msgs_spec <- policy_node."""
+"""Knowledge flows one way: msgs_spec <- fetch_hand_sim, msgs_spec <- policy_node; no circles."""
 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -45,7 +47,7 @@ ROS = (
 
 @dataclass(frozen=True)
 class Import:
-    """One imported module and where."""
+    """One imported module and where; `nested` if importing the source does not load it."""
 
     module: str
     line: int
@@ -72,13 +74,26 @@ def _absolute(node: ast.ImportFrom, package: str) -> str:
     return '.'.join([*base, node.module] if node.module else base)
 
 
+# What takes the name of a module or package as its first argument, a bare name too.
+_BY_NAME = ('import_module', '__import__', 'find_spec', 'run_module', 'files', 'resolve_name')
+# Inside any other text, for `python -m` and the like, a package counts only with what follows it:
+# `policy_node` alone is the name of a node and of an executable, which is found as an entry point.
+_DOTTED = re.compile(rf'\b(?:{"|".join(PACKAGES)})(?:\.\w+)+')
+
+
 def _dynamic(node: ast.AST) -> list[str]:
-    """The module named by `importlib.import_module('x')` or `__import__('x')`."""
+    """The modules named in strings: `import_module('x')`, `find_spec('x')`, `'python -m x.y'`."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return _DOTTED.findall(node.value)
     if not (isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant)):
         return []
     function = node.func
     name = function.attr if isinstance(function, ast.Attribute) else getattr(function, 'id', '')
-    return [str(node.args[0].value)] if name in ('import_module', '__import__') else []
+    return [str(node.args[0].value)] if name in _BY_NAME else []
+
+
+def _is_docstring(node: ast.AST) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
 
 
 def _modules(node: ast.AST, package: str) -> list[str]:
@@ -96,13 +111,15 @@ def imports(source: str, package: str) -> Iterator[Import]:
 
     def visit(node: ast.AST, nested: bool) -> Iterator[Import]:
         for module in _modules(node, package):
-            yield Import(module, getattr(node, 'lineno', 0), nested)
+            named = isinstance(node, (ast.Import, ast.ImportFrom))
+            yield Import(module, getattr(node, 'lineno', 0), nested or not named)
         # Code under `if TYPE_CHECKING` does not run at import, like the body of a function.
         lazy = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)) or (
             isinstance(node, ast.If) and 'TYPE_CHECKING' in ast.unparse(node.test)
         )
         for child in ast.iter_child_nodes(node):
-            yield from visit(child, nested or lazy)
+            if not _is_docstring(child):
+                yield from visit(child, nested or lazy)
 
     return visit(ast.parse(source), nested=False)
 
@@ -138,6 +155,62 @@ def test_there_are_modules_to_check(package):
 @pytest.mark.parametrize('path', SOURCES, ids=module_name)
 def test_module_imports_only_what_its_layer_may(path):
     assert violations(path.read_text(), module_name(path), _package(path)) == []
+
+
+# Circles
+
+
+def import_graph(modules: Mapping[str, str]) -> dict[str, set[str]]:
+    """Which modules each one loads when it is imported itself.
+
+    Args:
+        modules: Source by dotted name; packages end in `.__init__`.
+    """
+    graph = {}
+    for name, source in modules.items():
+        package = name.rpartition('.')[0]
+        loaded = {each.module for each in imports(source, package) if not each.nested}
+        # `from a import b` says `a` and `a.b`; where `a.b` is a module, `a` is only its place.
+        places = {module.rpartition('.')[0] for module in loaded if module in modules}
+        packages = {f'{module}.__init__' for module in loaded - places}
+        graph[name] = ((loaded | packages) & set(modules)) - {name}
+    return graph
+
+
+def circle(graph: Mapping[str, set[str]]) -> list[str]:
+    """Returns one circle of modules that import each other, or nothing."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def _full_name(path: Path) -> str:
+    """The dotted name of a source file, `.__init__` included."""
+    return '.'.join(path.relative_to(ROOT).with_suffix('').parts)
+
+
+def test_no_modules_import_each_other():
+    assert circle(import_graph({_full_name(path): path.read_text() for path in SOURCES})) == []
+
+
+@pytest.mark.parametrize(
+    ('sources', 'expected'),
+    [
+        ({'p.a': 'from p import b', 'p.b': 'import p.a'}, {'p.a', 'p.b'}),
+        ({'p.__init__': 'from p.a import x', 'p.a': 'from p import x'}, {'p.__init__', 'p.a'}),
+        ({'p.a': 'from .b import x', 'p.b': 'from .c import x', 'p.c': 'from . import a'}, None),
+        ({'p.a': 'from p import b', 'p.b': 'def late():\n    import p.a'}, set()),
+        ({'p.__init__': 'from p.a import x', 'p.a': 'from p import b', 'p.b': ''}, set()),
+    ],
+)
+def test_a_circle_is_found(sources, expected):
+    wanted = set(sources) if expected is None else expected
+    assert set(circle(import_graph(sources))) == wanted
+
+
+# ROS
 
 
 def ros_at_import(source: str, package: str) -> list[str]:
@@ -178,6 +251,10 @@ def test_ros_in_a_node_is_found(node):
         ('policy_node.node', 'from fetch_hand_sim.simulation import Simulation'),
         ('policy_node.node', 'from policy_node import training'),
         ('policy_node.node', 'from .training import replay'),
+        ('fetch_hand_sim.commands.demo', "util.find_spec('policy_node')"),
+        ('fetch_hand_sim.commands.demo', "start('policy_node.node', parameters)"),
+        ('fetch_hand_sim.commands.demo', "f'{sys.executable} -m policy_node.node --ros-args'"),
+        ('policy_node.policies.actor', "MODULE = 'policy_node.training.learning.trainer'"),
     ],
 )
 def test_a_forbidden_import_is_found(module, source):
@@ -195,6 +272,9 @@ def test_a_forbidden_import_is_found(module, source):
             'from fetch_hand_sim.simulation import Simulation',
         ),
         ('policy_node.training.train_her', 'from . import replay'),
+        ('fetch_hand_sim.commands.demo', "executable('policy_node')"),
+        ('fetch_hand_sim.commands.demo', "entry_points(group='fetch_hand_sim.actors')"),
+        ('fetch_hand_sim.commands.demo', '"""Starts `policy_node.node` by its entry point."""'),
     ],
 )
 def test_an_allowed_import_is_not(module, source):

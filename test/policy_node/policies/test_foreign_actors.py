@@ -14,9 +14,10 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.commands import command_from_action
 from msgs_spec.tasks import task_spec
-from policy_node.policies.actor import load_actor, shipped_actors
+from policy_node.policies.actor import load_actor
 from policy_node.policies.commander import make_commander
 from policy_node.policies.export_actor import main as export_actor
+from policy_node.policies.shipped import shipped_actors
 
 REACH = task_spec('FetchReach')
 

@@ -1,0 +1,33 @@
+"""Executables are found through entry points, and start as the installed scripts do."""
+
+from __future__ import annotations
+
+import subprocess
+
+import pytest
+
+from fetch_hand_sim.commands.executables import (
+    UnknownExecutableError,
+    executable,
+    find_executable,
+    is_actor_shipped,
+)
+
+
+def test_an_executable_runs_with_its_arguments_and_exit_code(tmp_path):
+    command = [*executable('list_episodes'), tmp_path]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert (result.returncode, result.stderr) == (0, '')
+    assert result.stdout.startswith('0 episodes')
+    missing = subprocess.run([*command[:-1], tmp_path / 'none'], capture_output=True, text=True)
+    assert missing.returncode == 2 and 'none' in missing.stderr
+
+
+def test_an_unknown_executable_is_named_with_those_there_are():
+    with pytest.raises(UnknownExecutableError, match=r"no executable 'sim'; installed: .*sim_node"):
+        find_executable('sim')
+
+
+def test_shipped_actors_are_asked_for_by_task():
+    assert is_actor_shipped('FetchReach')
+    assert not is_actor_shipped('HandManipulatePenFull')
