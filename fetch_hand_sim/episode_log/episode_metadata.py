@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import json
 import platform
+from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 
 from msgs_spec.tasks import PHYSICS_TIMESTEP, TaskSpec
+
+# What the messages of an episode mean. 1, which wrote no number: a robot ignored frame and stamp of
+# a goal, and the orientations of `fingertip_poses` were identity.
+INTERFACE_VERSION = 2
 
 _PACKAGES = ('fetch_hand_sim', 'mujoco', 'numpy', 'gymnasium-robotics', 'mcap')
 
@@ -50,6 +55,7 @@ def episode_metadata(
             runs; leave it out for files that are equal byte by byte.
     """
     known = {
+        'interface_version': str(INTERFACE_VERSION),
         'task': task.name,
         'episode': str(episode),
         'seed': str(seed),
@@ -69,3 +75,12 @@ def episode_metadata(
         **{f'{package}_version': _version(package) for package in _PACKAGES},
     }
     return {key: value for key, value in known.items() if value is not None}
+
+
+def interface_version(metadata: Mapping[str, str]) -> int:
+    """Returns the `INTERFACE_VERSION` an episode was written with.
+
+    Raises:
+        ValueError: If it is no number.
+    """
+    return int(metadata.get('interface_version', '1'))

@@ -18,8 +18,9 @@ from mcap.records import Channel, Chunk, Metadata
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
+from fetch_hand_sim.episode_log.limits import MAX_UNPACKED_BYTES
 from fetch_hand_sim.episode_log.reader import mcap_file, one_line_errors
-from fetch_hand_sim.episode_log.untrusted import MAX_UNPACKED_BYTES, unpack
+from fetch_hand_sim.episode_log.untrusted import unpack
 
 _MAGIC = bytes([137, 77, 67, 65, 80, 48, 13, 10])
 _RECORD = struct.Struct('<BQ')

@@ -1,8 +1,8 @@
 """Records of a file that anybody may have made: no damage costs more memory than a limit.
 
 The mcap package believes the lengths a file gives and asks the system for that much memory. Here a
-length is compared with what is left of the file first, and a chunk is unpacked no further than the
-limits below, two orders above the largest episode this project writes.
+length is compared with what is left of the file first, and a chunk is unpacked no further than
+`limits` allow.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from mcap.exceptions import EndOfFile
 from mcap.records import Chunk, McapRecord
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-MAX_CHUNK_BYTES = 16 * 2**20
-MAX_UNPACKED_BYTES = 64 * 2**20
+from fetch_hand_sim.episode_log.limits import MAX_CHUNK_BYTES, MAX_UNPACKED_BYTES
 
 
 class _Readable(Protocol):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -11,10 +12,12 @@ from typing import Any, cast
 import numpy as np
 
 from fetch_hand_sim.episode_log import Episode, EpisodeReadError, episode_metadata, read_episode
+from fetch_hand_sim.episode_log.episode_metadata import interface_version
 from fetch_hand_sim.episode_log.model import model_sha256
 from fetch_hand_sim.episode_log.reader import UNREADABLE, one_line, printable
 from fetch_hand_sim.episode_log.ticks import LoggedTick, TickMessage, episode_task, split_ticks
 from fetch_hand_sim.episodes.context import source_revision
+from fetch_hand_sim.episodes.goals import accept_goal
 from fetch_hand_sim.episodes.recorder import episode_result
 from fetch_hand_sim.episodes.runner import Array, EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
@@ -158,6 +161,7 @@ def _compare(
 ) -> None:
     """Runs the episode and notes how far it is the recorded one."""
     encoder = TickEncoder(runner.spec)
+    version = interface_version(episode.metadata)
     for number, logged in enumerate(ticks):
         command = _applied_command(logged) if number else runner.resting_command()
         if command is None:
@@ -179,7 +183,7 @@ def _compare(
             return
         result.ticks += 1
         result.messages += len(logged.published)
-        _set_goals(runner, logged)
+        _set_goals(runner, logged, version)
     result.difference = _result_difference(ticks[-1], tick.status, runner, episode)
 
 
@@ -209,14 +213,13 @@ def _decoded(message: TickMessage) -> Array:
     return decode(message.topic, deserialize(message.topic.type_name, message.data))
 
 
-def _set_goals(runner: EpisodeRunner, logged: LoggedTick) -> None:
-    """Does what the node did with the goals it received; it dropped those that do not fit."""
+def _set_goals(runner: EpisodeRunner, logged: LoggedTick, version: int) -> None:
+    """Does what the node did with the goals it received."""
     for message in logged.received:
-        if message.topic.name == 'set_goal' and not runner.is_between_episodes:
-            try:
-                runner.set_goal(_decoded(message))
-            except ValueError:
-                continue
+        if message.topic.name == 'set_goal':
+            with suppress(ValueError):
+                goal = deserialize(message.topic.type_name, message.data)
+                accept_goal(runner, message.topic, goal, reads_header=version >= 2)
 
 
 def _tick_difference(

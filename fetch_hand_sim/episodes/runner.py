@@ -58,7 +58,7 @@ class EpisodeRunner:
         self._first_seed = first_seed
         self._episodes = episodes
         self._period_ns = round(simulation.tick_duration * 1e9)
-        self._first_stamp_ns = self._next_stamp_ns = first_stamp_ns
+        self._first_stamp_ns = self._next_stamp_ns = self._reset_stamp_ns = first_stamp_ns
         self._episode = first_episode
         self._tick = 0
         self._return = 0.0
@@ -89,6 +89,11 @@ class EpisodeRunner:
     def stamp_ns(self) -> int:
         """Simulated time of the last tick; one period before the first if there is none."""
         return self._next_stamp_ns - self._period_ns
+
+    @property
+    def reset_stamp_ns(self) -> int:
+        """Simulated time of tick 0 of the running or last episode."""
+        return self._reset_stamp_ns
 
     @property
     def has_started(self) -> bool:
@@ -129,6 +134,7 @@ class EpisodeRunner:
 
     def _reset(self) -> Tick:
         self._tick = 0
+        self._reset_stamp_ns = self._next_stamp_ns
         self._return = 0.0
         self.has_diverged = False
         self.is_between_episodes = False

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from fetch_hand_sim.sim_node.command_buffer import CommandRejected
 from fetch_hand_sim.sim_node.robot import Robot
-from msgs_spec.codecs import decode, decode_status
+from msgs_spec.codecs import decode_status
 from msgs_spec.schemas import from_ros, serialize
 from msgs_spec.topics import TopicSpec
 
@@ -75,7 +75,7 @@ class Receivers:
 
     def _goal(self, spec: TopicSpec, message: Any) -> None:
         try:
-            self._robot.set_goal(lambda: decode(spec, message))
+            self._robot.set_goal(spec, message)
         except ValueError as error:
             self._warn(f'goal dropped: {error}')
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fetch_hand_sim.episodes.goals import accept_goal
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.schedule import TickSchedule
@@ -20,8 +21,6 @@ Messages = list[tuple[TopicSpec, bytes]]
 
 # A call that steps blocks the robot; this many ticks take the slowest task a few seconds.
 MAX_STEPS = 1000
-# Goals beyond, in metres, would overflow in distances and rewards sooner or later.
-FARTHEST_GOAL = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,19 +146,18 @@ class Robot:
         """
         self.buffer.accept_named(names, positions, self._clock())
 
-    def set_goal(self, read: Callable[[], NDArray[np.float64]]) -> None:
+    def set_goal(self, topic: TopicSpec, message: Any) -> None:
         """Replaces the goal of the running episode from the next tick on.
 
         Args:
-            read: Reads the goal (goal size,) from what was received.
+            topic: `set_goal` of the task.
+            message: What was received.
 
         Raises:
-            ValueError: If there is no episode, or the goal does not fit.
+            ValueError: If it is refused, see `accept_goal`.
         """
         try:
-            if self.runner.is_between_episodes:
-                raise ValueError('no episode is running')
-            self.runner.set_goal(_within_reach(read()))
+            accept_goal(self.runner, topic, message)
         except ValueError:
             self.counters.goals_rejected += 1
             raise
@@ -210,11 +208,3 @@ class Robot:
     def set_real_time_factor(self, factor: float) -> None:
         """Changes the pace from now on."""
         self.schedule.set_real_time_factor(factor, self._clock())
-
-
-def _within_reach(goal: NDArray[np.float64]) -> NDArray[np.float64]:
-    beyond = np.abs(goal) > FARTHEST_GOAL
-    if beyond.any():
-        allowed = f'-{FARTHEST_GOAL:g} ... {FARTHEST_GOAL:g}'
-        raise ValueError(f'{goal[beyond][0]:g} given; allowed: {allowed}')
-    return goal
