@@ -36,6 +36,8 @@ setup(
         ]
     ),
     package_data={'policy_node': ['actors/*']},
+    # Critics, to train on from a shipped actor: in the repository only.
+    exclude_package_data={'policy_node': ['actors/*.training.safetensors']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

@@ -41,6 +41,8 @@ class ActorInfo:
         config: The training configuration.
         success: Measured success and how it was measured; empty if unmeasured.
         goal_features: How observation and goal become inputs: `plain`, `relative`, `symmetric`.
+        init_from: What its training started from: name, task, environment steps, and what that
+            had started from; empty if from nothing.
     """
 
     task: str
@@ -57,6 +59,7 @@ class ActorInfo:
     config: dict[str, Any] = field(default_factory=dict)
     success: dict[str, Any] = field(default_factory=dict)
     goal_features: str = 'plain'
+    init_from: dict[str, Any] = field(default_factory=dict)
 
     @property
     def shape(self) -> NetworkShape:
@@ -153,8 +156,8 @@ def _info(path: str | Path, metadata: dict[str, str]) -> ActorInfo:
     version = metadata.get('format_version')
     if version != str(FORMAT_VERSION):
         raise ValueError(f'{path} has format version {version}; supported: {FORMAT_VERSION}')
-    # Files from before there were goal features have plain ones.
-    metadata = {'goal_features': '"plain"', **metadata}
+    # Files from before there were goal features have plain ones, and started from nothing.
+    metadata = {'goal_features': '"plain"', 'init_from': '{}', **metadata}
     names = [item.name for item in dataclasses.fields(ActorInfo)]
     missing = [name for name in names if name not in metadata]
     if missing:

@@ -8,4 +8,6 @@ from pathlib import Path
 def shipped_actors() -> dict[str, Path]:
     """Returns task name -> checkpoint of the actors that come with the package."""
     folder = Path(__file__).parents[1] / 'actors'
-    return {path.stem: path for path in sorted(folder.glob('*.safetensors'))}
+    # `<task>.training.safetensors` holds the critic of an actor.
+    files = sorted(folder.glob('*.safetensors'))
+    return {path.stem: path for path in files if '.' not in path.stem}

@@ -14,8 +14,9 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies import checkpoint
 from policy_node.training.evaluate_policy import FIRST_SEED, print_table
 from policy_node.training.evaluation.episodes import evaluate, summarize
-from policy_node.training.learning.run_folder import BEST_FILE
+from policy_node.training.learning.run_folder import BEST_FILE, STATE_FILE, companion_file
 from policy_node.training.learning.run_log import draw_curve, read_progress
+from policy_node.training.learning.training_state import TrainingState, read_state, write_state
 
 ACTORS = Path(__file__).parents[1] / 'actors'
 
@@ -64,13 +65,27 @@ def ship(options: argparse.Namespace) -> int:
         'sha256': checkpoint.checkpoint_hash(target),
         'env_steps': info.env_steps,
         'command': command,
+        'init_from': info.init_from,
         'source_revision': info.source_revision,
         **summary,
     }
     shipped.write_text(json.dumps(report, indent=2) + '\n')
+    if (options.run / STATE_FILE).is_file():
+        ship_critic(options.run / STATE_FILE, target)
     title = f'{info.task}, {info.config["recipe"]} recipe, seed {info.seed}'
     draw_curve(read_progress(options.run / 'progress.csv'), title, target.with_suffix('.png'))
     return 0
+
+
+def ship_critic(state_file: Path, actor: Path) -> None:
+    """Puts the critic of a run beside its shipped actor, so that training can go on from there.
+
+    The actor holds its normalisers itself; optimisers start fresh.
+    """
+    state = read_state(state_file)
+    tensors = {name: value for name, value in state.tensors.items() if name.startswith('critic.')}
+    extra = {'config': state.extra['config'], 'actor_sha256': checkpoint.checkpoint_hash(actor)}
+    write_state(companion_file(actor), TrainingState(tensors, state.counters, extra))
 
 
 def run_command(run: Path) -> str:

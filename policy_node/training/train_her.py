@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import shlex
 import signal
 import subprocess
@@ -23,6 +24,7 @@ from policy_node.training.learning.config import (
 )
 
 if TYPE_CHECKING:
+    from policy_node.training.learning.initial_networks import InitialNetworks
     from policy_node.training.learning.replay import Episodes
     from policy_node.training.learning.trainer import Trainer
 
@@ -55,6 +57,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='any field of TrainConfig')
     add('--output', type=Path, help='default: runs/<task>_<recipe>_seed<seed>')
     add('--resume', type=Path, help='folder of a run to continue; its configuration is kept')
+    add('--init-from', metavar='RUN', help='run folder or actor whose networks it starts from')
     add('--from-episodes', type=Path, metavar='DIR', help='logged episodes to learn from as well')
     return parser.parse_args(arguments)
 
@@ -69,6 +72,7 @@ _FIELD_OPTIONS = (
     'success_target',
     'strategy',
     'reward_type',
+    'init_from',
 )
 
 
@@ -93,9 +97,11 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
             raise ValueError(f'--task is missing; allowed: {", ".join(TASKS)}')
         return recipe_config(options.task, options.recipe, **overrides)
     from policy_node.training.learning.run_folder import STATE_FILE
-    from policy_node.training.learning.training_state import read_extra
+    from policy_node.training.learning.training_state import read_state
 
-    stored = read_extra(options.resume / STATE_FILE)['config']
+    if options.init_from is not None:
+        raise ValueError('--init-from excludes --resume: a run goes on with its own networks')
+    stored = read_state(options.resume / STATE_FILE).extra['config']
     if options.task not in (None, stored['task']):
         raise ValueError(f'{options.resume} is a run of {stored["task"]}, not of {options.task}')
     return config_from_dict({**stored, **overrides})
@@ -139,11 +145,14 @@ def train(config: TrainConfig, options: argparse.Namespace, arguments: Sequence[
     output = output or Path('runs') / f'{config.task}_{config.recipe}_seed{config.seed}'
     if options.resume is None and (output / STATE_FILE).exists():
         raise ValueError(f'{output} holds a run; continue it with --resume or choose another')
+    networks = None
+    if config.init_from and options.resume is None:
+        config, networks = _read_initial_networks(config)
     experience = _read_experience(config, options.from_episodes)
     output.mkdir(parents=True, exist_ok=True)
     workers = join_workers(choose_device(config.device))
     command = shlex.join(['train_her', *arguments])
-    trainer = Trainer(config, output, workers, command, source_revision())
+    trainer = Trainer(config, output, workers, command, source_revision(), networks)
     if options.resume is not None:
         trainer.resume(output / STATE_FILE)
     if experience is not None:
@@ -166,6 +175,26 @@ def train(config: TrainConfig, options: argparse.Namespace, arguments: Sequence[
     if workers.is_first:
         _report(config, output, reason, trainer.counters)
     return 0
+
+
+def _read_initial_networks(config: TrainConfig) -> tuple[TrainConfig, InitialNetworks]:
+    """Reads the networks to start from; a critic that must start from nothing learns first.
+
+    Raises:
+        ValueError: If there are none of that name or they do not fit.
+    """
+    from policy_node.training.learning.initial_networks import CRITIC_FIRST, read_initial_networks
+
+    networks = read_initial_networks(config.init_from)
+    networks.require_fit(config)
+    if not networks.has_critic and config.critic_first == 0:
+        config = dataclasses.replace(config, critic_first=CRITIC_FIRST)
+        print(
+            f'{config.init_from} has no critic beside it: a new one learns for '
+            f'{CRITIC_FIRST:,} updates before the actor does',
+            file=sys.stderr,
+        )
+    return config, networks
 
 
 def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | None:

@@ -13,7 +13,7 @@ from policy_node.training import train_her
 from policy_node.training.learning.config import TrainConfig, config_from_dict, recipe_config
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.run_log import read_progress
-from policy_node.training.learning.training_state import read_extra
+from policy_node.training.learning.training_state import read_state
 
 PROGRESS_FILE = 'progress.csv'
 LOCK_FILE = '.lock'
@@ -101,7 +101,7 @@ class Job:
         """
         if not self.has_checkpoint:
             return
-        stored = config_from_dict(read_extra(self.folder / STATE_FILE)['config'])
+        stored = config_from_dict(read_state(self.folder / STATE_FILE).extra['config'])
         wanted = dataclasses.asdict(self.config)
         differing = [
             f'{name} {value!r}, now {wanted[name]!r}'

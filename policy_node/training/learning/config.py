@@ -44,6 +44,12 @@ class TrainConfig:
     moved_share: float = 0.0
     """Share of a batch from episodes in which the achieved goal moved; 0 draws uniformly."""
 
+    init_from: str = ''
+    """Networks and normalisers to start from: a run folder, a shipped actor or the file of one;
+    empty starts from nothing."""
+    critic_first: int = 0
+    """Updates of the critic alone before the actor learns too; 0 is 5,000 where `init_from` is an
+    actor without its critic, else none."""
     total_steps: int = 5_000_000
     """Environment steps of the run."""
     time_limit: float = 0.0
@@ -145,6 +151,7 @@ _RANGES = (
     ('hindsight_k', 1, 1000),
     ('reward_distance', 1e-3, 1000),
     ('moved_share', 0, 1),
+    ('critic_first', 0, _INFINITY),
     ('total_steps', 1, _INFINITY),
     ('time_limit', 0, _INFINITY),
     ('success_target', 0, 1),

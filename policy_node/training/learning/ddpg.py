@@ -104,7 +104,8 @@ class DDPG:
             action = self.actor(features)
             value = self.critic(features, action).mean()
             loss = -value + self.config.action_l2 * action.float().square().mean()
-        self._step(self.actor_optimizer, loss, self._actor_parameters)
+        if self.updates >= self.config.critic_first:
+            self._step(self.actor_optimizer, loss, self._actor_parameters)
         return loss, value
 
     def _step(

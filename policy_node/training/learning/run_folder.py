@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,11 @@ LATEST_FILE = 'latest.safetensors'
 BEST_FILE = 'best.safetensors'
 
 
+def companion_file(actor: Path) -> Path:
+    """Where the critic of an actor lies, so that training can go on from it."""
+    return actor.with_suffix('.training.safetensors')
+
+
 @dataclass(frozen=True, slots=True)
 class RunFolder:
     """Where a run writes its actors and the state that `--resume` goes on from.
@@ -30,12 +35,14 @@ class RunFolder:
         config: Configuration of the run.
         command: Command line, for the metadata of actors.
         source_revision: Revision of the source, likewise.
+        init_from: Origin of the networks the run started from; empty if they were random.
     """
 
     path: Path
     config: TrainConfig
     command: str = ''
     source_revision: str = ''
+    init_from: dict[str, Any] = field(default_factory=dict)
 
     def save_actor(
         self, name: str, actor: Actor, env_steps: int, success: dict[str, Any] | None = None
@@ -64,6 +71,7 @@ class RunFolder:
             config=dataclasses.asdict(config),
             success=success or {},
             goal_features=config.goal_features,
+            init_from=self.init_from,
         )
         checkpoint.save(self.path / name, actor, info)
 
@@ -71,5 +79,6 @@ class RunFolder:
         self, learner: DDPG, statistics: dict[str, RunningStatistics], counters: Counters
     ) -> None:
         """Writes everything that a resumed run needs but the replay."""
-        extra = {'config': dataclasses.asdict(self.config)}
+        config = dataclasses.asdict(self.config)
+        extra = {'config': config, 'command': self.command, 'init_from': self.init_from}
         save_state(self.path / STATE_FILE, learner, statistics, counters, extra)

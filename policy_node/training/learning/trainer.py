@@ -15,8 +15,7 @@ import torch
 
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
-from policy_node.policies.actor import Actor, NetworkShape
-from policy_node.policies.goal_features import goal_features
+from policy_node.policies.actor import Actor
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
 from policy_node.training.learning.collector import Collector
@@ -24,11 +23,12 @@ from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.ddpg import DDPG, Losses, choose_device
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.initial_networks import InitialNetworks, network_shape
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE, RunFolder
 from policy_node.training.learning.run_log import RunLog
 from policy_node.training.learning.threads import split_threads
-from policy_node.training.learning.training_state import Counters, load_state
+from policy_node.training.learning.training_state import Counters, load_networks, load_state
 
 
 class TrainingError(RuntimeError):
@@ -55,6 +55,7 @@ class Trainer:
         workers: Workers,
         command: str = '',
         source_revision: str = '',
+        init_from: InitialNetworks | None = None,
     ) -> None:
         """Prepares simulations, networks and the output folder.
 
@@ -64,16 +65,20 @@ class Trainer:
             workers: This worker among all.
             command: Command line, for the metadata of checkpoints.
             source_revision: Revision of the source, likewise.
+            init_from: Networks to start from; None starts from random ones.
         """
         self.config = config
         self.workers = workers
-        self._folder = RunFolder(output, config, command, source_revision)
+        origin = {} if init_from is None else init_from.origin
+        self._folder = RunFolder(output, config, command, source_revision, origin)
         self.device = choose_device(config.device)
         self._simulation_threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
         torch.manual_seed(config.seed)
         self._build_simulations()
         self._build_learner()
+        if init_from is not None:
+            load_networks(init_from.tensors, self.learner, self.experience.statistics)
         self.counters = Counters()
         self._stop_reason = ''
         self._learning_starts = config.learning_starts
@@ -110,15 +115,7 @@ class Trainer:
 
     def _build_learner(self) -> None:
         config, spec = self.config, self.spec
-        shape = NetworkShape(
-            observation_size=spec.observation_size,
-            goal_size=spec.goal.size,
-            action_size=spec.robot.action_size,
-            hidden_sizes=config.hidden_sizes,
-            layer_norm=config.layer_norm,
-            goal_features=goal_features(config.goal_features, spec),
-        )
-        self.learner = DDPG(shape, config, self.device, self.workers)
+        self.learner = DDPG(network_shape(config), config, self.device, self.workers)
         compute_reward = scale_distance(self.simulation.metric, config.reward_distance).reward
         generator = self._seed(env_steps=0)
         self.experience = Experience(config, spec, self.workers, compute_reward, generator)
@@ -133,7 +130,9 @@ class Trainer:
         Raises:
             ValueError: If the file does not fit the configuration.
         """
-        self.counters = load_state(path, self.learner, self.experience.statistics)
+        state = load_state(path, self.learner, self.experience.statistics)
+        self.counters = state.counters
+        self._folder = replace(self._folder, init_from=state.extra.get('init_from', {}))
         # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
         self.experience.generator = self._seed(self.counters.env_steps)
         refill = min(self.counters.env_steps, self.config.replay_transitions, 100_000)

@@ -1,4 +1,4 @@
-"""Everything a run needs to go on, in one safetensors file. The replay is refilled instead."""
+"""Networks, optimisers, normalisers and counters of a run in one safetensors file."""
 
 from __future__ import annotations
 
@@ -39,6 +39,21 @@ class Counters:
     best_return: float = -1e9
 
 
+@dataclass(frozen=True, slots=True)
+class TrainingState:
+    """What a file holds.
+
+    Attributes:
+        tensors: By part and name, `critic.network.output.bias`.
+        counters: How far the run was.
+        extra: JSON values: configuration, command, origin of the first networks.
+    """
+
+    tensors: dict[str, Tensor]
+    counters: Counters
+    extra: dict[str, Any]
+
+
 def save_state(
     path: Path,
     learner: DDPG,
@@ -46,14 +61,14 @@ def save_state(
     counters: Counters,
     extra: dict[str, Any],
 ) -> None:
-    """Writes networks, optimisers, normalisers, counters and generators.
+    """Writes everything that a resumed run needs but the replay.
 
     Args:
         path: File to write.
         learner: The learner.
         statistics: The normalisers by name.
         counters: How far the run is.
-        extra: JSON values to give back on load: configuration and generator states.
+        extra: JSON values to give back on load.
     """
     tensors: dict[str, Tensor] = {'torch_generator': torch.get_rng_state()}
     for part, module in _modules(learner).items():
@@ -66,55 +81,98 @@ def save_state(
     for part, running in statistics.items():
         for name, value in running.state().items():
             tensors[f'{part}.{name}'] = value
-    values = {name: getattr(counters, name) for name in Counters.__slots__}
+    write_state(path, TrainingState(tensors, counters, extra))
+
+
+def write_state(path: Path, state: TrainingState) -> None:
+    """Writes a state; the file is complete or not there."""
+    values = {name: getattr(state.counters, name) for name in Counters.__slots__}
     metadata = {'format': FORMAT, 'format_version': str(FORMAT_VERSION)}
-    metadata |= {'counters': json.dumps(values), 'extra': json.dumps(extra)}
-    write_tensors(path, tensors, metadata)
+    metadata |= {'counters': json.dumps(values), 'extra': json.dumps(state.extra)}
+    write_tensors(path, state.tensors, metadata)
 
 
-def read_extra(path: Path) -> dict[str, Any]:
-    """Reads the `extra` values of a training state.
-
-    Raises:
-        ValueError: If the file is no training state of this version.
-    """
-    _, metadata = _read(path)
-    return dict(json.loads(metadata['extra']))
-
-
-def load_state(path: Path, learner: DDPG, statistics: dict[str, RunningStatistics]) -> Counters:
-    """Fills learner and normalisers from a file and returns how far the run was.
+def read_state(path: Path) -> TrainingState:
+    """Reads a training state.
 
     Raises:
-        ValueError: If the file is no training state or its tensors do not fit.
+        ValueError: If the file is no training state of this version, or damaged.
     """
-    tensors, metadata = _read(path)
-    if not _part(tensors, 'average_actor'):
-        # States from before there was an average start it at the actor.
-        network = _part(_part(tensors, 'actor'), 'network')
-        tensors |= {f'average_actor.{name}': value for name, value in network.items()}
-    torch.set_rng_state(tensors.pop('torch_generator'))
-    try:
-        for part, module in _modules(learner).items():
-            module.load_state_dict(_part(tensors, part))
-        for part, optimizer in _optimizers(learner).items():
-            _load_optimizer(optimizer, _part(tensors, part))
-        for part, running in statistics.items():
-            running.load_state(_part(tensors, part))
-    except (RuntimeError, KeyError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f'{path} does not fit this configuration: {reason}') from None
-    counters = Counters(**json.loads(metadata['counters']))
-    learner.updates = counters.updates
-    return counters
-
-
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     tensors, metadata = read_tensors(path)
     found = (metadata.get('format'), metadata.get('format_version'))
     if found != (FORMAT, str(FORMAT_VERSION)):
         raise ValueError(f'{path} is no training state of version {FORMAT_VERSION}: {found}')
-    return tensors, metadata
+    try:
+        counters = Counters(**json.loads(metadata['counters']))
+        extra = dict(json.loads(metadata['extra']))
+        if not isinstance(extra['config'], dict):
+            raise TypeError('config is no object')
+    except KeyError as error:
+        raise ValueError(f'{path} lacks {error.args[0]!r} in its metadata') from None
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f'{path} has unreadable metadata: {error}') from None
+    return TrainingState(tensors, counters, extra)
+
+
+def load_state(
+    path: Path, learner: DDPG, statistics: dict[str, RunningStatistics]
+) -> TrainingState:
+    """Fills learner and normalisers from a file and returns what it holds.
+
+    Raises:
+        ValueError: If the file is no training state or its tensors do not fit.
+    """
+    state = read_state(path)
+    try:
+        torch.set_rng_state(state.tensors['torch_generator'])
+        load_networks(state.tensors, learner, statistics)
+        for part, optimizer in _optimizers(learner).items():
+            _load_optimizer(optimizer, part_of(state.tensors, part))
+    except (RuntimeError, KeyError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f'{path} does not fit this configuration: {reason}') from None
+    learner.updates = state.counters.updates
+    return state
+
+
+def load_networks(
+    tensors: dict[str, Tensor], learner: DDPG, statistics: dict[str, RunningStatistics]
+) -> None:
+    """Fills networks and normalisers; without a critic the learner keeps its own.
+
+    Raises:
+        RuntimeError: If sizes do not fit.
+        KeyError: If a part is incomplete.
+    """
+    tensors = _with_copies(tensors)
+    for part, module in _modules(learner).items():
+        if part_of(tensors, part) or 'critic' not in part:
+            module.load_state_dict(part_of(tensors, part))
+    for part, running in statistics.items():
+        running.load_state(part_of(tensors, part))
+
+
+def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
+    """The tensors of one part, by their names in it."""
+    prefix = f'{part}.'
+    return {
+        name.removeprefix(prefix): value
+        for name, value in tensors.items()
+        if name.startswith(prefix)
+    }
+
+
+def _with_copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Targets and average where a file has none: they start at actor and critic."""
+    actor, critic = part_of(tensors, 'actor.network'), part_of(tensors, 'critic')
+    sources = {'target_actor': actor, 'average_actor': actor, 'target_critic': critic}
+    copies = {
+        f'{part}.{name}': value
+        for part, source in sources.items()
+        if not part_of(tensors, part)
+        for name, value in source.items()
+    }
+    return tensors | copies
 
 
 def _modules(learner: DDPG) -> dict[str, torch.nn.Module]:
@@ -131,15 +189,6 @@ def _optimizers(learner: DDPG) -> dict[str, torch.optim.Adam]:
     return {
         'actor_optimizer': learner.actor_optimizer,
         'critic_optimizer': learner.critic_optimizer,
-    }
-
-
-def _part(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
-    prefix = f'{part}.'
-    return {
-        name.removeprefix(prefix): value
-        for name, value in tensors.items()
-        if name.startswith(prefix)
     }
 
 

@@ -24,7 +24,7 @@ from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.logged_episodes import read_experience
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.trainer import Collected, Trainer, TrainingError, scale_distance
-from policy_node.training.learning.training_state import read_extra
+from policy_node.training.learning.training_state import read_state
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
 
@@ -78,10 +78,11 @@ def test_fetch_reach_is_learnt_from_nothing(tmp_path: Path) -> None:
         )
         == 0
     )
-    assert sorted(path.suffix for path in (tmp_path / 'actors').iterdir()) == [
-        '.json',
-        '.png',
-        '.safetensors',
+    assert sorted(path.name for path in (tmp_path / 'actors').iterdir()) == [
+        'FetchReach.json',
+        'FetchReach.png',
+        'FetchReach.safetensors',
+        'FetchReach.training.safetensors',
     ]
     assert (
         ship_actor(
@@ -121,7 +122,7 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(tmp_path: Path, overla
 )
 def test_the_four_arms_run(tmp_path: Path, arm: list[str]) -> None:
     assert main([*SMALL, *arm, '--output', str(tmp_path / 'run')]) == 0
-    config = read_extra(tmp_path / 'run' / 'training_state.safetensors')['config']
+    config = read_state(tmp_path / 'run' / 'training_state.safetensors').extra['config']
     assert config['reward_type'] == arm[arm.index('--reward-type') + 1]
     assert (config['strategy'] == 'none') == ('--no-her' in arm)
 
@@ -268,7 +269,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(tmp_pa
         trainer.train()
     kept = weights(tmp_path / 'training_state.safetensors')
     assert all(torch.isfinite(value.float()).all() for value in kept.values())
-    assert read_extra(tmp_path / 'training_state.safetensors')['config']['num_envs'] == 8
+    assert read_state(tmp_path / 'training_state.safetensors').extra['config']['num_envs'] == 8
 
 
 def test_an_observation_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:

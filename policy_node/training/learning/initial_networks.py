@@ -1,0 +1,147 @@
+"""Networks that a run starts from instead of random ones: those of another run or actor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from msgs_spec.tasks import task_spec
+from policy_node.policies import checkpoint
+from policy_node.policies.actor import NetworkShape, actor_path
+from policy_node.policies.goal_features import goal_features
+from policy_node.training.learning.config import TrainConfig, config_from_dict
+from policy_node.training.learning.run_folder import STATE_FILE, companion_file
+from policy_node.training.learning.training_state import part_of, read_state
+
+# Updates of the critic alone where it starts from nothing beside an actor that is already good:
+# the gradient of a critic that knows nothing would ruin it.
+CRITIC_FIRST = 5_000
+
+
+@dataclass(frozen=True, slots=True)
+class InitialNetworks:
+    """Weights and normalisers to start from.
+
+    Attributes:
+        tensors: Named as in a training state; without optimisers, counters and generators.
+        shape: What they fit.
+        goal_features: Their kind of inputs.
+        origin: Where they come from, for the record: name, task, environment steps and command.
+    """
+
+    tensors: dict[str, Tensor]
+    shape: NetworkShape
+    goal_features: str
+    origin: dict[str, Any]
+
+    @property
+    def has_critic(self) -> bool:
+        """Whether there is more than an actor."""
+        return any(name.startswith('critic.') for name in self.tensors)
+
+    def require_fit(self, config: TrainConfig) -> None:
+        """Refuses networks that another run cannot start from.
+
+        Raises:
+            ValueError: One line names the sizes of both.
+        """
+        ours, theirs = network_shape(config), self.shape
+        pairs = {
+            'observation': (theirs.observation_size, ours.observation_size),
+            'goal': (theirs.goal_size, ours.goal_size),
+            'action': (theirs.action_size, ours.action_size),
+            'hidden_sizes': (theirs.hidden_sizes, ours.hidden_sizes),
+            'layer_norm': (theirs.layer_norm, ours.layer_norm),
+            'goal_features': (self.goal_features, config.goal_features),
+            'inputs': (theirs.feature_size, ours.feature_size),
+        }
+        differing = [f'{name} {old}, now {new}' for name, (old, new) in pairs.items() if old != new]
+        if differing:
+            origin = f'{self.origin["name"]} ({self.origin["task"]})'
+            raise ValueError(f'{config.task} cannot start from {origin}: {"; ".join(differing)}')
+
+
+def network_shape(config: TrainConfig) -> NetworkShape:
+    """Shape of the actor, and of the critic, that a configuration asks for."""
+    spec = task_spec(config.task)
+    return NetworkShape(
+        observation_size=spec.observation_size,
+        goal_size=spec.goal.size,
+        action_size=spec.robot.action_size,
+        hidden_sizes=config.hidden_sizes,
+        layer_norm=config.layer_norm,
+        goal_features=goal_features(config.goal_features, spec),
+    )
+
+
+def read_initial_networks(name: str) -> InitialNetworks:
+    """Reads the networks called `name`.
+
+    Args:
+        name: A run folder, whose latest networks are meant; a shipped actor; or the file of an
+            actor. The critic of an actor lies beside it (`<Task>.training.safetensors`), or in the
+            training state of the run folder that holds the file; without either it is missing.
+
+    Raises:
+        ValueError: If there is no such actor or run, or a file is damaged.
+    """
+    path = Path(name)
+    return _of_run(path) if path.is_dir() else _of_actor(name, actor_path(name))
+
+
+def _of_run(folder: Path) -> InitialNetworks:
+    state = read_state(folder / STATE_FILE)
+    config = config_from_dict(state.extra['config'])
+    kept = ('actor', 'critic', 'target_', 'average_actor', 'observation_stat', 'goal_stat')
+    tensors = {
+        key: value
+        for key, value in state.tensors.items()
+        if key.startswith(kept) and '_optimizer.' not in key
+    }
+    origin = {
+        'name': str(folder),
+        'task': config.task,
+        'env_steps': state.counters.env_steps,
+        'command': state.extra.get('command', ''),
+        'init_from': state.extra.get('init_from', {}),
+    }
+    return InitialNetworks(tensors, network_shape(config), config.goal_features, origin)
+
+
+def _of_actor(name: str, path: Path) -> InitialNetworks:
+    actor, info = checkpoint.load(path)
+    tensors = {f'actor.{key}': value for key, value in actor.state_dict().items()}
+    for part in ('observation', 'goal'):
+        mean, std = (tensors[f'actor.{part}_normalizer.{key}'] for key in ('mean', 'std'))
+        for key, value in _sums(mean, std, info.env_steps).items():
+            tensors[f'{part}_statistics.{key}'] = value
+    beside = (companion_file(path), path.parent / STATE_FILE)
+    source = next((file for file in beside if file.is_file()), None)
+    digest = checkpoint.checkpoint_hash(path)
+    if source is not None:
+        state = read_state(source)
+        if state.extra.get('actor_sha256', digest) != digest:
+            raise ValueError(f'{source} is the critic of another actor than {path}')
+        critic = part_of(state.tensors, 'critic')
+        tensors |= {f'critic.{key}': value for key, value in critic.items()}
+    origin = {
+        'name': name,
+        'task': info.task,
+        'env_steps': info.env_steps,
+        'command': info.command,
+        'sha256': digest,
+        'init_from': info.init_from,
+    }
+    return InitialNetworks(tensors, info.shape, info.goal_features, origin)
+
+
+def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:
+    """Sums of a `RunningStatistics` that has seen `count` inputs of this mean and deviation."""
+    number = torch.tensor([float(max(count, 1))], dtype=torch.float64)
+    mean, std = mean.double(), std.double()
+    square = (std.square() + mean.square()) * number
+    return {'count': number, 'total': mean * number, 'total_square': square}

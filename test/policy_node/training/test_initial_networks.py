@@ -1,0 +1,171 @@
+"""Runs that start from the networks of another run or actor."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from policy_node.policies import checkpoint
+from policy_node.policies.actor import load_actor
+from policy_node.policies.shipped import shipped_actors
+from policy_node.training.learning.config import TrainConfig, recipe_config
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.initial_networks import read_initial_networks
+from policy_node.training.learning.run_log import read_progress
+from policy_node.training.learning.trainer import Trainer
+from policy_node.training.ship_actor import main as ship_actor
+from policy_node.training.train_her import main
+
+torch.set_num_threads(1)
+
+# One cycle of two simulations.
+TINY = {'num_envs': 2, 'updates_per_cycle': 3, 'batch_size': 32, 'evaluation_episodes': 2}
+TINY |= {'simulation_threads': 1, 'torch_threads': 1, 'hidden_sizes': (32, 32)}
+SET = [f'--set={name}={value}' for name, value in TINY.items() if name != 'hidden_sizes']
+SET.append('--set=hidden_sizes=32,32')
+
+
+def tiny(task: str, **changes: object) -> TrainConfig:
+    return recipe_config(task, 'best', **{**TINY, 'total_steps': 200, **changes})
+
+
+@pytest.fixture(scope='module')
+def block_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of HandManipulateBlockRotateXYZ with a best actor."""
+    folder = tmp_path_factory.mktemp('xyz')
+    arguments = ['--task', 'HandManipulateBlockRotateXYZ', '--steps', '400', *SET]
+    assert main([*arguments, '--set', 'evaluate_every=200', '--output', str(folder)]) == 0
+    return folder
+
+
+def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
+    return first.keys() == second.keys() and all(torch.equal(first[n], second[n]) for n in first)
+
+
+def test_a_run_starts_with_all_networks_of_another(tmp_path: Path, block_run: Path) -> None:
+    networks = read_initial_networks(str(block_run))
+    config = tiny('HandManipulateBlockFull')
+    networks.require_fit(config)
+    source = Trainer(tiny('HandManipulateBlockRotateXYZ'), tmp_path, Workers())
+    source.resume(block_run / 'training_state.safetensors')
+    started = Trainer(config, tmp_path, Workers(), init_from=networks)
+    for name in ('actor', 'critic', 'target_actor', 'target_critic', 'average_actor'):
+        ours, theirs = (getattr(trainer.learner, name) for trainer in (started, source))
+        assert same(ours.state_dict(), theirs.state_dict()), name
+    for name, statistics in started.experience.statistics.items():
+        assert same(statistics.state(), source.experience.statistics[name].state())
+    assert (started.counters.env_steps, started.counters.updates, started.learner.updates) == (
+        0,
+    ) * 3
+    assert started.learner.critic_optimizer.state_dict()['state'] == {}
+    assert source.learner.critic_optimizer.state_dict()['state'] != {}
+
+
+def test_where_it_started_is_kept_through_resume_and_shipped(
+    tmp_path: Path, block_run: Path
+) -> None:
+    run, actors = tmp_path / 'full', tmp_path / 'actors'
+    arguments = ['--task', 'HandManipulateBlockFull', '--steps', '200', *SET]
+    assert main([*arguments, '--init-from', str(block_run), '--output', str(run)]) == 0
+    resume = ['--resume', str(run), '--steps', '400', '--set', 'evaluate_every=1']
+    assert main(resume) == 0
+    origin = checkpoint.read_info(run / 'latest.safetensors').init_from
+    assert origin['task'] == 'HandManipulateBlockRotateXYZ'
+    assert origin['env_steps'] == 400 and 'RotateXYZ' in origin['command']
+    shipping = [str(run), '--episodes', '2', '--threads', '1', '--actors', str(actors)]
+    assert ship_actor(shipping) == 0
+    report = json.loads((actors / 'HandManipulateBlockFull.json').read_text())
+    assert report['init_from'] == origin
+    shipped = read_initial_networks(str(actors / 'HandManipulateBlockFull.safetensors'))
+    assert shipped.has_critic
+    latest = read_initial_networks(str(run))
+    critic = {name for name in latest.tensors if name.startswith('critic.')}
+    assert all(torch.equal(shipped.tensors[name], latest.tensors[name]) for name in critic)
+    best, _ = checkpoint.load(run / 'best.safetensors')
+    assert all(
+        torch.equal(shipped.tensors[f'actor.{name}'], value)
+        for name, value in best.state_dict().items()
+    )
+    shutil.copy(run / 'latest.safetensors', actors / 'HandManipulateBlockFull.safetensors')
+    with pytest.raises(ValueError, match='is the critic of another actor'):
+        read_initial_networks(str(actors / 'HandManipulateBlockFull.safetensors'))
+
+
+def test_normalisers_of_an_actor_go_on_from_what_it_has_seen(tmp_path: Path) -> None:
+    networks = read_initial_networks('FetchReach')
+    trainer = Trainer(recipe_config('FetchReach', 'best'), tmp_path, Workers(), init_from=networks)
+    before = {name: value.clone() for name, value in trainer.learner.actor.state_dict().items()}
+    trainer.experience.normalize(
+        trainer.collector.collect(trainer.learner.actor)[0], trainer.learner.actor, 0
+    )
+    steps = checkpoint.read_info(shipped_actors()['FetchReach']).env_steps
+    count = trainer.experience.statistics['observation_statistics'].count.item()
+    assert count == steps + trainer.simulation.num_envs * 50
+    for name, value in trainer.learner.actor.state_dict().items():
+        torch.testing.assert_close(value, before[name], rtol=0.25, atol=0.05)
+
+
+def test_an_actor_alone_acts_from_the_first_cycle_while_its_critic_learns(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    actor = tmp_path / 'alone.safetensors'
+    shutil.copy(shipped_actors()['FetchReach'], actor)
+    arguments = ['--task', 'FetchReach', '--init-from', str(actor), '--steps', '2000']
+    arguments += ['--num-envs', '20', '--threads', '1', '--torch-threads', '1']
+    arguments += ['--set', 'updates_per_cycle=5', '--set', 'batch_size=64']
+    arguments += ['--set', 'evaluation_episodes=20', '--output', str(tmp_path / 'run')]
+    assert main(arguments) == 0
+    assert 'a new one learns for 5,000 updates before the actor does' in capsys.readouterr().err
+    evaluated = [
+        row for row in read_progress(tmp_path / 'run/progress.csv') if 'eval_success' in row
+    ]
+    assert evaluated[0]['eval_success'] >= 0.95, 'from nothing it would be about 0'
+    learnt = checkpoint.load(tmp_path / 'run' / 'latest.safetensors')[0]
+    assert same(learnt.network.state_dict(), load_actor('FetchReach').network.state_dict())
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--task', 'HandReach'], 'observation 10, now 63; goal 3, now 15; action 4, now 20'),
+        (['--task', 'FetchReach', '--set', 'hidden_sizes=9'], 'hidden_sizes (256, 256, 256), now'),
+        (
+            ['--task', 'FetchReach', '--set', 'goal_features=relative'],
+            'goal_features plain, now rel',
+        ),
+    ],
+)
+def test_networks_that_do_not_fit_are_refused_before_anything_is_written(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = ['--init-from', 'FetchReach', '--output', str(tmp_path / 'run')]
+    assert main([*arguments, *output]) == 2
+    error = capsys.readouterr().err
+    assert 'cannot start from FetchReach (FetchReach): ' in error
+    assert message in error and error.count('\n') == 1
+    assert not (tmp_path / 'run').exists()
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--init-from', 'Nobody'], "no actor 'Nobody'; shipped: "),
+        (['--init-from', '.'], 'training_state.safetensors is not a readable'),
+        (['--init-from', 'FetchReach', '--resume', '.'], '--init-from excludes --resume'),
+    ],
+)
+def test_a_start_that_is_not_there_is_one_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(['--task', 'FetchReach', *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
