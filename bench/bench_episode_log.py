@@ -30,7 +30,7 @@ from fetch_hand_sim.episodes.context import RecordingContext  # noqa: E402
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder  # noqa: E402
 from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
-from msgs_spec.cdr import TopicEncoder  # noqa: E402
+from msgs_spec.cdr import TopicCodec  # noqa: E402
 from msgs_spec.tasks import TASKS  # noqa: E402
 from msgs_spec.tick import Tick, TickEncoder  # noqa: E402
 from msgs_spec.topics import TopicSpec, topic  # noqa: E402
@@ -48,7 +48,7 @@ class Robot:
     def __init__(self, task: str, directory: Path, with_compiled_model: bool) -> None:
         simulation = Simulation(task, num_threads=1)
         self.commands = topic(simulation.spec, 'commands')
-        self.command = TopicEncoder(self.commands).encode(0, np.zeros(self.commands.size))
+        self.command = TopicCodec(self.commands).encode(0, np.zeros(self.commands.size))
         self.ticks = _episode(simulation)
         self.directory = directory
         self.logged = threading.Semaphore(0)

@@ -30,7 +30,7 @@ import rclpy  # noqa: E402
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
-from msgs_spec.cdr import TopicEncoder  # noqa: E402
+from msgs_spec.cdr import TopicCodec  # noqa: E402
 from msgs_spec.codecs import decode_status  # noqa: E402
 from msgs_spec.observations import ObservationAssembler  # noqa: E402
 from msgs_spec.qos import STATE, rclpy_profile  # noqa: E402
@@ -57,7 +57,7 @@ def echo(spec: TaskSpec) -> None:
     publisher = node.create_publisher(
         ros_message_class(commands.type_name), 'commands', rclpy_profile(commands.qos)
     )
-    command = TopicEncoder(commands).encode(0, np.zeros(commands.size))
+    command = TopicCodec(commands).encode(0, np.zeros(commands.size))
     *others, last = observed(spec)
     for name in (*others, last):
         node.create_subscription(

@@ -7,14 +7,16 @@ written and read without a ROS installation. Types are named as ROS names them:
 
 from __future__ import annotations
 
-from array import array
-from dataclasses import fields
+import struct
 from functools import cache
 from typing import Any
 
-import numpy as np
+from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
+
+# What the type store raises for bytes that are not such a message; asserts find bytes left over.
+_UNREADABLE = (AssertionError, IndexError, MemoryError, SerdeError, struct.error)
 
 
 @cache
@@ -61,33 +63,14 @@ def serialize(type_name: str, message: object) -> bytes:
     return bytes(_store().serialize_cdr(message, type_name, little_endian=True))
 
 
-def from_ros(message: Any) -> Any:
-    """Returns a message of rclpy as an instance of `message_class`, to be given to `serialize`.
-
-    `rclpy.serialization` would do for the bytes, but leaves uninitialised ones at their end.
-    """
-    package = type(message).__module__.split('.')[0]
-    target = message_class(f'{package}/msg/{type(message).__name__}')
-    names = [item.name for item in fields(target) if item.name != '__msgtype__']
-    return target(**{name: _plain(getattr(message, name)) for name in names})
-
-
-def _plain(value: Any) -> Any:
-    if hasattr(value, 'get_fields_and_field_types'):
-        return from_ros(value)
-    if isinstance(value, array | np.ndarray):
-        return np.asarray(value)
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    # ROS's `byte` is a bytes object in rclpy and a number in the type store.
-    return value[0] if isinstance(value, bytes) else value
-
-
 def deserialize(type_name: str, data: bytes) -> Any:
     """Returns the message in `data` as an instance of `message_class(type_name)`.
 
     Raises:
-        rosbags.interfaces.SerdeError: If the bytes are not such a message.
+        ValueError: If the bytes are not such a message, or there is no such type.
     """
     message_class(type_name)
-    return _store().deserialize_cdr(data, type_name)
+    try:
+        return _store().deserialize_cdr(data, type_name)
+    except _UNREADABLE as error:
+        raise ValueError(f'no readable {type_name}: {error}') from None

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.cdr import TopicEncoder
+from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_status
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TaskSpec
@@ -175,7 +175,7 @@ class TickEncoder:
         published = [spec for spec in topics(task) if spec.direction == 'published']
         self._status = next(spec for spec in published if spec.name == 'episode_status')
         self._encoders = [
-            (spec, TopicEncoder(spec), _VECTORS[spec.name])
+            (spec, TopicCodec(spec), _VECTORS[spec.name])
             for spec in published
             if spec is not self._status
         ]

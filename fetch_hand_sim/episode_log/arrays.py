@@ -14,7 +14,7 @@ from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.messages import MessageFile, MessageRows, read_messages
 from fetch_hand_sim.episode_log.summary import expand_episodes
-from msgs_spec.cdr import TopicEncoder
+from msgs_spec.cdr import TopicCodec
 from msgs_spec.commands import action_from_command
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import TaskSpec, task_spec
@@ -113,8 +113,8 @@ def load_episode(path: Path) -> EpisodeArrays:
 
 
 @cache
-def _encoder(task: TaskSpec, name: str) -> TopicEncoder:
-    return TopicEncoder(topic(task, name))
+def _codec(task: TaskSpec, name: str) -> TopicCodec:
+    return TopicCodec(topic(task, name))
 
 
 @cache
@@ -174,10 +174,10 @@ class _Decoder:
         vectors: dict[str, Array] = {}
         stamps: NDArray[np.int64] | None = None
         for name, found in rows.items():
-            given, values = _encoder(self._task, name).decode(found.data[:ticks])
+            given, values = _codec(self._task, name).decode_many(found.data[:ticks])
             vectors[name] = values
             stamps = given if stamps is None else stamps
-            if given is None or stamps is None or not np.array_equal(given, stamps):
+            if not np.array_equal(given, stamps):
                 raise ValueError(f'{name} has other stamps than the topics before it')
         if stamps is None or not (np.diff(stamps) > 0).all():
             raise ValueError('stamps do not grow')
@@ -197,4 +197,4 @@ class _Decoder:
         ticks = np.searchsorted(stamps, rows.log_times[:count], side='right') - 1
         if not np.array_equal(ticks, np.arange(first, len(stamps))):
             raise ValueError(f'{name} is missing at some ticks')
-        return _encoder(self._task, name).decode(rows.data[:count])[1]
+        return _codec(self._task, name).decode_many(rows.data[:count])[1]

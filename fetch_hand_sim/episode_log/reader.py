@@ -13,7 +13,6 @@ from typing import BinaryIO
 import zstandard
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metadata, Schema
-from rosbags.serde import SerdeError
 
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
@@ -37,9 +36,6 @@ DAMAGED = (
     struct.error,
     zstandard.ZstdError,
 )
-
-# What deserialising bytes raises that are no message of their type.
-UNREADABLE = (SerdeError, AssertionError, *DAMAGED)
 
 
 @dataclass(frozen=True, slots=True)

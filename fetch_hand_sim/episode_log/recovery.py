@@ -14,7 +14,7 @@ from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.bag_file import ChannelSpec
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT, begin_bag, complete_bag
 from fetch_hand_sim.episode_log.errors import EpisodeLogError
-from fetch_hand_sim.episode_log.reader import DAMAGED, UNREADABLE, one_line, read_episode
+from fetch_hand_sim.episode_log.reader import DAMAGED, one_line, read_episode
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from fetch_hand_sim.episode_log.untrusted import read_records
 from msgs_spec.schemas import deserialize
@@ -61,7 +61,7 @@ class _Remains:
         found = [m for m in self.messages if m.channel_id in types]
         try:
             return [deserialize(types[m.channel_id], m.data).data for m in found]
-        except UNREADABLE:
+        except ValueError:
             return []
 
 

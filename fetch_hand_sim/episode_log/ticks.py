@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
-from fetch_hand_sim.episode_log.reader import UNREADABLE, Episode, one_line
+from fetch_hand_sim.episode_log.reader import Episode, one_line
 from msgs_spec.codecs import message_stamp
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TaskSpec, task_spec
@@ -108,5 +108,5 @@ def split_ticks(episode: Episode) -> list[LoggedTick]:
 def _stamp(episode: Episode, clock: TickMessage) -> int:
     try:
         return message_stamp(deserialize(clock.topic.type_name, clock.data))
-    except UNREADABLE as error:
+    except ValueError as error:
         raise EpisodeReadError(f'{episode.path}: unreadable clock ({one_line(error)})') from error

@@ -14,7 +14,7 @@ import numpy as np
 from fetch_hand_sim.episode_log import Episode, EpisodeReadError, episode_metadata, read_episode
 from fetch_hand_sim.episode_log.episode_metadata import interface_version
 from fetch_hand_sim.episode_log.model import model_sha256
-from fetch_hand_sim.episode_log.reader import UNREADABLE, one_line, printable
+from fetch_hand_sim.episode_log.reader import DAMAGED, one_line, printable
 from fetch_hand_sim.episode_log.ticks import LoggedTick, TickMessage, episode_task, split_ticks
 from fetch_hand_sim.episodes.context import source_revision
 from fetch_hand_sim.episodes.goals import accept_goal
@@ -105,7 +105,7 @@ class EpisodeChecker:
             runner = self._runner(episode, ticks)
             result = CheckResult(episode.path, changed=self._changes(episode, runner))
             _compare(runner, ticks, episode, result)
-        except UNREADABLE as error:
+        except DAMAGED as error:
             raise EpisodeReadError(
                 f'{episode.path}: cannot be run again ({one_line(error)})'
             ) from error
@@ -251,7 +251,7 @@ def _field_difference(topic: TopicSpec, recorded: bytes, simulated: bytes) -> tu
     """The first field in which two messages differ, and its two values."""
     try:
         first, second = (deserialize(topic.type_name, data) for data in (recorded, simulated))
-    except UNREADABLE:
+    except ValueError:
         return '', f'{len(recorded)} unreadable bytes', f'{len(simulated)} bytes'
     for (where, one), (other_where, other) in zip(_leaves(first), _leaves(second), strict=False):
         # Text shows every bit of a float64, except those of NaN.

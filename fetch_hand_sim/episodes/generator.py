@@ -20,7 +20,7 @@ from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.recorder import LoggedEpisode, episode_result
 from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS, robot_readings
 from fetch_hand_sim.simulation import Observation, Simulation
-from msgs_spec.cdr import TopicEncoder
+from msgs_spec.cdr import TopicCodec
 from msgs_spec.commands import clip_command, command_from_action
 from msgs_spec.tick import EpisodeStatus, Phase, Tick, TickEncoder
 from msgs_spec.topics import topic
@@ -68,7 +68,7 @@ class EpisodeGenerator:
         self._context = context
         self._encoder = TickEncoder(simulation.spec)
         self._commands = topic(simulation.spec, 'commands')
-        self._command_encoder = TopicEncoder(self._commands)
+        self._command_encoder = TopicCodec(self._commands)
         self._period_ns = round(simulation.tick_duration * 1e9)
 
     def generate(self, episodes: int, first_seed: int = 0) -> Iterator[LoggedEpisode]:

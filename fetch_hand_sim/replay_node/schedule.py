@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fetch_hand_sim.episode_log import Episode, EpisodeReadError, read_episode
-from fetch_hand_sim.episode_log.reader import UNREADABLE
 from fetch_hand_sim.episode_log.ticks import logged_topics
 from msgs_spec.schemas import deserialize
 from msgs_spec.topics import TopicSpec
@@ -113,7 +112,7 @@ def _period_ns(episode: Episode) -> int:
 def _require_readable(path: Path, spec: TopicSpec, message: ReplayMessage) -> None:
     try:
         deserialize(spec.type_name, message.data)
-    except UNREADABLE as error:
+    except ValueError as error:
         raise EpisodeReadError(
             f'{path}: {message.name} at {message.time_ns} ns is no {spec.type_name}'
         ) from error

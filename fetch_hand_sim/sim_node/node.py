@@ -28,7 +28,7 @@ from fetch_hand_sim.sim_node.robot import Messages, Robot
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.cdr import TopicEncoder
+from msgs_spec.cdr import TopicCodec
 from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports
 from msgs_spec.parameters import SIM_NODE, set_callback
 from msgs_spec.qos import rclpy_profile
@@ -74,7 +74,7 @@ class SimNode(Node):
         open_services(self, self._robot)
         now = time.monotonic()
         self._health = Health(self._robot, self.get_fully_qualified_name(), now)
-        self._factor_encoder = TopicEncoder(REAL_TIME_FACTOR)
+        self._factor_codec = TopicCodec(REAL_TIME_FACTOR)
         self._said: set[str] = set()
         self._has_introduction = False
         self._beat_due = self._ticked_at = now
@@ -116,7 +116,7 @@ class SimNode(Node):
             profile = rclpy_profile(spec.qos)
             if spec.direction == 'subscribed':
                 callback = receivers.callback(spec)
-                self.create_subscription(message_class, spec.name, callback, profile)
+                self.create_subscription(message_class, spec.name, callback, profile, raw=True)
             elif spec.name != '/clock' or self._settings['publish_clock']:
                 publishers[spec.name] = self.create_publisher(message_class, spec.name, profile)
         return publishers
@@ -249,7 +249,7 @@ class SimNode(Node):
         report = self._health.report(surroundings, now)
         self._say_news(surroundings)
         stamp_ns = self.get_clock().now().nanoseconds
-        factor = self._factor_encoder.encode(0, [self._health.real_time_factor])
+        factor = self._factor_codec.encode(0, [self._health.real_time_factor])
         self._publish([(DIAGNOSTICS, encode_reports(stamp_ns, [report]))])
         self._publish([(REAL_TIME_FACTOR, factor)])
 

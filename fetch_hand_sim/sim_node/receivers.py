@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from fetch_hand_sim.sim_node.command_buffer import CommandRejected
 from fetch_hand_sim.sim_node.robot import Robot
 from msgs_spec.codecs import decode_status
-from msgs_spec.schemas import from_ros, serialize
+from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.topics import TopicSpec
 
 
@@ -48,16 +48,30 @@ class Receivers:
             'policy_status': self._policy_status,
         }
 
-    def callback(self, spec: TopicSpec) -> Callable[[Any], None]:
-        """Returns what a subscription of this topic calls with each message."""
+    def callback(self, spec: TopicSpec) -> Callable[[bytes], None]:
+        """Returns what a raw subscription of this topic calls with the bytes of each message."""
         handle = self._handlers[spec.name]
 
-        def on_message(message: Any) -> None:
+        def on_message(data: bytes) -> None:
+            try:
+                message = deserialize(spec.type_name, data)
+            except ValueError as error:
+                self._drop(spec, error)
+                return
             if self._log is not None:
-                self._log.record_received(spec, serialize(spec.type_name, from_ros(message)))
+                # Serialised again, because senders leave the bytes between fields uninitialised.
+                self._log.record_received(spec, serialize(spec.type_name, message))
             handle(spec, message)
 
         return on_message
+
+    def _drop(self, spec: TopicSpec, error: ValueError) -> None:
+        """Counts bytes that are no message."""
+        if spec.name == 'set_goal':
+            self._robot.counters.goals_rejected += 1
+        elif spec.name != 'policy_status':
+            self._robot.buffer.rejected['unreadable'] += 1
+        self._warn(f'{spec.name} dropped: {error}')
 
     def _command(self, spec: TopicSpec, message: Any) -> None:
         del spec

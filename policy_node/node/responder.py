@@ -8,8 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.cdr import TopicEncoder
-from msgs_spec.cdr_decoder import TopicDecoder
+from msgs_spec.cdr import TopicCodec
 from msgs_spec.diagnostics import Durations
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tick import EpisodeStatus
@@ -49,8 +48,8 @@ class Responder:
         self._assembler = ObservationAssembler(commander.spec, status.control_hz)
         self._send = send
         self._clock = clock
-        self._encoder = TopicEncoder(topic(commander.spec, 'commands'))
-        self._decoders = {source.name: TopicDecoder(source) for source in self._assembler.topics}
+        self._commands = TopicCodec(topic(commander.spec, 'commands'))
+        self._sources = {source.name: TopicCodec(source) for source in self._assembler.topics}
         self._unsent: bytes | None = None
         self.topics = self._assembler.topics
         self.join = StampJoin(source.name for source in self.topics)
@@ -70,7 +69,7 @@ class Responder:
             ValueError: If the message cannot be used, in one line; it is counted and dropped.
         """
         try:
-            stamp, vector = self._decoders[name].decode(data)
+            stamp, vector = self._sources[name].decode(data)
             vectors = self.join.add(name, stamp, vector)
             if vectors is not None:
                 self._answer(self._assembler.assemble(vectors))
@@ -93,5 +92,5 @@ class Responder:
         self.received_at = began = self._clock()
         command = self._commander.command(observation)
         self.inference.add(self._clock() - began)
-        self._unsent = self._encoder.encode(0, command)
+        self._unsent = self._commands.encode(0, command)
         self.send_unsent()

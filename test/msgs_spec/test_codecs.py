@@ -7,7 +7,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from msgs_spec.cdr import TopicEncoder
+from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import (
     build_message,
     build_status,
@@ -48,11 +48,11 @@ def ros_class(type_name):
 
 @every_topic
 def test_template_gives_the_bytes_of_the_serialiser(spec):
-    encoder = TopicEncoder(spec)
+    codec = TopicCodec(spec)
     for seed, stamp in enumerate((0, 1, 999_999_999, 1_000_000_000, STAMP)):
         vector = random_vector(spec, seed)
         expected = serialize(spec.type_name, build_message(spec, stamp, vector))
-        assert encoder.encode(stamp, vector) == expected
+        assert codec.encode(stamp, vector) == expected
 
 
 @every_topic
@@ -60,7 +60,7 @@ def test_vectors_survive_bit_for_bit(spec):
     vector = random_vector(spec)
     if spec.size > 1:
         vector[:2] = [-0.0, np.nextafter(0.0, 1.0)]
-    message = deserialize(spec.type_name, TopicEncoder(spec).encode(STAMP, vector))
+    message = deserialize(spec.type_name, TopicCodec(spec).encode(STAMP, vector))
     assert decode(spec, message).tobytes() == vector.tobytes()
 
 
@@ -68,7 +68,7 @@ def test_vectors_survive_bit_for_bit(spec):
 def test_rclpy_reads_the_bytes(spec):
     serialization = pytest.importorskip('rclpy.serialization')
     vector = random_vector(spec, seed=1)
-    data = TopicEncoder(spec).encode(STAMP, vector)
+    data = TopicCodec(spec).encode(STAMP, vector)
     message = serialization.deserialize_message(data, ros_class(spec.type_name))
     np.testing.assert_array_equal(decode(spec, message), vector)
     if hasattr(message, 'header') or hasattr(message, 'clock'):
@@ -80,7 +80,7 @@ def test_rclpy_reads_the_bytes(spec):
 @every_topic
 def test_rclpy_writes_the_same_fields_before_its_uninitialised_tail(spec):
     serialization = pytest.importorskip('rclpy.serialization')
-    data = TopicEncoder(spec).encode(STAMP, random_vector(spec, seed=1))
+    data = TopicCodec(spec).encode(STAMP, random_vector(spec, seed=1))
     message = serialization.deserialize_message(data, ros_class(spec.type_name))
     theirs = serialization.serialize_message(message)
     assert len(data) <= len(theirs) <= len(data) + 8
@@ -96,7 +96,7 @@ def test_mcap_ros2_reads_the_bytes_by_schema_text(spec):
         id=1, name=spec.type_name, encoding='ros2msg', data=schema_text(spec.type_name).encode()
     )
     vector = random_vector(spec, seed=1)
-    data = TopicEncoder(spec).encode(STAMP, vector)
+    data = TopicCodec(spec).encode(STAMP, vector)
     message = decoder.decoder_for('cdr', schema)(data)
     np.testing.assert_array_equal(decode(spec, message), vector)
 
@@ -105,11 +105,11 @@ def test_mcap_ros2_reads_the_bytes_by_schema_text(spec):
 def test_wrong_size_is_refused_with_both_sizes(spec):
     message = rf'{spec.name}: shape \({spec.size + 1},\) given; allowed: \({spec.size},\)'
     with pytest.raises(ValueError, match=message):
-        TopicEncoder(spec).encode(0, np.zeros(spec.size + 1))
+        TopicCodec(spec).encode(0, np.zeros(spec.size + 1))
     # A single number must not spread over all places.
     if spec.size > 1:
         with pytest.raises(ValueError, match='given; allowed'):
-            TopicEncoder(spec).encode(0, np.zeros(1))
+            TopicCodec(spec).encode(0, np.zeros(1))
 
 
 def test_quaternions_are_xyzw_in_messages_and_wxyz_in_vectors():

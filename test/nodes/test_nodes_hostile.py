@@ -16,7 +16,7 @@ from rcl_interfaces.srv import SetParameters
 from std_msgs.msg import Float64MultiArray
 from test_nodes import episodes_in, finish
 
-from msgs_spec.cdr import TopicEncoder
+from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode_status
 from msgs_spec.qos import QosSpec, rclpy_profile
 from msgs_spec.tasks import task_spec
@@ -49,8 +49,8 @@ def reports(robot, node: str = '/sim_node') -> list[dict[str, str]]:
 def test_flood_of_commands_neither_delays_nor_grows_the_robot(start_process: Start) -> None:
     sim = start_process(*SIM_NODE)
     source = topic(REACH, 'commands')
-    good = TopicEncoder(source).encode(0, np.full(4, 0.1))
-    bad = TopicEncoder(source).encode(0, np.full(4, np.nan))
+    good = TopicCodec(source).encode(0, np.full(4, 0.1))
+    bad = TopicCodec(source).encode(0, np.full(4, np.nan))
     with client(REACH) as robot:
         robot.subscribe('joint_states', '/diagnostics')
         robot.connect('commands')

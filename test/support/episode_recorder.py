@@ -18,7 +18,7 @@ from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeWriter, episode_
 from fetch_hand_sim.episode_log.model import model_sha256
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.cdr import TopicEncoder
+from msgs_spec.cdr import TopicCodec
 from msgs_spec.commands import command_from_action
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import TopicSpec, topic
@@ -42,7 +42,7 @@ class Recorder:
         self.runner = EpisodeRunner(self.simulation)
         self.commands = topic(self.spec, 'commands')
         self._encoder = TickEncoder(self.spec)
-        self._command_encoder = TopicEncoder(self.commands)
+        self._command_encoder = TopicCodec(self.commands)
 
     def metadata(self, started: str | None = None) -> dict[str, str]:
         return episode_metadata(

@@ -23,7 +23,7 @@ from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.cdr import LayoutError, TopicEncoder
+from msgs_spec.cdr import LayoutError, TopicCodec
 from msgs_spec.codecs import decode
 from msgs_spec.commands import action_from_command
 from msgs_spec.schemas import deserialize
@@ -203,7 +203,7 @@ def test_check_names_the_version_that_changed(reach, tmp_path):
 def test_check_runs_goals_that_were_set_on_the_way(tmp_path):
     recorder = Recorder('HandManipulateBlockFull')
     goal_topic = topic(recorder.spec, 'set_goal')
-    encoder = TopicEncoder(goal_topic)
+    encoder = TopicCodec(goal_topic)
     directory = EpisodeDirectory(tmp_path)
     writer = directory.begin(recorder.spec.name, 0, recorder.metadata())
     command = recorder.runner.resting_command()
@@ -270,22 +270,22 @@ def test_decoding_all_at_once_equals_one_at_a_time(generated):
             continue
         data = [m.data for m in episode.topics['/' + spec.name.lstrip('/')].messages]
         rows = np.frombuffer(b''.join(data), np.uint8).reshape(len(data), -1)
-        _, values = TopicEncoder(spec).decode(rows)
+        _, values = TopicCodec(spec).decode_many(rows)
         expected = [decode(spec, deserialize(spec.type_name, each)) for each in data]
         assert values.tobytes() == np.array(expected).tobytes(), spec.name
 
 
 def test_messages_of_another_layout_are_refused():
     spec = topic(task_spec('FetchReach'), 'joint_states')
-    encoder = TopicEncoder(spec)
+    encoder = TopicCodec(spec)
     data = bytearray(encoder.encode(0, np.zeros(spec.size)))
     rows = np.frombuffer(bytes(data), np.uint8)[None]
-    assert encoder.decode(rows)[1].shape == (1, spec.size)
+    assert encoder.decode_many(rows)[1].shape == (1, spec.size)
     data[data.index(b'robot0')] ^= 1
     with pytest.raises(LayoutError, match='joint_states'):
-        encoder.decode(np.frombuffer(bytes(data), np.uint8)[None])
+        encoder.decode_many(np.frombuffer(bytes(data), np.uint8)[None])
     with pytest.raises(LayoutError, match='bytes'):
-        encoder.decode(rows[:, :-1])
+        encoder.decode_many(rows[:, :-1])
 
 
 def test_interrupted_episodes_load_as_far_as_they_go(reach, tmp_path):
@@ -351,7 +351,7 @@ def test_list_filters(reach, tmp_path, capsys):
     for number, task in enumerate(('FetchPush', 'FetchReach')):
         writer = EpisodeWriter(directory, f'x{number}', {'task': task, 'seed': '1'})
         spec = topic(task_spec(task), '/clock')
-        writer.write(spec, TopicEncoder(spec).encode(0, []), 1)
+        writer.write(spec, TopicCodec(spec).encode(0, []), 1)
         if number:
             writer.abort('the reason', {'success': 'false'})
         else:
@@ -392,7 +392,7 @@ def test_list_names_and_skips_what_it_cannot_read(reach, tmp_path, capsys):
 def test_list_shows_no_control_characters_of_a_file(tmp_path, capsys):
     writer = EpisodeWriter(tmp_path, 'x', {'task': '\x1b]0;owned\x07', 'seed': '[red]1[/red]'})
     spec = topic(task_spec('FetchReach'), '/clock')
-    writer.write(spec, TopicEncoder(spec).encode(0, []), 1)
+    writer.write(spec, TopicCodec(spec).encode(0, []), 1)
     writer.finish({'success': '\x9b', 'return': 'nan', 'steps': '\n'})
     assert list_episodes.main([str(tmp_path)]) == 0
     output = capsys.readouterr().out

@@ -13,14 +13,14 @@ from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeLogError, Episod
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder, episode_result
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.cdr import TopicEncoder
+from msgs_spec.cdr import TopicCodec
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import TopicSpec, topic
 
 METADATA = {'task': 'FetchReach'}
 COMMANDS = topic(TASKS['FetchReach'], 'commands')
-COMMAND = TopicEncoder(COMMANDS).encode(0, np.zeros(COMMANDS.size))
+COMMAND = TopicCodec(COMMANDS).encode(0, np.zeros(COMMANDS.size))
 
 Ticks = list[tuple[Tick, list[tuple[TopicSpec, bytes]]]]
 

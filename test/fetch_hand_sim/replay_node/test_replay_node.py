@@ -20,13 +20,14 @@ from fetch_hand_sim.episode_log.ticks import split_ticks
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplaySchedule
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.ros import ros_message_class
-from msgs_spec.schemas import deserialize, from_ros, serialize
+from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import topic, topics
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.training import generate_episodes
 from support.graph import POLICY_NODE, SIM_NODE, TIMEOUT, client, ros_args
+from support.ros_messages import from_ros
 
 REPLAY_NODE = (*SIM_NODE[:2], 'fetch_hand_sim.replay_node')
 REACH = task_spec('FetchReach')
