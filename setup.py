@@ -6,20 +6,32 @@ from setuptools import find_packages, setup
 
 PACKAGE = 'fetch_hand_sim'
 
-# To write ONNX actors; onnxruntime alone runs them.
-ONNX = ['onnx>=1.17', 'onnxruntime>=1.20', 'onnxscript>=0.3']
-
-# What test/ needs beyond the package itself. An extra called `test` makes `colcon test` use pytest.
+# To run and train actors.
+ACTORS = ['safetensors>=0.4', 'torch>=2.6']
+# What a command needs beyond the base installation; it says so itself where it is missing.
+EXTRAS = {
+    # ROS 2 Jazzy itself, for a machine without it.
+    'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
+    'actors': ACTORS,
+    'train': [*ACTORS, 'matplotlib>=3.8', 'tensorboard>=2.16'],
+    # `export_episodes`.
+    'data': ['minari>=0.5.3', 'pyarrow>=18'],
+    'sb3': [*ACTORS, 'stable-baselines3>=2.4'],
+    # To write ONNX actors; onnxruntime alone runs them.
+    'onnx': ['onnx>=1.17', 'onnxruntime>=1.20', 'onnxscript>=0.3'],
+    # `benchmark --ray`.
+    'cluster': [*ACTORS, 'matplotlib>=3.8', 'ray>=2.10'],
+}
+# What test/ needs beyond all of that. An extra called `test` makes `colcon test` use pytest.
 TEST = [
     'colcon-core',
+    'colcon-package-selection',
     'colcon-python-setup-py',
     'colcon-ros',
     'mcap-ros2-support',
-    *ONNX,
     'pytest',
     'pytest-timeout',
     'setuptools',
-    'stable-baselines3',
 ]
 
 setup(
@@ -45,30 +57,23 @@ setup(
         (f'share/{PACKAGE}/config', glob('config/*.yaml')),
     ],
     zip_safe=True,
-    # Without rclpy and the messages: in a ROS workspace pip must not replace those of ROS.
+    # Without rclpy and the messages: in a ROS workspace pip must not replace those of ROS. No `~=`:
+    # colcon cannot read it, and would then find no tests and say that they passed.
     install_requires=[
         'gymnasium>=1.0',
-        'gymnasium-robotics~=1.4.2',
+        'gymnasium-robotics>=1.4.2,<1.5',
         'lz4>=4',
         'mcap>=1.5',
-        'mujoco~=4.0',
+        'mujoco>=4.0,<5',
         'numpy>=1.26',
         'PyYAML>=6',
         'rich>=13',
         'rosbags>=0.10',
-        'safetensors>=0.4',
-        'torch>=2.6',
         'zstandard>=0.20',
     ],
     extras_require={
-        # ROS 2 Jazzy itself, for a machine without it.
-        'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
-        'train': ['matplotlib', 'tensorboard'],
-        'cluster': ['matplotlib', 'ray>=2.10'],
-        # `export_episodes`.
-        'export': ['minari>=0.5.3', 'pyarrow>=18'],
-        'onnx': ONNX,
-        'stable_baselines3': ['stable-baselines3>=2.4'],
+        **EXTRAS,
+        'all': sorted({each for needed in EXTRAS.values() for each in needed}),
         'test': TEST,
         'dev': [*TEST, 'mypy', 'pymcap-cli', 'ruff', 'types-PyYAML'],
     },
@@ -76,16 +81,16 @@ setup(
         'console_scripts': [
             'sim_node = fetch_hand_sim.sim_node:main',
             'policy_node = policy_node.node:main',
-            'export_actor = policy_node.policies.export_actor:main',
-            'benchmark = policy_node.training.benchmark.command:main',
-            'train_her = policy_node.training.train_her:main',
-            'evaluate_policy = policy_node.training.evaluate_policy:main',
+            'export_actor = policy_node.training.commands:export_actor',
+            'benchmark = policy_node.training.commands:benchmark',
+            'train_her = policy_node.training.commands:train_her',
+            'evaluate_policy = policy_node.training.commands:evaluate_policy',
             'replay_node = fetch_hand_sim.replay_node:main',
             'list_episodes = fetch_hand_sim.commands.list_episodes:main',
             'check_episode = fetch_hand_sim.commands.check_episode:main',
             'recover_episodes = fetch_hand_sim.commands.recover_episodes:main',
             'export_episodes = fetch_hand_sim.commands.export_episodes:main',
-            'generate_episodes = policy_node.training.generate_episodes:main',
+            'generate_episodes = policy_node.training.commands:generate_episodes',
         ],
         # Whoever ships actors says for which tasks; the demo asks without knowing the package.
         'fetch_hand_sim.actors': ['shipped = policy_node.policies.shipped:shipped_actors'],

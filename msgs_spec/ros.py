@@ -10,22 +10,19 @@ from importlib import import_module
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from msgs_spec.command_line import EXIT_SUCCESS, CommandError, complain, require_extra
+from msgs_spec.command_line import UsageError as UsageError
 from msgs_spec.parameters import ParameterSpec, descriptor, validate
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
     from rclpy.node import Node
 
-EXIT_SUCCESS, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
 # Seconds between looks at what no callback announces: signals, the graph.
 BEAT = 0.1
 
 
-class UsageError(Exception):
-    """The user asked for what is not possible; the message is one line that says what is."""
-
-
-class NodeFailure(Exception):
+class NodeFailure(CommandError):
     """The node cannot go on; the message is one line that says why."""
 
 
@@ -153,6 +150,11 @@ def run_node(name: str, run: Callable[[StopSignals], None], args: list[str] | No
     # First of all: what follows takes long enough for people to change their mind.
     stop = StopSignals()
     keep_discovery_local()
+    try:
+        require_extra('ros')
+    except UsageError as error:
+        complain(name, error)
+        return error.exit_code
     import rclpy
     from rclpy.exceptions import ROSInterruptException
     from rclpy.signals import SignalHandlerOptions
@@ -161,12 +163,9 @@ def run_node(name: str, run: Callable[[StopSignals], None], args: list[str] | No
         _refuse_plain_arguments(sys.argv[1:] if args is None else args)
         _initialise(rclpy.init, args, SignalHandlerOptions.NO)
         run(stop)
-    except UsageError as error:
-        print(f'{name}: {error}', file=sys.stderr)
-        return EXIT_USAGE
-    except NodeFailure as error:
-        print(f'{name}: {error}', file=sys.stderr)
-        return EXIT_FAILURE
+    except CommandError as error:
+        complain(name, error)
+        return error.exit_code
     except ROSInterruptException:
         return EXIT_SUCCESS
     finally:

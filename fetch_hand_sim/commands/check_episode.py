@@ -6,49 +6,89 @@ Exit code 0: all are identical; 1: an episode differs; 2: bad usage, or a file c
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from fetch_hand_sim.episode_log import EpisodeReadError, expand_episodes
-from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.checker import CheckResult, EpisodeChecker
+from msgs_spec.command_line import (
+    EXIT_FAILURE,
+    EXIT_SUCCESS,
+    EXIT_USAGE,
+    complain,
+    progress,
+    run_command,
+)
+
+_NAME = 'check_episode'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    parser = argparse.ArgumentParser(prog='check_episode', description=__doc__)
+    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
     parser.add_argument(
         'paths', type=Path, nargs='+', metavar='PATH', help='episode, or directory of episodes'
     )
+    parser.add_argument('--json', action='store_true', help='print one JSON array instead of lines')
     options = parser.parse_args(arguments)
-    checker = EpisodeChecker()
-    codes = [_check(checker, path) for path in options.paths]
-    return max(codes)
+    return run_command(_NAME, lambda: _run(options))
 
 
-def _check(checker: EpisodeChecker, path: Path) -> int:
-    """Checks an episode or all in a directory; returns the exit code for them."""
-    code = 0
+def _run(options: argparse.Namespace) -> int:
+    episodes, code = _expand(options.paths)
+    results: list[CheckResult] = []
     try:
-        episodes = expand_episodes(path)
-        if not episodes:
-            raise EpisodeReadError(f'{path} holds no episode')
-    except EpisodeReadError as error:
-        return _complain(error)
-    for episode in episodes:
-        try:
-            result = checker.check(episode)
-        except EpisodeReadError as error:
-            code = max(code, _complain(error))
-        else:
-            print(result, flush=True)
-            code = max(code, 1 if result.difference is not None else 0)
+        code = max(code, _check(episodes, results, is_quiet=options.json))
+    finally:
+        if options.json:
+            print(json.dumps([_as_json(result) for result in results], indent=2))
     return code
 
 
-def _complain(error: EpisodeReadError) -> int:
-    print(f'check_episode: {error}', file=sys.stderr)
-    return 2
+def _expand(paths: Sequence[Path]) -> tuple[list[Path], int]:
+    """Returns the episodes meant by some paths, and the exit code for what is none."""
+    episodes: list[Path] = []
+    code = EXIT_SUCCESS
+    for path in paths:
+        try:
+            found = expand_episodes(path)
+            if not found:
+                raise EpisodeReadError(f'{path} holds no episode')
+        except EpisodeReadError as error:
+            complain(_NAME, error)
+            code = EXIT_USAGE
+        else:
+            episodes += found
+    return episodes, code
+
+
+def _check(episodes: Sequence[Path], results: list[CheckResult], is_quiet: bool) -> int:
+    """Checks episodes, appends what came out to `results`, and returns the exit code."""
+    checker = EpisodeChecker()
+    code = EXIT_SUCCESS
+    with progress('episodes', len(episodes)) as advance:
+        for episode in episodes:
+            try:
+                result = checker.check(episode)
+            except EpisodeReadError as error:
+                complain(_NAME, error)
+                code = EXIT_USAGE
+            else:
+                results.append(result)
+                code = max(code, EXIT_SUCCESS if result.difference is None else EXIT_FAILURE)
+                if not is_quiet:
+                    print(result, flush=True)
+            advance(1)
+    return code
+
+
+def _as_json(result: CheckResult) -> dict[str, Any]:
+    values = dataclasses.asdict(result)
+    return {**values, 'path': str(result.path), 'identical': result.difference is None}
 
 
 if __name__ == '__main__':

@@ -13,10 +13,22 @@ from pathlib import Path
 
 from fetch_hand_sim.episode_log import EpisodeArrays, EpisodeReadError, load_episodes
 from fetch_hand_sim.episodes.export import ExportError, export_minari, export_parquet
+from msgs_spec.command_line import (
+    EXIT_FAILURE,
+    EXIT_SUCCESS,
+    CommandError,
+    UsageError,
+    complain,
+    progress,
+    require_extra,
+    run_command,
+)
+
+_NAME = 'export_episodes'
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog='export_episodes', description=__doc__)
+    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
     parser.add_argument('path', type=Path, help='an episode, or a directory of episodes')
     parser.add_argument('--to', choices=('parquet', 'minari'), required=True)
     parser.add_argument('--output', type=Path, required=True, help='directory to write to')
@@ -29,24 +41,31 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     options = _parse(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    require_extra('data')
     skipped: list[EpisodeReadError] = []
     try:
         episodes = load_episodes(options.path, on_skip=skipped.append)
     except EpisodeReadError as error:
-        return _fail(error, 2)
+        raise UsageError(str(error)) from None
     for reason in skipped:
-        _fail(f'skipped {reason}', 1)
+        complain(_NAME, f'skipped {reason}')
     if not episodes:
-        return _fail(f'{options.path} holds no episode', 2)
+        raise UsageError(f'{options.path} holds no episode')
     by_task: dict[str, list[EpisodeArrays]] = {}
     for episode in episodes:
         by_task.setdefault(episode.spec.name, []).append(episode)
-    try:
+    with progress('episodes', len(episodes)) as advance:
         for task, group in by_task.items():
-            print(f'{len(group)} episodes of {task}: {_export(options, group)}')
-    except ExportError as error:
-        return _fail(error, 1)
-    return 1 if skipped else 0
+            try:
+                print(f'{len(group)} episodes of {task}: {_export(options, group)}', flush=True)
+            except ExportError as error:
+                raise CommandError(str(error)) from None
+            advance(len(group))
+    return EXIT_FAILURE if skipped else EXIT_SUCCESS
 
 
 def _export(options: argparse.Namespace, episodes: Sequence[EpisodeArrays]) -> str:
@@ -54,11 +73,6 @@ def _export(options: argparse.Namespace, episodes: Sequence[EpisodeArrays]) -> s
         return ', '.join(str(path) for path in export_parquet(episodes, options.output))
     dataset_id = export_minari(episodes, options.output, options.name)
     return f'Minari dataset {dataset_id} in {options.output}'
-
-
-def _fail(error: object, code: int) -> int:
-    print(f'export_episodes: {error}', file=sys.stderr)
-    return code
 
 
 if __name__ == '__main__':

@@ -6,10 +6,13 @@ Exit code 0: everything was read; 1: something was skipped, named on stderr; 2: 
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -22,10 +25,18 @@ from fetch_hand_sim.episode_log import (
     find_leftovers,
     read_summary,
 )
-from fetch_hand_sim.episode_log.reader import printable
 from fetch_hand_sim.episode_log.summary import EpisodeSummary
+from msgs_spec.command_line import (
+    EXIT_FAILURE,
+    EXIT_SUCCESS,
+    UsageError,
+    complain,
+    printable,
+    run_command,
+)
 from msgs_spec.tasks import TASKS
 
+_NAME = 'list_episodes'
 _COLUMNS = ('episode', 'task', 'seed', 'steps', 'return', 'success', 'seconds', 'KiB', 'ended')
 _NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB'})
 # A pipe has no width to fit into; this one fits every column.
@@ -105,7 +116,7 @@ def _short(number: str) -> str:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog='list_episodes', description=__doc__)
+    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
     parser.add_argument('directory', type=Path, help='where episodes are collected')
     parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='only this task')
     success = parser.add_mutually_exclusive_group()
@@ -119,34 +130,70 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         default=None,
         help='only episodes that ran to their end, or only interrupted ones',
     )
+    parser.add_argument('--json', action='store_true', help='print one JSON array, no table')
     return parser.parse_args(arguments)
-
-
-def _complain(text: object) -> None:
-    print(f'list_episodes: {text}', file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     options = _parse(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     try:
         episodes, errors = read_summaries(options.directory)
         leftovers = find_leftovers(options.directory)
     except (EpisodeReadError, EpisodeLogError) as error:
-        _complain(error)
-        return 2
+        raise UsageError(str(error)) from None
     wanted = Filter(options.task, options.success, options.complete)
     shown = [episode for episode in episodes if wanted.accepts(episode)]
-    console = Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH)
-    if shown:
-        console.print(make_table(shown))
-    successes = sum(episode.result.get('success') == 'true' for episode in shown)
-    print(f'{len(shown)} episodes, {successes} successes; {len(episodes) - len(shown)} filtered')
+    if options.json:
+        print(json.dumps([_as_json(episode) for episode in shown], indent=2))
+    else:
+        _print_table(shown)
+        successes = sum(episode.result.get('success') == 'true' for episode in shown)
+        filtered = len(episodes) - len(shown)
+        print(f'{len(shown)} episodes, {successes} successes; {filtered} filtered')
     for leftover in leftovers:
-        print(f'{leftover}; recover_episodes makes a bag of it')
+        line = printable(f'{leftover}; recover_episodes makes a bag of it')
+        print(line, file=sys.stderr if options.json else sys.stdout)
     for skipped in errors:
-        _complain(f'skipped {skipped}')
-    return 1 if errors else 0
+        complain(_NAME, f'skipped {skipped}')
+    return EXIT_FAILURE if errors else EXIT_SUCCESS
+
+
+def _print_table(episodes: Sequence[EpisodeSummary]) -> None:
+    console = Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH)
+    if episodes:
+        with console.capture() as captured:
+            console.print(make_table(episodes))
+        print(captured.get(), end='')
+
+
+def _as_json(episode: EpisodeSummary) -> dict[str, Any]:
+    """The row of an episode with values in their own types, None where the file says nothing."""
+    metadata, result = episode.metadata, episode.result
+    return {
+        'path': str(episode.path),
+        'task': metadata.get('task'),
+        'seed': _number(metadata.get('seed'), int),
+        'steps': _number(result.get('steps'), int),
+        'return': _number(result.get('return'), float),
+        'success': {'true': True, 'false': False}.get(result.get('success', '')),
+        'seconds': episode.duration_s,
+        'bytes': episode.size_bytes,
+        'complete': episode.is_complete,
+        'reason': None if episode.is_complete else result.get('reason'),
+    }
+
+
+def _number(text: str | None, kind: type[int] | type[float]) -> float | None:
+    try:
+        value = kind(text or '')
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
 
 
 if __name__ == '__main__':

@@ -18,47 +18,60 @@ from fetch_hand_sim.episode_log import (
     read_summary,
     recover_episode,
 )
+from msgs_spec.command_line import (
+    EXIT_FAILURE,
+    EXIT_SUCCESS,
+    UsageError,
+    complain,
+    progress,
+    run_command,
+)
+
+_NAME = 'recover_episodes'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    parser = argparse.ArgumentParser(prog='recover_episodes', description=__doc__)
+    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
     parser.add_argument('directory', type=Path, help='where episodes are collected')
     parser.add_argument('--dry-run', action='store_true', help='only name what is unfinished')
     options = parser.parse_args(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     try:
         if not options.directory.is_dir():
-            raise EpisodeLogError(f'{options.directory} is no directory')
+            raise UsageError(f'{options.directory} is no directory')
         leftovers = find_leftovers(options.directory)
     except EpisodeLogError as error:
-        return _fail(error, 2)
+        raise UsageError(str(error)) from None
     failures = 0
-    for leftover in leftovers:
-        print(leftover)
-        if not options.dry_run:
-            failures += _recover(leftover.path)
+    with progress('unfinished episodes', len(leftovers)) as advance:
+        for leftover in leftovers:
+            print(leftover, flush=True)
+            if not options.dry_run:
+                failures += not _recover(leftover.path)
+            advance(1)
     if not leftovers:
         print(f'{options.directory}: no unfinished episode')
-    return 1 if failures else 0
+    return EXIT_FAILURE if failures else EXIT_SUCCESS
 
 
-def _recover(leftover: Path) -> int:
-    """Recovers one episode and says what came out; returns the number of failures."""
+def _recover(leftover: Path) -> bool:
+    """Recovers one episode and says what came out; whether it worked."""
     try:
         episode = read_summary(recover_episode(leftover))
     except (EpisodeLogError, EpisodeReadError) as error:
-        return _fail(error, 1)
+        complain(_NAME, error)
+        return False
     state = 'complete' if episode.is_complete else 'marked as interrupted'
     print(
         f'recovered {episode.path.parent}: {episode.message_count} messages, '
-        f'{episode.duration_s:.2f} s, {state}'
+        f'{episode.duration_s:.2f} s, {state}',
+        flush=True,
     )
-    return 0
-
-
-def _fail(error: Exception, code: int) -> int:
-    print(f'recover_episodes: {error}', file=sys.stderr)
-    return code
+    return True
 
 
 if __name__ == '__main__':

@@ -17,6 +17,7 @@ from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metad
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.untrusted import read_records
+from msgs_spec.command_line import printable
 
 # CRC of the summary and magic, bytes.
 FILE_END = 4 + 8
@@ -178,11 +179,6 @@ def mcap_file(path: Path) -> Path:
             f'{path} holds {len(files)} MCAP files; an episode is a directory of one'
         )
     return files[0]
-
-
-def printable(text: str) -> str:
-    """Returns text from a file with what could command a terminal escaped."""
-    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def one_line(error: Exception) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from fetch_hand_sim.episode_log import Episode, EpisodeReadError, episode_metadata, read_episode
 from fetch_hand_sim.episode_log.episode_metadata import interface_version
 from fetch_hand_sim.episode_log.model import model_sha256
-from fetch_hand_sim.episode_log.reader import DAMAGED, one_line, printable
+from fetch_hand_sim.episode_log.reader import DAMAGED, one_line
 from fetch_hand_sim.episode_log.ticks import LoggedTick, TickMessage, episode_task, split_ticks
 from fetch_hand_sim.episodes.context import source_revision
 from fetch_hand_sim.episodes.goals import accept_goal
@@ -23,6 +23,7 @@ from fetch_hand_sim.episodes.runner import Array, EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
 from msgs_spec.codecs import decode
+from msgs_spec.command_line import printable
 from msgs_spec.schemas import deserialize
 from msgs_spec.tick import EpisodeStatus, TickEncoder
 from msgs_spec.topics import TopicSpec

@@ -1,6 +1,6 @@
 """Logged episodes as datasets of the ecosystem: Parquet tables, Minari datasets.
 
-Needs the extra `[export]`. Values are those of `load_episodes`, float64, unchanged.
+Needs the extra `[data]`. Values are those of `load_episodes`, float64, unchanged.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _require(module: str) -> Any:
     except ImportError as error:
         raise ExportError(
             f'{module.partition(".")[0]} is missing; install it with pip install '
-            "'fetch_hand_sim[export]'"
+            "'fetch_hand_sim[data]'"
         ) from error
 
 
@@ -179,7 +179,7 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
                 requirements=_requirements(episodes[0]),
             )
     except ImportError as error:
-        raise ExportError(f"{error}; install with pip install 'fetch_hand_sim[export]'") from error
+        raise ExportError(f"{error}; install with pip install 'fetch_hand_sim[data]'") from error
     except (OSError, ValueError, AssertionError) as error:
         raise ExportError(f'{dataset_id}: {" ".join(str(error).split())}') from error
     return dataset_id

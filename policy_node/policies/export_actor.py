@@ -17,10 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from msgs_spec.command_line import EXIT_SUCCESS, CommandError, UsageError, run_command
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor, actor_path
 from policy_node.policies.onnx import FORMAT, INPUTS, OUTPUT, OnnxActor
 
+_NAME = 'export_actor'
 # Largest difference between the actions of both, in [-1, 1]; float32 sums differ in order.
 _TOLERANCE = 1e-4
 _TRIALS = 100
@@ -97,19 +99,26 @@ def _largest_difference(actor: Actor, exported: OnnxActor) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Writes the file; returns the exit code."""
-    parser = argparse.ArgumentParser(prog='export_actor', description=__doc__)
+    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
     parser.add_argument('actor', help='name of a shipped actor, or a checkpoint')
     parser.add_argument('target', type=Path, help='file to write, <name>.onnx')
     options = parser.parse_args(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     if options.target.suffix != '.onnx':
-        parser.error(f'target {str(options.target)!r}; allowed: a name that ends in .onnx')
+        raise UsageError(f'target {str(options.target)!r}; allowed: a name that ends in .onnx')
     try:
-        difference = export(actor_path(options.actor), options.target)
+        source = actor_path(options.actor)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    try:
+        difference = export(source, options.target)
     except (OSError, ValueError) as error:
-        print(f'export_actor: {error}', file=sys.stderr)
-        return 1
+        raise CommandError(str(error)) from None
     print(f'{options.target}: actions within {difference:.1e} of the checkpoint')
-    return 0
+    return EXIT_SUCCESS
 
 
 if __name__ == '__main__':

@@ -15,6 +15,14 @@ from rich.console import Console
 from rich.table import Table
 
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.command_line import (
+    EXIT_INTERRUPTED,
+    EXIT_SUCCESS,
+    CommandError,
+    UsageError,
+    progress,
+    run_command,
+)
 from msgs_spec.tasks import TASKS, task_spec
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import actor_path
@@ -22,6 +30,9 @@ from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, 
 from policy_node.training.evaluation.floors import RandomPolicy, RestingPolicy
 from policy_node.training.learning.collector import Policy
 
+_NAME = 'evaluate_policy'
+# What `--json` without a file means.
+_STDOUT = Path('-')
 FLOORS = ('random', 'resting')
 # Far from the seeds of training and of its evaluations.
 FIRST_SEED = 2_000_000_000
@@ -29,7 +40,7 @@ FIRST_SEED = 2_000_000_000
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(prog='evaluate_policy', description=__doc__)
+    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
     add = parser.add_argument
     add(
         '--actor',
@@ -43,7 +54,14 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--threads', type=int, default=0, help='simulation threads; default: all cores')
     add('--success-rule', choices=('gymnasium', 'paper'), default='gymnasium', help='of the reward')
     add('--reward-type', choices=('sparse', 'dense'), default='sparse', help='of the return')
-    add('--json', type=Path, help='write the summary')
+    add(
+        '--json',
+        type=Path,
+        nargs='?',
+        const=_STDOUT,
+        metavar='FILE',
+        help='write the summary to a file, or print it instead of the table',
+    )
     add('--csv', type=Path, help='write one row per episode')
     return parser.parse_args(arguments)
 
@@ -51,22 +69,56 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     options = parse_arguments(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    for name in ('episodes', 'num_envs'):
+        if getattr(options, name) < 1:
+            raise UsageError(f'--{name.replace("_", "-")} {getattr(options, name)}; allowed: >= 1')
     try:
-        if options.episodes < 1 or options.num_envs < 1:
-            raise ValueError(f'--episodes {options.episodes}, --num-envs {options.num_envs}: >= 1')
         policy, task, about = load_policy(options.actor, options.task)
-        outcomes, summary = _run(options, policy, task)
+        simulation = _simulation(options, task)
     except (ValueError, ImportError) as error:
-        print(f'evaluate_policy: {error}', file=sys.stderr)
-        return 2
-    report = {'actor': options.actor, 'task': task, **about, **summary}
-    print_table(report)
-    if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(report, indent=2) + '\n')
-    if options.csv is not None:
-        write_csv(outcomes, options.csv)
-    return 0
+        raise UsageError(str(error)) from None
+    outcomes, code = _evaluate(options, simulation, policy)
+    rules = {'reward_type': options.reward_type, 'touched_rule': options.success_rule}
+    report = {'actor': options.actor, 'task': task, **about, **summarize(outcomes), **rules}
+    text = json.dumps(report, indent=2)
+    if options.json == _STDOUT:
+        print(text)
+    else:
+        print_table(report)
+    try:
+        if options.json not in (None, _STDOUT):
+            options.json.parent.mkdir(parents=True, exist_ok=True)
+            options.json.write_text(text + '\n')
+        if options.csv is not None:
+            write_csv(outcomes, options.csv)
+    except OSError as error:
+        raise CommandError(f'{error.filename}: {error.strerror}') from None
+    return code
+
+
+def _evaluate(
+    options: argparse.Namespace, simulation: Simulation, policy: Policy
+) -> tuple[EpisodeOutcomes, int]:
+    """Returns what happened and the exit code; after Ctrl-C what had happened by then."""
+    finished: list[EpisodeOutcomes] = []
+    with progress('episodes', options.episodes) as advance:
+
+        def note(outcomes: EpisodeOutcomes) -> bool:
+            advance(len(outcomes) - sum(len(each) for each in finished[-1:]))
+            finished.append(outcomes)
+            return False
+
+        try:
+            episodes, first_seed = options.episodes, options.first_seed
+            return evaluate(simulation, policy, episodes, first_seed, note), EXIT_SUCCESS
+        except KeyboardInterrupt:
+            if not finished:
+                raise
+            return finished[-1], EXIT_INTERRUPTED
 
 
 def load_policy(actor: str, task: str | None) -> tuple[Policy, str, dict[str, Any]]:
@@ -105,19 +157,14 @@ def _stable_baselines3(actor: str) -> Policy:
     return policy
 
 
-def _run(
-    options: argparse.Namespace, policy: Policy, task: str
-) -> tuple[EpisodeOutcomes, dict[str, Any]]:
-    simulation = Simulation(
+def _simulation(options: argparse.Namespace, task: str) -> Simulation:
+    return Simulation(
         task,
         num_envs=min(options.num_envs, options.episodes),
         num_threads=options.threads,
         reward_type=options.reward_type,
         success_rule=options.success_rule,
     )
-    outcomes = evaluate(simulation, policy, options.episodes, options.first_seed)
-    rules = {'reward_type': options.reward_type, 'touched_rule': options.success_rule}
-    return outcomes, {**summarize(outcomes), **rules}
 
 
 def print_table(report: dict[str, Any]) -> None:

@@ -14,22 +14,29 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import Progress
 
 from fetch_hand_sim.episode_log import EpisodeLogError
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.simulation import Observation, Simulation
+from msgs_spec.command_line import (
+    EXIT_SUCCESS,
+    CommandError,
+    UsageError,
+    progress,
+    run_command,
+)
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import actor_path
 from policy_node.training.evaluate_policy import FLOORS, load_policy
 
+_NAME = 'generate_episodes'
+
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(prog='generate_episodes', description=__doc__)
+    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
     add = parser.add_argument
     add(
         '--policy',
@@ -87,37 +94,35 @@ def _control_hz(actor: str) -> float:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     options = parse_arguments(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     torch.set_num_threads(1)
     try:
         generator, simulation = make_generator(options)
     except (ValueError, ImportError) as error:
-        return _fail(error, 2)
+        raise UsageError(str(error)) from None
     began, cpu_began = time.perf_counter(), time.process_time()
-    steps = successes = 0
+    count = steps = successes = 0
     try:
-        with Progress(console=Console(stderr=True), transient=True) as progress:
-            bar = progress.add_task(simulation.spec.name, total=options.episodes)
+        with progress('episodes', options.episodes) as advance:
             for logged in generator.generate(options.episodes, options.first_seed):
+                count += 1
                 steps += logged.status.tick
                 successes += logged.status.is_success
-                progress.advance(bar)
+                advance(1)
     except EpisodeLogError as error:
-        return _fail(error, 1)
-    except KeyboardInterrupt:
-        return _fail(KeyboardInterrupt('interrupted; finished episodes are kept'), 1)
-    wall, cpu = time.perf_counter() - began, time.process_time() - cpu_began
-    simulated = steps * simulation.tick_duration
-    print(
-        f'{options.episodes} episodes of {simulation.spec.name} in {options.output}: '
-        f'{successes} successes, {steps} steps, {wall:.1f} s, {simulated / wall:.0f} x real time, '
-        f'{simulated / cpu:.0f} x per core'
-    )
-    return 0
-
-
-def _fail(error: BaseException, code: int) -> int:
-    print(f'generate_episodes: {error}', file=sys.stderr)
-    return code
+        raise CommandError(str(error)) from None
+    finally:
+        wall, cpu = time.perf_counter() - began, time.process_time() - cpu_began
+        simulated = steps * simulation.tick_duration
+        print(
+            f'{count} episodes of {simulation.spec.name} in {options.output}: '
+            f'{successes} successes, {steps} steps, {wall:.1f} s, {simulated / wall:.0f} x real '
+            f'time, {simulated / cpu:.0f} x per core'
+        )
+    return EXIT_SUCCESS
 
 
 if __name__ == '__main__':

@@ -8,13 +8,20 @@ continued, so the same command goes on where it stopped; given twice at once, it
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from msgs_spec.command_line import (
+    EXIT_FAILURE,
+    EXIT_SUCCESS,
+    CommandError,
+    UsageError,
+    require_extra,
+    run_command,
+)
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.jobs import (
     ARMS,
@@ -26,6 +33,8 @@ from policy_node.training.benchmark.jobs import (
 )
 from policy_node.training.benchmark.results import write_report
 from policy_node.training.learning.config import RECIPES, parse_assignment, recipe_config
+
+_NAME = 'benchmark'
 
 
 def reduced_budget(task: str) -> dict[str, Any]:
@@ -52,7 +61,7 @@ def reduced_budget(task: str) -> dict[str, Any]:
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(prog='benchmark', description=__doc__)
+    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
     add = parser.add_argument
     add('--tasks', nargs='+', choices=list(TASKS), default=['FetchReach'], metavar='TASK')
     add('--arms', nargs='+', choices=list(ARMS), default=list(ARMS), metavar='ARM')
@@ -101,27 +110,33 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     options = parse_arguments(arguments)
+    command = shlex.join([_NAME, *(sys.argv[1:] if arguments is None else arguments)])
+    return run_command(_NAME, lambda: _run(options, command))
+
+
+def _run(options: argparse.Namespace, command: str) -> int:
+    if options.ray:
+        require_extra('cluster')
     try:
-        if options.ray and importlib.util.find_spec('ray') is None:
-            raise ValueError("Ray is not installed: pip install 'fetch_hand_sim[cluster]'")
         jobs = jobs_from_arguments(options)
     except (ValueError, TypeError) as error:
-        print(f'benchmark: {error}', file=sys.stderr)
-        return 2
-    command = shlex.join(['benchmark', *(sys.argv[1:] if arguments is None else arguments)])
+        raise UsageError(str(error)) from None
     try:
         whole = _run_on_ray(jobs) if options.ray else _run_in_turn(jobs)
+        return EXIT_SUCCESS if whole else EXIT_FAILURE
     except JobError as error:
-        print(f'benchmark: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        whole = False
+        raise CommandError(str(error)) from None
+    finally:
+        _report(options, jobs, command)
+
+
+def _report(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> None:
+    """Draws and prints what is finished, and says what is not."""
     finished = [job for job in jobs if job.is_finished]
     if finished:
         write_report(finished, options.report or options.output, command)
-    if not whole:
+    if len(finished) < len(jobs):
         print(f'{len(finished)} of {len(jobs)} jobs are finished; the same command goes on')
-    return 0
 
 
 def _run_in_turn(jobs: Sequence[Job]) -> bool:
@@ -133,7 +148,8 @@ def _run_in_turn(jobs: Sequence[Job]) -> bool:
         print(f'job {number} of {len(jobs)}: {job.name}', flush=True)
         try:
             if not run_job(job):
-                return False
+                # The trainer took the signal and finished its cycle.
+                raise KeyboardInterrupt
         except JobTakenError as error:
             print(error)
             whole = False

@@ -196,7 +196,7 @@ def test_ctrl_c_keeps_what_there_is_and_the_same_command_goes_on(
     handler = signal.getsignal(signal.SIGINT)
     thread = threading.Thread(target=interrupt)
     thread.start()
-    assert main(arguments) == 0
+    assert main(arguments) == 130
     thread.join()
     assert '0 of 2 jobs are finished; the same command goes on' in capsys.readouterr().out
     assert signal.getsignal(signal.SIGINT) is handler
@@ -215,7 +215,7 @@ def test_a_job_of_another_process_is_left_alone(
     taken.mkdir(parents=True)
     with (taken / LOCK_FILE).open('w') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        assert main(small(tmp_path, '--arms', 'her_sparse', 'ddpg_dense')) == 0
+        assert main(small(tmp_path, '--arms', 'her_sparse', 'ddpg_dense')) == 1
     printed = capsys.readouterr().out
     assert 'FetchReach/her_sparse/seed0 is being run by another process' in printed
     assert '1 of 2 jobs are finished' in printed

@@ -150,3 +150,26 @@ def test_bad_usage_is_one_line_and_exit_status_2(
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1
+
+
+def test_json_is_all_that_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ['--actor', 'resting', '--task', 'FetchReach', '--episodes', '2', '--json']
+    assert main([*arguments, '--threads', '1']) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report['task'], report['episodes']) == ('FetchReach', 2)
+
+
+def test_ctrl_c_reports_the_episodes_that_are_finished(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batches = iter([False, True])
+
+    def interrupted(*arguments: object) -> EpisodeOutcomes:
+        if next(batches):
+            raise KeyboardInterrupt
+        return run_episodes(*arguments)
+
+    monkeypatch.setattr('policy_node.training.evaluation.episodes.run_episodes', interrupted)
+    arguments = ['--actor', 'resting', '--task', 'FetchReach', '--episodes', '9', '--json']
+    assert main([*arguments, '--num-envs', '3', '--threads', '1']) == 130
+    assert json.loads(capsys.readouterr().out)['episodes'] == 3

@@ -1,0 +1,172 @@
+"""What all command lines share: errors of one line, exit codes, Ctrl-C, closed pipes, progress.
+
+Here, because commands of both packages use it and neither package knows the other.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
+from types import FrameType
+
+# Done; done, and something is wrong; not begun, because of what was given.
+EXIT_SUCCESS, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
+# As shells say it: 128 + SIGINT, 128 + SIGPIPE.
+EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 130, 141
+
+# Modules by which an extra of this package is recognised, since ROS brings its own by apt.
+EXTRAS = {
+    'ros': ('rclpy',),
+    'actors': ('torch', 'safetensors'),
+    'train': ('torch', 'safetensors', 'matplotlib', 'tensorboard'),
+    'data': ('pyarrow', 'minari'),
+    'sb3': ('stable_baselines3',),
+    'onnx': ('onnx', 'onnxruntime', 'onnxscript'),
+    'cluster': ('ray',),
+}
+
+
+class CommandError(Exception):
+    """Something is wrong; the message is one line."""
+
+    exit_code = EXIT_FAILURE
+
+
+class UsageError(CommandError):
+    """The user asked for what is not possible; the message is one line that says what is."""
+
+    exit_code = EXIT_USAGE
+
+
+def printable(text: str) -> str:
+    """Returns text from anywhere with what could command a terminal escaped."""
+    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def complain(name: str, text: object) -> None:
+    """Prints one line on stderr.
+
+    Args:
+        name: The command that complains.
+        text: What is wrong; line breaks become spaces, control characters are escaped.
+    """
+    print(f'{name}: {printable(" ".join(str(text).split()))}', file=sys.stderr, flush=True)
+
+
+def run_command(name: str, run: Callable[[], int]) -> int:
+    """Runs the body of a command and returns the exit code of the process.
+
+    Args:
+        name: Name of the command, for error lines.
+        run: Returns the exit code; may raise `CommandError`.
+
+    Returns:
+        What `run` returns, or the exit code of what it raised: 1 or 2 for a `CommandError`, 130 for
+        Ctrl-C (it is acknowledged at once with a line), 141 if nobody reads the output any more.
+    """
+    with _stopping_is_said(name):
+        try:
+            code = run()
+            sys.stdout.flush()
+        except CommandError as error:
+            complain(name, error)
+            return error.exit_code
+        except KeyboardInterrupt:
+            return EXIT_INTERRUPTED
+        except BrokenPipeError:
+            _discard_output()
+            return EXIT_CLOSED_PIPE
+    return code
+
+
+def start_command(name: str, module: str, *extras: str) -> int:
+    """Runs the `main` of a module that needs extras, once it is known that they are there.
+
+    Loading what they bring takes seconds: without this, Ctrl-C in them and what is missing would
+    end in tracebacks.
+    """
+
+    def run() -> int:
+        for extra in extras:
+            require_extra(extra)
+        main: Callable[[], int] = import_module(module).main
+        return main()
+
+    return run_command(name, run)
+
+
+def require_extra(extra: str) -> None:
+    """Checks that what an extra of this package brings is installed.
+
+    Raises:
+        UsageError: If not; the message says what to install.
+    """
+    missing = [module for module in EXTRAS[extra] if find_spec(module) is None]
+    if missing:
+        source = 'source a ROS 2 Jazzy installation or ' if extra == 'ros' else ''
+        raise UsageError(
+            f"{' and '.join(missing)} missing: {source}pip install 'fetch_hand_sim[{extra}]'"
+        )
+
+
+@contextmanager
+def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Shows how far a command is and how long it will take; nothing unless somebody watches.
+
+    Args:
+        description: What is counted.
+        total: How many there are.
+
+    Yields:
+        A function to call with the number of those that were done since the last call.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import TimeRemainingColumn as Remaining
+
+    columns = (TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), Remaining())
+    bars = Progress(
+        *columns,
+        console=Console(stderr=True),
+        transient=True,
+        disable=not sys.stderr.isatty(),
+        # Lines printed meanwhile go above the bar, unless they go to a file.
+        redirect_stdout=sys.stdout.isatty(),
+    )
+    with bars:
+        bar = bars.add_task(description, total=total)
+        yield lambda count: bars.advance(bar, count)
+
+
+@contextmanager
+def _stopping_is_said(name: str) -> Iterator[None]:
+    """Ctrl-C says `stopping` before it raises KeyboardInterrupt; a second one ends the process."""
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        complain(name, 'stopping')
+        signal.default_int_handler(number, frame)
+
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    if not is_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        # A command inside of another one, or somebody else's handler: theirs stays.
+        yield
+        return
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _discard_output() -> None:
+    """Lets Python flush stdout at its end without an error, although the pipe is closed."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)

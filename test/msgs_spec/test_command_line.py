@@ -1,0 +1,148 @@
+"""What all commands share: codes, one line per error, Ctrl-C, closed pipes, progress."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from msgs_spec.command_line import (
+    CommandError,
+    UsageError,
+    progress,
+    require_extra,
+    run_command,
+    start_command,
+)
+from support import script_environment
+
+PRELUDE = 'import sys, time\nfrom msgs_spec.command_line import *\n'
+
+
+def run_script(body: str, **options: object) -> subprocess.Popen[str]:
+    """Starts `run` of a script as the command `tool`."""
+    lines = ''.join(f'    {line}\n' for line in body.splitlines())
+    code = f'{PRELUDE}def run():\n{lines}sys.exit(run_command("tool", run))'
+    pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE} | options
+    return subprocess.Popen(
+        [sys.executable, '-c', code], text=True, env=script_environment(), **pipes
+    )
+
+
+def fail(error: BaseException) -> int:
+    raise error
+
+
+@pytest.mark.parametrize(
+    ('error', 'code'), [(CommandError('no\nluck \x1b[31m'), 1), (UsageError('no luck \x1b[31m'), 2)]
+)
+def test_an_error_is_one_line_without_control_characters(error, code, capsys):
+    assert run_command('tool', lambda: fail(error)) == code
+    assert capsys.readouterr().err == 'tool: no luck \\x1b[31m\n'
+
+
+def test_the_code_of_a_command_is_its_own():
+    assert [run_command('tool', lambda code=code: code) for code in (0, 1, 2)] == [0, 1, 2]
+
+
+def test_an_error_that_nobody_expects_is_not_hidden():
+    with pytest.raises(ZeroDivisionError):
+        run_command('tool', lambda: 1 // 0)
+
+
+def test_ctrl_c_is_acknowledged_and_ends_with_130_without_a_traceback():
+    process = run_script(
+        'try:\n    print("begun", flush=True)\n    time.sleep(60)\nfinally:\n    print("tidied")'
+    )
+    assert process.stdout.readline() == 'begun\n'
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=20) == ('tidied\n', 'tool: stopping\n')
+    assert process.returncode == 130
+
+
+def test_a_second_ctrl_c_ends_a_command_that_tidies_for_ever():
+    process = run_script(
+        'try:\n    print(1, flush=True)\n    time.sleep(60)\nfinally:\n    time.sleep(60)'
+    )
+    process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    assert process.stderr.readline() == 'tool: stopping\n'
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=20) == ('', '')
+    assert process.returncode == -signal.SIGINT
+
+
+def test_a_handler_of_others_stays():
+    before = signal.getsignal(signal.SIGINT)
+    seen: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: seen.append(number))
+    try:
+        assert run_command('tool', lambda: os.kill(os.getpid(), signal.SIGINT) or 0) == 0
+        assert seen == [signal.SIGINT]
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize('flush', [True, False])
+def test_a_closed_output_ends_quietly(flush):
+    process = run_script(f'for _ in range(100000): print("line", flush={flush})\nreturn 0')
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.stderr.read() == ''
+    assert process.wait(20) == 141
+
+
+# Extras
+
+
+def test_what_an_extra_lacks_is_named_with_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    with pytest.raises(UsageError, match=r"pyarrow missing: pip install 'fetch_hand_sim\[data\]'"):
+        require_extra('data')
+    monkeypatch.setitem(sys.modules, 'rclpy', None)
+    with pytest.raises(UsageError, match=r'source a ROS 2 Jazzy installation or pip install'):
+        require_extra('ros')
+
+
+def test_a_command_does_not_begin_without_its_extra(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, 'torch', None)
+    assert start_command('tool', 'no.such.module', 'actors') == 2
+    assert capsys.readouterr().err == (
+        "tool: torch missing: pip install 'fetch_hand_sim[actors]'\n"
+    )
+
+
+# Progress
+
+
+@pytest.mark.parametrize('is_watched', [True, False])
+def test_progress_is_shown_to_a_person_only(is_watched):
+    script = (
+        'with progress("episodes", 3) as advance:\n    advance(1)\n    time.sleep(0.3)\nreturn 0'
+    )
+    if not is_watched:
+        process = run_script(script)
+        assert process.communicate(timeout=20) == ('', '')
+        return
+    terminal, end = pty.openpty()
+    process = run_script(script, stderr=end)
+    os.close(end)
+    shown = b''
+    try:
+        while chunk := os.read(terminal, 4096):
+            shown += chunk
+    except OSError:
+        pass  # How Linux says that the other end is closed.
+    finally:
+        os.close(terminal)
+    assert process.communicate(timeout=20)[0] == ''
+    assert b'episodes' in shown and b'1/3' in shown
+
+
+def test_progress_passes_what_is_inside_on():
+    with pytest.raises(ValueError, match='inside'), progress('episodes', 1):
+        raise ValueError('inside')

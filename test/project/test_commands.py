@@ -1,0 +1,127 @@
+"""All commands, as installed: one exit code for one kind of failure, no traceback for anybody."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+from importlib.metadata import distribution
+
+import pytest
+
+from fetch_hand_sim.commands.executables import executable, find_executable
+from msgs_spec.command_line import EXTRAS
+
+NODES = {'sim_node', 'policy_node', 'replay_node'}
+# What each executable needs beyond the base installation.
+NEEDS = {
+    'sim_node': ['rclpy'],
+    'policy_node': ['rclpy'],
+    'replay_node': ['rclpy'],
+    'evaluate_policy': ['torch', 'safetensors'],
+    'generate_episodes': ['torch', 'safetensors'],
+    'train_her': ['torch', 'safetensors', 'matplotlib', 'tensorboard'],
+    'benchmark': ['torch', 'safetensors', 'matplotlib', 'tensorboard'],
+    'export_actor': ['torch', 'onnx', 'onnxscript'],
+    'export_episodes': ['pyarrow', 'minari'],
+    'list_episodes': [],
+    'check_episode': [],
+    'recover_episodes': [],
+}
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Runs an executable through its entry point; returns exit code, stdout and stderr.
+
+    In this process, because most of them load torch.
+    """
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def call(name: str, *arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, 'argv', [name, *map(str, arguments)])
+        try:
+            code = find_executable(name).load()()
+        except SystemExit as exit_:
+            code = exit_.code
+        return code, *capsys.readouterr()
+
+    yield call
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def test_every_executable_says_what_it_needs():
+    points = distribution('fetch_hand_sim').entry_points
+    assert points.select(group='console_scripts').names == set(NEEDS)
+
+
+@pytest.mark.parametrize(
+    ('name', 'module'), [(name, module) for name, needs in NEEDS.items() for module in needs]
+)
+def test_a_missing_extra_is_one_line_that_says_what_to_install(name, module, run, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    required = ['x', '--to', 'parquet', '--output', 'x'] if name == 'export_episodes' else []
+    code, output, error = run(name, *required)
+    assert (code, output) == (2, '')
+    line = rf"{name}: {module} missing: .*pip install 'fetch_hand_sim\[\w+\]'\n"
+    assert re.fullmatch(line, error)
+
+
+@pytest.mark.parametrize('name', sorted(set(NEEDS) - NODES))
+def test_help_is_there(name, run):
+    code, output, error = run(name, '--help')
+    assert (code, error) == (0, '')
+    assert f'usage: {name}' in output
+
+
+@pytest.mark.parametrize(
+    ('name', 'arguments'),
+    [
+        ('evaluate_policy', ['--actor', 'nosuch']),
+        ('generate_episodes', ['--policy', 'nosuch', '--output', 'x']),
+        ('export_actor', ['nosuch', 'x.onnx']),
+        ('export_actor', ['FetchReach', 'nosuch.txt']),
+        ('train_her', ['--task', 'FetchReach', '--set', 'nosuch=1']),
+        ('list_episodes', ['nosuch']),
+        ('check_episode', ['nosuch']),
+        ('recover_episodes', ['nosuch']),
+        ('export_episodes', ['nosuch', '--to', 'parquet', '--output', 'x']),
+    ],
+)
+def test_what_is_not_there_is_bad_usage_in_one_line(name, arguments, run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, output, error = run(name, *arguments)
+    assert (code, output) == (2, '')
+    assert re.fullmatch(rf'{name}: .*nosuch.*\n', error)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_in_an_evaluation_keeps_what_is_finished():
+    arguments = ['--actor', 'resting', '--task', 'FetchReach', '--episodes', '1000000']
+    terminal, end = pty.openpty()
+    process = subprocess.Popen(
+        [*executable('evaluate_policy'), *arguments, '--num-envs', '4', '--threads', '1'],
+        stdout=subprocess.PIPE,
+        stderr=end,
+        text=True,
+    )
+    os.close(end)
+    shown = b''
+    while not re.search(rb'[1-9]\d*/1000000', shown):
+        shown += os.read(terminal, 4096)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    shown += os.read(terminal, 65536)
+    os.close(terminal)
+    assert process.returncode == 130
+    assert b'evaluate_policy: stopping' in shown and b'Traceback' not in shown
+    assert re.search(r'FetchReach: resting, \d+ episodes', output)
+
+
+def test_extras_are_those_of_the_package():
+    declared = set(distribution('fetch_hand_sim').metadata.get_all('Provides-Extra'))
+    assert set(EXTRAS) <= declared
