@@ -40,7 +40,7 @@ from msgs_spec.tasks import TaskSpec
 _OBJECT_JOINT = 'object:joint'
 _OBJECT_SITE = 'object:center'
 # An object whose centre is lower than this after settling has fallen off the palm, metres.
-_PALM_HEIGHT = 0.04
+PALM_HEIGHT = 0.04
 _SETTLING_TICKS = 10
 _POSITION_SCATTER = 0.005
 # Box around the object in which `Full` goals lie, metres.
@@ -117,7 +117,7 @@ class HandManipulateTask(HandTask):
             self.batch.step(left, nstep=_SETTLING_TICKS * self.substeps)
             self.batch.forward(left)
             height = self._site_xpos[left, self._object_site, 2]
-            left = left[~(height > _PALM_HEIGHT)]
+            left = left[~(height > PALM_HEIGHT)]
         return np.array([self._sample_goal(i, generator_of[i]) for i in ids.tolist()])
 
     def _start_again(self, ids: Ids) -> None:

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
+from msgs_spec.tasks import GoalKind, TaskSpec
 from policy_node.training.learning.collector import Policy
 
 # Two-sided 95 % quantile of the standard normal distribution.
@@ -28,6 +30,13 @@ class EpisodeOutcomes:
         touched: Success (rule of the simulation) at any step.
         episode_return: Sum of rewards.
         diverged: MuJoCo lost the episode; it counts as a failure.
+        ticks_reached: Ticks in success (rule of the simulation) that another tick follows.
+        ticks_kept: Those of them that are followed by success.
+        long_way: The quaternions of goal and object had opposite signs at the start, so that the
+            `gymnasium` rule asks for the turn of more than pi; False where the goal is no pose.
+        dropped: The object was below the palm at the end; False where the goal is no pose.
+        final_distance: Metres to the goal at the end; NaN where position does not count.
+        final_rotation: Radians to the goal at the end; NaN where rotation does not count.
     """
 
     seed: NDArray[np.int64]
@@ -36,6 +45,12 @@ class EpisodeOutcomes:
     touched: NDArray[np.bool_]
     episode_return: NDArray[np.float64]
     diverged: NDArray[np.bool_]
+    ticks_reached: NDArray[np.int64]
+    ticks_kept: NDArray[np.int64]
+    long_way: NDArray[np.bool_]
+    dropped: NDArray[np.bool_]
+    final_distance: NDArray[np.float64]
+    final_rotation: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.seed)
@@ -72,7 +87,30 @@ def summarize(outcomes: EpisodeOutcomes) -> dict[str, Any]:
         summary[f'{name}_interval_95'] = list(wilson_interval(count, episodes))
     summary['mean_return'] = float(outcomes.episode_return.mean())
     summary['diverged'] = int(outcomes.diverged.sum())
-    return summary
+    return summary | diagnose(outcomes)
+
+
+def diagnose(outcomes: EpisodeOutcomes) -> dict[str, float]:
+    """Why episodes fail; what the task does not have, or did not happen, is left out.
+
+    Returns:
+        `stay`: probability of success at the next tick, given success at this one. `long_way`:
+        success at the last step of episodes that ask for the turn of more than pi, and
+        `long_way_share`, how many do. `dropped`: share of episodes that end below the palm.
+        `distance`, `rotation`: medians at the end, metres and radians.
+    """
+    found: dict[str, float] = {}
+    if outcomes.ticks_reached.any():
+        found['stay'] = float(outcomes.ticks_kept.sum() / outcomes.ticks_reached.sum())
+    if outcomes.long_way.any():
+        found['long_way'] = float(outcomes.success_gymnasium[outcomes.long_way].mean())
+        found['long_way_share'] = float(outcomes.long_way.mean())
+    if np.isfinite(outcomes.final_rotation).any():
+        found['dropped'] = float(outcomes.dropped.mean())
+        found['rotation'] = float(np.nanmedian(outcomes.final_rotation))
+    if np.isfinite(outcomes.final_distance).any():
+        found['distance'] = float(np.nanmedian(outcomes.final_distance))
+    return found
 
 
 def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> EpisodeOutcomes:
@@ -85,17 +123,25 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
     """
     observation = simulation.reset(seed=seeds)
     count = simulation.num_envs
+    long_way = _long_way(simulation.spec, observation)
     touched, diverged = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+    success = np.zeros(count, np.bool_)
+    ticks_reached, ticks_kept = np.zeros(count, np.int64), np.zeros(count, np.int64)
     episode_return = np.zeros(count)
     for _ in range(simulation.spec.episode_ticks):
         action, _ = policy.predict(observation, deterministic=True)
         result = simulation.step(action)
         observation = result.observation
-        touched |= result.success & ~diverged
+        ticks_reached += success
+        ticks_kept += success & result.success
+        success = result.success
+        touched |= success & ~diverged
         diverged |= result.diverged
         episode_return += result.reward
     goals = observation['achieved_goal'], observation['desired_goal']
-    metric = simulation.metric
+    metric, spec = simulation.metric, simulation.spec
+    distance, rotation = metric.distances(*goals)
+    fallen = spec.goal is GoalKind.POSE and goals[0][:, 2] < PALM_HEIGHT
     return EpisodeOutcomes(
         seed=np.array(seeds),
         success_gymnasium=replace(metric, success_rule='gymnasium').success(*goals) & ~diverged,
@@ -103,7 +149,21 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
         touched=touched,
         episode_return=episode_return,
         diverged=diverged,
+        ticks_reached=ticks_reached,
+        ticks_kept=ticks_kept,
+        long_way=long_way,
+        dropped=np.broadcast_to(fallen, count),
+        final_distance=distance if spec.position_counts else np.full(count, np.nan),
+        final_rotation=rotation if spec.goal is GoalKind.POSE else np.full(count, np.nan),
     )
+
+
+def _long_way(spec: TaskSpec, observation: dict[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
+    """Whether goal and object have quaternions of opposite signs, (episodes,)."""
+    achieved, desired = observation['achieved_goal'], observation['desired_goal']
+    if spec.goal is not GoalKind.POSE:
+        return np.zeros(len(achieved), np.bool_)
+    return np.asarray((achieved[:, 3:] * desired[:, 3:]).sum(axis=-1) < 0.0)
 
 
 def evaluate(

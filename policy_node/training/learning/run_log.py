@@ -21,6 +21,12 @@ COLUMNS = (
     'train_success',
     'eval_success',
     'eval_episodes',
+    'eval_touched',
+    'eval_stay',
+    'eval_long_way',
+    'eval_dropped',
+    'eval_distance',
+    'eval_rotation',
     'critic_loss',
     'actor_loss',
     'mean_value',
@@ -50,10 +56,14 @@ class RunLog:
         self._total_steps = total_steps
         self._time_limit = time_limit
         kept = _rows_until(self.path, resumed_steps)
-        self._file: IO[str] = self.path.open('w', newline='')
-        self._writer = csv.DictWriter(self._file, COLUMNS)
+        partial = self.path.with_name(f'.{self.path.name}.partial')
+        self._file: IO[str] = partial.open('w', newline='')
+        # Logs from before a column was added leave it empty.
+        self._writer = csv.DictWriter(self._file, COLUMNS, restval='', extrasaction='ignore')
         self._writer.writeheader()
         self._writer.writerows(kept)
+        self._file.flush()
+        partial.replace(self.path)
         self._board = _tensorboard(output, resumed_steps)
         self._console = Console(stderr=True)
         self._live = Live(console=self._console, refresh_per_second=4, transient=False)

@@ -16,7 +16,7 @@ import torch
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from policy_node.policies.actor import Actor
-from policy_node.training.evaluation.episodes import EpisodeOutcomes
+from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
 from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.config import TrainConfig
@@ -266,6 +266,7 @@ class Trainer:
             if self.workers.is_first:
                 rule = self.config.success_rule
                 measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
+                measured |= diagnose(outcomes)
                 self._folder.save_actor(BEST_FILE, actor, counters.env_steps, measured)
 
     def _reason_to_stop(self, collected: Collected) -> str:
@@ -308,12 +309,21 @@ class Trainer:
             'train_success': collected.train_success,
             'eval_success': None if outcomes is None else self._evaluator.success_rate(outcomes),
             'eval_episodes': None if outcomes is None else len(outcomes),
+            **_diagnostics(outcomes),
             'critic_loss': mean('critic'),
             'actor_loss': mean('actor'),
             'mean_value': mean('value'),
             'steps_per_second': steps / seconds,
             'samples_per_second': samples / seconds,
         }
+
+
+def _diagnostics(outcomes: EpisodeOutcomes | None) -> dict[str, float | None]:
+    """Columns of the log that say why evaluated episodes failed."""
+    if outcomes is None:
+        return {}
+    found = {'touched': float(outcomes.touched.mean()), **diagnose(outcomes)}
+    return {f'eval_{name}': value for name, value in found.items() if name != 'long_way_share'}
 
 
 def scale_distance(metric: GoalMetric, share: float) -> GoalMetric:

@@ -14,6 +14,7 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.training.evaluate_policy import main
 from policy_node.training.evaluation.episodes import (
     EpisodeOutcomes,
+    diagnose,
     evaluate,
     run_episodes,
     summarize,
@@ -102,13 +103,63 @@ def test_both_rules_are_applied_whatever_the_rule_of_the_simulation() -> None:
 def test_summary() -> None:
     flags = np.array([True, False, True, False])
     outcomes = EpisodeOutcomes(
-        np.arange(4) + 7, flags, ~flags, flags | True, np.arange(4) * -1.0, ~flags
+        seed=np.arange(4) + 7,
+        success_gymnasium=flags,
+        success_paper=~flags,
+        touched=flags | True,
+        episode_return=np.arange(4) * -1.0,
+        diverged=~flags,
+        ticks_reached=np.array([10, 0, 30, 0]),
+        ticks_kept=np.array([9, 0, 21, 0]),
+        long_way=np.array([True, True, False, True]),
+        dropped=np.array([False, True, False, False]),
+        final_distance=np.full(4, np.nan),
+        final_rotation=np.array([0.05, 2.0, 0.03, 0.15]),
     )
     summary = summarize(outcomes)
     assert (summary['episodes'], summary['first_seed'], summary['diverged']) == (4, 7, 2)
     assert (summary['success_gymnasium'], summary['touched']) == (0.5, 1.0)
     assert summary['success_gymnasium_interval_95'] == list(wilson_interval(2, 4))
     assert summary['mean_return'] == -1.5
+    assert (summary['stay'], summary['dropped']) == (0.75, 0.25)
+    assert (summary['long_way'], summary['long_way_share']) == (pytest.approx(1 / 3), 0.75)
+    assert summary['rotation'] == pytest.approx(0.1) and 'distance' not in summary
+
+
+def test_staying_is_counted_tick_by_tick() -> None:
+    """The goal is where the gripper is for `held` ticks of every four, else far away."""
+
+    class Fleeting(RestingPolicy):
+        tick = 0
+
+        def predict(self, observation: dict[str, np.ndarray], **options: bool) -> tuple:
+            far = 0.0 if self.tick % 4 < held else 1.0
+            robot.set_goal(observation['achieved_goal'] + far)
+            self.tick += 1
+            return super().predict(observation, **options)
+
+    robot = simulation(2)
+    for held, stay in ((1, 0.0), (2, 13 / 25), (3, 25 / 37)):
+        outcomes = run_episodes(robot, Fleeting(4), [1, 2])
+        # 50 ticks are twelve times four and two more, the last of which nothing follows.
+        reached = 12 * held + min(held, 2) - (held >= 2)
+        assert outcomes.ticks_reached.tolist() == [reached] * 2
+        assert diagnose(outcomes).get('stay', 0.0) == pytest.approx(stay)
+        assert outcomes.final_distance == pytest.approx(0.0 if held >= 2 else 3**0.5, abs=0.01)
+        assert not {'dropped', 'rotation', 'long_way'} & diagnose(outcomes).keys()
+
+
+def test_objects_that_fall_and_goals_the_long_way_round_are_seen() -> None:
+    seeds = list(range(8))
+    pen = simulation(8, 'HandManipulatePenRotate')
+    dropped = run_episodes(pen, RandomPolicy(20), seeds)
+    heights = pen.observe()['achieved_goal'][:, 2]
+    assert dropped.dropped.tolist() == (heights < 0.04).tolist()
+    assert 4 <= dropped.dropped.sum(), 'nine of ten random episodes drop it'
+    start = pen.reset(seed=seeds)
+    product = start['achieved_goal'][:, 3:] * start['desired_goal'][:, 3:]
+    assert dropped.long_way.tolist() == (product.sum(axis=1) < 0).tolist()
+    assert np.isnan(dropped.final_distance).all() and (dropped.final_rotation >= 0).all()
 
 
 def test_random_policy_is_seeded_and_bounded() -> None:

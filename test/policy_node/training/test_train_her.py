@@ -57,11 +57,12 @@ def test_fetch_reach_is_learnt_from_nothing(tmp_path: Path) -> None:
     arguments = ['--task', 'FetchReach', '--success-target', '1', '--steps', '40000']
     assert main([*arguments, *THREADS, '--output', str(tmp_path / 'run')]) == 0
     _, info = checkpoint.load(tmp_path / 'run' / 'best.safetensors', task='FetchReach')
-    assert info.success == {'last_step': 1.0, 'episodes': 200, 'rule': 'gymnasium'}
+    assert info.success.items() >= {'last_step': 1.0, 'episodes': 200, 'rule': 'gymnasium'}.items()
+    assert info.success['stay'] > 0.9 and info.success['distance'] < 0.05
     assert info.command.startswith('train_her --task FetchReach --success-target 1')
     assert info.source_revision and 0 < info.env_steps <= 40_000
     rows = read_progress(tmp_path / 'run' / 'progress.csv')
-    assert rows[-1]['eval_success'] == 1.0
+    assert rows[-1]['eval_success'] == 1.0 and rows[-1]['eval_stay'] > 0.9
     assert rows[0]['train_success'] < 0.5 < rows[-1]['train_success']
     assert (tmp_path / 'run' / 'curve.png').read_bytes()[:4] == b'\x89PNG'
     assert (
@@ -293,7 +294,11 @@ def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path: Path)
     def evaluated(steps: int, successes: int, mean_return: float, count: int = 4) -> int:
         flags = np.arange(count) < successes
         returns = np.full(count, mean_return)
-        outcomes = EpisodeOutcomes(np.arange(count), flags, flags, flags, returns, ~flags)
+        none, nan = np.zeros(count, int), np.full(count, np.nan)
+        outcomes = EpisodeOutcomes(
+            *(np.arange(count), flags, flags, flags, returns, ~flags),
+            *(none, none, ~flags, ~flags, nan, nan),
+        )
         trainer.counters.env_steps = steps
         actor = trainer.learner.evaluation_actor()
         trainer._keep_best(Collected(episodes, success, outcomes, actor))
