@@ -10,120 +10,83 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from msgs_spec.rotations import matrix_to_euler, quaternion_to_matrix
 from msgs_spec.tasks import PHYSICS_TIMESTEP, GoalKind, TaskSpec, substeps_per_tick
 from msgs_spec.topics import topic
 
 Array = NDArray[np.float64]
+# What sensors say: vectors (..., topic.size) by name of the topic.
+Readings = Mapping[str, Array]
 
 
-def fetch_observation(
-    end_effector_position: ArrayLike,
-    end_effector_velocity: ArrayLike,
-    joint_position: ArrayLike,
-    joint_velocity: ArrayLike,
-    tick_duration: float,
-    object_position: ArrayLike | None = None,
-    object_quaternion: ArrayLike | None = None,
-    object_linear_velocity: ArrayLike | None = None,
-    object_angular_velocity: ArrayLike | None = None,
-) -> Array:
-    """Observation of the Fetch tasks (`generate_mujoco_observations` of `fetch_env.py`).
+def observed_topics(task: TaskSpec) -> tuple[str, ...]:
+    """Names of the topics from which the observation of a task is made."""
+    if task.goal is GoalKind.FINGERTIPS:
+        return ('joint_states', 'fingertip_poses')
+    if task.goal is GoalKind.POSE:
+        return ('joint_states', 'object_joint')
+    robot = ('joint_states', 'end_effector_pose', 'end_effector_twist')
+    return (*robot, 'object_pose', 'object_twist') if task.has_object else robot
 
-    Velocities are per tick there, hence `tick_duration`. Without an object it is FetchReach's.
+
+def observation(task: TaskSpec, readings: Readings, tick_duration: float) -> Array:
+    """Observation vectors from what the sensors say; `task.observation` names their parts.
 
     Args:
-        end_effector_position: (..., 3), site `robot0:grip`, m, world.
-        end_effector_velocity: (..., 3), m/s, world.
-        joint_position: (..., 15), order of `joint_states`; the last two are the fingers, m.
-        joint_velocity: (..., 15), likewise, m/s.
+        task: The task.
+        readings: At least its `observed_topics`; quaternions of unit length.
         tick_duration: Seconds of one control period.
-        object_position: (..., 3), m, world.
-        object_quaternion: (..., 4), wxyz, unit length.
-        object_linear_velocity: (..., 3), m/s, world.
-        object_angular_velocity: (..., 3), rad/s, world.
 
     Returns:
-        (..., 10) without an object, (..., 25) with one.
-
-    Raises:
-        ValueError: If there is an object position but not the other object values.
+        (..., task.observation_size).
     """
-    gripper = np.asarray(end_effector_position, dtype=np.float64)
-    gripper_velocity = np.asarray(end_effector_velocity, dtype=np.float64) * tick_duration
-    fingers = np.asarray(joint_position, dtype=np.float64)[..., -2:]
-    fingers_velocity = np.asarray(joint_velocity, dtype=np.float64)[..., -2:] * tick_duration
-    if object_position is None:
-        return np.concatenate([gripper, fingers, gripper_velocity, fingers_velocity], axis=-1)
-    if (
-        object_quaternion is None
-        or object_linear_velocity is None
-        or object_angular_velocity is None
-    ):
-        raise ValueError(
-            'object_position given without object_quaternion, object_linear_velocity and '
-            'object_angular_velocity; allowed: all four or none'
-        )
-    position = np.asarray(object_position, dtype=np.float64)
-    velocity = np.asarray(object_linear_velocity, dtype=np.float64) * tick_duration
-    rotation_velocity = np.asarray(object_angular_velocity, dtype=np.float64) * tick_duration
-    return np.concatenate(
-        [
-            gripper,
-            position,
-            position - gripper,
-            fingers,
-            matrix_to_euler(quaternion_to_matrix(object_quaternion)),
-            velocity - gripper_velocity,
-            rotation_velocity,
-            gripper_velocity,
-            fingers_velocity,
-        ],
-        axis=-1,
-    )
+    if task.robot.has_gripper_command:
+        return np.concatenate(_fetch_parts(task, readings, tick_duration), axis=-1)
+    position, velocity, _ = np.split(readings['joint_states'], 3, axis=-1)
+    if task.goal is GoalKind.FINGERTIPS:
+        # `shadow_dexterous_hand/reach.py` of Gymnasium-Robotics.
+        return np.concatenate([position, velocity, readings['fingertip_poses']], axis=-1)
+    # `shadow_dexterous_hand/manipulate.py`.
+    qpos, qvel = np.split(readings['object_joint'], [7], axis=-1)
+    return np.concatenate([position, velocity, qvel, qpos], axis=-1)
 
 
-def hand_reach_observation(
-    joint_position: ArrayLike, joint_velocity: ArrayLike, fingertip_positions: ArrayLike
-) -> Array:
-    """Observation of HandReach (`shadow_dexterous_hand/reach.py` of Gymnasium-Robotics).
+def _fetch_parts(task: TaskSpec, readings: Readings, tick_duration: float) -> list[Array]:
+    """What `generate_mujoco_observations` of `fetch_env.py` puts together.
 
-    Args:
-        joint_position: (..., 24), rad.
-        joint_velocity: (..., 24), rad/s.
-        fingertip_positions: (..., 15), m, world, fingers in the order of `robots.FINGERTIPS`.
-
-    Returns:
-        (..., 63).
+    Velocities are per tick there, hence `tick_duration`.
     """
-    return _concatenate(joint_position, joint_velocity, fingertip_positions)
+    position, velocity, _ = np.split(readings['joint_states'], 3, axis=-1)
+    gripper = readings['end_effector_pose'][..., :3]
+    gripper_velocity = readings['end_effector_twist'][..., :3] * tick_duration
+    fingers, fingers_velocity = position[..., -2:], velocity[..., -2:] * tick_duration
+    if not task.has_object:
+        return [gripper, fingers, gripper_velocity, fingers_velocity]
+    place, quaternion = np.split(readings['object_pose'], [3], axis=-1)
+    linear, angular = np.split(readings['object_twist'] * tick_duration, 2, axis=-1)
+    return [
+        gripper,
+        place,
+        place - gripper,
+        fingers,
+        matrix_to_euler(quaternion_to_matrix(quaternion)),
+        linear - gripper_velocity,
+        angular,
+        gripper_velocity,
+        fingers_velocity,
+    ]
 
 
-def hand_object_observation(
-    joint_position: ArrayLike,
-    joint_velocity: ArrayLike,
-    object_qvel: ArrayLike,
-    object_qpos: ArrayLike,
-) -> Array:
-    """Observation of the hand manipulation tasks (`shadow_dexterous_hand/manipulate.py`).
-
-    Args:
-        joint_position: (..., 24), rad.
-        joint_velocity: (..., 24), rad/s.
-        object_qvel: (..., 6), the free joint's velocity as MuJoCo holds it: m/s (world) and rad/s
-            (object frame).
-        object_qpos: (..., 7), the free joint's position: m (world), quaternion wxyz.
-
-    Returns:
-        (..., 61).
-    """
-    return _concatenate(joint_position, joint_velocity, object_qvel, object_qpos)
-
-
-def _concatenate(*parts: ArrayLike) -> Array:
-    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts], axis=-1)
+def achieved_goal(task: TaskSpec, readings: Readings) -> Array:
+    """Achieved goals (..., task.goal.size) from what the sensors say, a fresh array."""
+    if task.goal is GoalKind.FINGERTIPS:
+        return readings['fingertip_poses'].copy()
+    if task.goal is GoalKind.POSE:
+        return readings['object_joint'][..., :7].copy()
+    place = readings['object_pose' if task.has_object else 'end_effector_pose']
+    return place[..., :3].copy()
 
 
 class ObservationAssembler:
@@ -143,10 +106,10 @@ class ObservationAssembler:
     def __init__(self, task: TaskSpec, control_hz: float) -> None:
         self._task = task
         self._tick_duration = substeps_per_tick(control_hz) * PHYSICS_TIMESTEP
-        names = (*_observed_topics(task), 'achieved_goal', 'desired_goal')
+        names = (*observed_topics(task), 'achieved_goal', 'desired_goal')
         self.topics = tuple(topic(task, name) for name in names)
 
-    def assemble(self, vectors: Mapping[str, Array]) -> dict[str, Array]:
+    def assemble(self, vectors: Readings) -> dict[str, Array]:
         """Returns `observation`, `achieved_goal` and `desired_goal`, float64.
 
         Args:
@@ -162,35 +125,7 @@ class ObservationAssembler:
             if not np.isfinite(vectors[name]).all():
                 raise ValueError(f'{name}: not every value is finite')
         return {
-            'observation': self._observation(vectors),
+            'observation': observation(self._task, vectors, self._tick_duration),
             'achieved_goal': vectors['achieved_goal'].copy(),
             'desired_goal': vectors['desired_goal'].copy(),
         }
-
-    def _observation(self, vectors: Mapping[str, Array]) -> Array:
-        position, velocity, _ = np.split(vectors['joint_states'], 3, axis=-1)
-        if self._task.robot.has_gripper_command:
-            return self._fetch(position, velocity, vectors)
-        if self._task.goal is GoalKind.FINGERTIPS:
-            return hand_reach_observation(position, velocity, vectors['fingertip_poses'])
-        qpos, qvel = np.split(vectors['object_joint'], [7], axis=-1)
-        return hand_object_observation(position, velocity, qvel, qpos)
-
-    def _fetch(self, position: Array, velocity: Array, vectors: Mapping[str, Array]) -> Array:
-        gripper = vectors['end_effector_pose'][..., :3]
-        gripper_velocity = vectors['end_effector_twist'][..., :3]
-        robot = (gripper, gripper_velocity, position, velocity, self._tick_duration)
-        if not self._task.has_object:
-            return fetch_observation(*robot)
-        object_position, object_quaternion = np.split(vectors['object_pose'], [3], axis=-1)
-        linear, angular = np.split(vectors['object_twist'], 2, axis=-1)
-        return fetch_observation(*robot, object_position, object_quaternion, linear, angular)
-
-
-def _observed_topics(task: TaskSpec) -> tuple[str, ...]:
-    if task.goal is GoalKind.FINGERTIPS:
-        return ('joint_states', 'fingertip_poses')
-    if task.goal is GoalKind.POSE:
-        return ('joint_states', 'object_joint')
-    robot = ('joint_states', 'end_effector_pose', 'end_effector_twist')
-    return (*robot, 'object_pose', 'object_twist') if task.has_object else robot

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_status
+from msgs_spec.observations import Readings
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import TopicSpec, topics
@@ -85,27 +86,14 @@ class EpisodeStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tick:
-    """State of the simulation at one stamp, SI units, world frame, quaternions wxyz.
+    """State of the simulation at one stamp.
 
-    What a task does not have is None. `reward` and `applied_command` are None at tick 0 of an
-    episode, where no command has been applied yet.
+    `reward` and `applied_command` are None at tick 0 of an episode, where no command has been
+    applied yet.
 
     Attributes:
         stamp_ns: Simulated time, nanoseconds.
-        joint_position: (joints,), order of the robot's joints.
-        joint_velocity: (joints,).
-        joint_effort: (joints,), N m or N.
-        end_effector_position: (3,), Fetch.
-        end_effector_quaternion: (4,), Fetch.
-        end_effector_linear_velocity: (3,), Fetch.
-        end_effector_angular_velocity: (3,), Fetch.
-        fingertip_positions: (15,), hand.
-        object_position: (3,).
-        object_quaternion: (4,).
-        object_linear_velocity: (3,).
-        object_angular_velocity: (3,), world axes.
-        object_qpos: (7,), free joint as MuJoCo holds it, hand manipulation.
-        object_qvel: (6,), likewise: linear in the world, angular in the object frame.
+        readings: What the sensors say: the vector (topic.size,) of each topic that reports one.
         desired_goal: (goal,).
         achieved_goal: (goal,).
         reward: Reward of the step that led here.
@@ -115,20 +103,7 @@ class Tick:
     """
 
     stamp_ns: int
-    joint_position: Array
-    joint_velocity: Array
-    joint_effort: Array
-    end_effector_position: Array | None = None
-    end_effector_quaternion: Array | None = None
-    end_effector_linear_velocity: Array | None = None
-    end_effector_angular_velocity: Array | None = None
-    fingertip_positions: Array | None = None
-    object_position: Array | None = None
-    object_quaternion: Array | None = None
-    object_linear_velocity: Array | None = None
-    object_angular_velocity: Array | None = None
-    object_qpos: Array | None = None
-    object_qvel: Array | None = None
+    readings: Readings
     desired_goal: Array
     achieved_goal: Array
     reward: float | None
@@ -137,31 +112,17 @@ class Tick:
     status: EpisodeStatus
 
 
-def _join(*parts: Array | None) -> Array:
-    """The given parts in one vector; what is missing shows in its size."""
-    return np.concatenate([np.zeros(0), *(part for part in parts if part is not None)])
-
-
-# The vector of each topic; None leaves the topic out of this tick.
-_VECTORS: dict[str, Callable[[Tick], Array | list[float] | None]] = {
-    '/clock': lambda tick: [],
-    'joint_states': lambda tick: _join(tick.joint_position, tick.joint_velocity, tick.joint_effort),
-    'end_effector_pose': lambda tick: _join(
-        tick.end_effector_position, tick.end_effector_quaternion
-    ),
-    'end_effector_twist': lambda tick: _join(
-        tick.end_effector_linear_velocity, tick.end_effector_angular_velocity
-    ),
-    'fingertip_poses': lambda tick: _join(tick.fingertip_positions),
-    'object_pose': lambda tick: _join(tick.object_position, tick.object_quaternion),
-    'object_twist': lambda tick: _join(tick.object_linear_velocity, tick.object_angular_velocity),
-    'object_joint': lambda tick: _join(tick.object_qpos, tick.object_qvel),
-    'desired_goal': lambda tick: tick.desired_goal,
-    'achieved_goal': lambda tick: tick.achieved_goal,
-    'reward': lambda tick: None if tick.reward is None else [tick.reward],
-    'is_success': lambda tick: [tick.is_success],
-    'applied_command': lambda tick: tick.applied_command,
-}
+def _vectors(tick: Tick) -> dict[str, ArrayLike | None]:
+    """The vector of each topic; None leaves the topic out of this tick."""
+    return {
+        **tick.readings,
+        '/clock': [],
+        'desired_goal': tick.desired_goal,
+        'achieved_goal': tick.achieved_goal,
+        'reward': None if tick.reward is None else [tick.reward],
+        'is_success': [tick.is_success],
+        'applied_command': tick.applied_command,
+    }
 
 
 class TickEncoder:
@@ -174,11 +135,7 @@ class TickEncoder:
     def __init__(self, task: TaskSpec) -> None:
         published = [spec for spec in topics(task) if spec.direction == 'published']
         self._status = next(spec for spec in published if spec.name == 'episode_status')
-        self._encoders = [
-            (spec, TopicCodec(spec), _VECTORS[spec.name])
-            for spec in published
-            if spec is not self._status
-        ]
+        self._codecs = [TopicCodec(spec) for spec in published if spec is not self._status]
 
     def encode(self, tick: Tick, latched: bool = False) -> list[tuple[TopicSpec, bytes]]:
         """Returns the messages of a tick with their CDR bytes, in the order of `topics`.
@@ -195,18 +152,21 @@ class TickEncoder:
             ValueError: If a vector is missing or has a wrong size.
         """
         messages = []
-        for spec, encoder, vector in self._encoders:
-            values = vector(tick)
+        vectors = _vectors(tick)
+        for codec in self._codecs:
+            if codec.topic.name not in vectors:
+                raise ValueError(f'no {codec.topic.name} in a tick of {tick.status.task}')
+            values = vectors[codec.topic.name]
             if values is not None:
-                messages.append((spec, encoder.encode(tick.stamp_ns, values)))
+                messages.append((codec.topic, codec.encode(tick.stamp_ns, values)))
         if latched:
             messages.append(self.encode_status(tick.stamp_ns, tick.status))
         return messages
 
     def encode_clock(self, stamp_ns: int) -> tuple[TopicSpec, bytes]:
         """Returns `/clock` alone, for a simulation that stands still."""
-        spec, encoder, _ = self._encoders[0]
-        return spec, encoder.encode(stamp_ns, [])
+        clock = self._codecs[0]
+        return clock.topic, clock.encode(stamp_ns, [])
 
     def encode_status(self, stamp_ns: int, status: EpisodeStatus) -> tuple[TopicSpec, bytes]:
         """Returns `episode_status` alone, for a simulation that has not started."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeLogError, EpisodeWriter
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.recorder import LoggedEpisode, episode_result
-from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS, robot_readings
+from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS
 from fetch_hand_sim.simulation import Observation, Simulation
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.commands import clip_command, command_from_action
@@ -103,47 +103,43 @@ class EpisodeGenerator:
     def _run(self, robots: Sequence[_Robot], first_seed: int) -> None:
         """Runs one episode in every robot; robots beyond those given run idle."""
         simulation, robot_spec = self._simulation, self._simulation.spec.robot
-        observation = simulation.reset(seed=first_seed)
-        success = simulation.compute_success(
-            observation['achieved_goal'], observation['desired_goal']
-        )
-        self._take(robots, observation, success, None, None)
+        simulation.reset(seed=first_seed)
+        observation = self._take(robots, None, None)
         for _ in range(simulation.spec.episode_ticks):
             actions = self._act(observation)
             commands = np.asarray(command_from_action(robot_spec, actions), dtype=np.float64)
             self._receive(robots, commands)
             applied = clip_command(robot_spec, commands)
-            result = simulation.step_commands(applied)
-            observation = result.observation
-            self._take(robots, observation, result.success, applied, result.reward, result.diverged)
+            observation = self._take(robots, applied, simulation.advance(applied))
 
     def _take(
         self,
         robots: Sequence[_Robot],
-        observation: Observation,
-        success: NDArray[np.bool_],
         applied: Array | None,
-        reward: Array | None,
-        diverged: NDArray[np.bool_] | None = None,
-    ) -> None:
-        """Encodes one tick of every robot that is still in its episode."""
-        readings = self._simulation.readings()
+        diverged: NDArray[np.bool_] | None,
+    ) -> Observation:
+        """Encodes one tick of every robot that is still in its episode; returns what all see."""
+        simulation = self._simulation
+        readings = simulation.readings()
+        observation = simulation.observe_from(readings)
+        achieved, desired = observation['achieved_goal'], observation['desired_goal']
+        reward, success = simulation.metric.evaluate(achieved, desired)
         for index, robot in enumerate(robots):
             if robot.is_finished:
                 continue
             phase: Phase = 'reset'
-            if reward is not None and diverged is not None:
+            if diverged is not None:
                 robot.tick += 1
                 robot.episode_return += float(reward[index])
-                is_last = diverged[index] or robot.tick >= self._simulation.spec.episode_ticks
+                is_last = diverged[index] or robot.tick >= simulation.spec.episode_ticks
                 phase = 'finished' if is_last else 'running'
             robot.status = self._status(robot, phase, bool(success[index]))
             tick = Tick(
                 stamp_ns=robot.stamp_ns,
-                **robot_readings(readings, index),
-                desired_goal=observation['desired_goal'][index],
-                achieved_goal=observation['achieved_goal'][index],
-                reward=None if reward is None else float(reward[index]),
+                readings={name: values[index] for name, values in readings.items()},
+                desired_goal=desired[index],
+                achieved_goal=achieved[index],
+                reward=None if applied is None else float(reward[index]),
                 is_success=bool(success[index]),
                 applied_command=None if applied is None else applied[index],
                 status=robot.status,
@@ -151,6 +147,7 @@ class EpisodeGenerator:
             messages = self._encoder.encode(tick, latched=phase != 'running')
             robot.messages.append((robot.stamp_ns, messages, None))
             robot.stamp_ns += self._period_ns
+        return observation
 
     def _receive(self, robots: Sequence[_Robot], commands: Array) -> None:
         """Notes the command that each robot got after its last tick, as `policy_node` sends it."""

@@ -6,13 +6,11 @@ lockstep and a Python loop give the same ticks for the same commands.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation import Observation, Simulation
-from fetch_hand_sim.simulation.tasks import Readings
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.observations import achieved_goal
 from msgs_spec.tick import EpisodeStatus, Phase, Tick
 
 Array = NDArray[np.float64]
@@ -138,26 +136,15 @@ class EpisodeRunner:
         self._return = 0.0
         self.has_diverged = False
         self.is_between_episodes = False
-        observation = self.simulation.reset(seed=self.seed)
-        success = self.simulation.compute_success(
-            observation['achieved_goal'], observation['desired_goal']
-        )
-        return self._make_tick(observation, 'reset', bool(success[0]), None, None)
+        self.simulation.reset(seed=self.seed)
+        return self._make_tick('reset', None)
 
     def _step(self, command: Array) -> Tick:
-        result = self.simulation.step_commands(command[None])
-        reward = float(result.reward[0])
+        (diverged,) = self.simulation.advance(command[None])
         self._tick += 1
-        self._return += reward
-        self.has_diverged = bool(result.diverged[0])
+        self.has_diverged = bool(diverged)
         is_last = self.has_diverged or self._tick >= self.spec.episode_ticks
-        tick = self._make_tick(
-            result.observation,
-            'finished' if is_last else 'running',
-            bool(result.success[0]),
-            reward,
-            command.copy(),
-        )
+        tick = self._make_tick('finished' if is_last else 'running', command.copy())
         if is_last:
             self._finish()
         return tick
@@ -166,25 +153,24 @@ class EpisodeRunner:
         self.is_between_episodes = True
         self._episode += 1
 
-    def _make_tick(
-        self,
-        observation: Observation,
-        phase: Phase,
-        is_success: bool,
-        reward: float | None,
-        applied_command: Array | None,
-    ) -> Tick:
+    def _make_tick(self, phase: Phase, command: Array | None) -> Tick:
+        """Reads the sensors, once, into the tick that follows a reset (None) or a command."""
+        readings = self.simulation.readings()
+        achieved = achieved_goal(self.spec, readings)
+        (reward,), (success,) = self.simulation.metric.evaluate(achieved, self.simulation.goals)
+        if command is not None:
+            self._return += float(reward)
         stamp_ns = self._next_stamp_ns
         self._next_stamp_ns += self._period_ns
         return Tick(
             stamp_ns=stamp_ns,
-            **robot_readings(self.simulation.readings(), 0),
-            desired_goal=observation['desired_goal'][0],
-            achieved_goal=observation['achieved_goal'][0],
-            reward=reward,
-            is_success=is_success,
-            applied_command=applied_command,
-            status=self._status(phase, is_success=is_success),
+            readings={name: values[0] for name, values in readings.items()},
+            desired_goal=self.simulation.goals[0].copy(),
+            achieved_goal=achieved[0],
+            reward=None if command is None else float(reward),
+            is_success=bool(success),
+            applied_command=command,
+            status=self._status(phase, is_success=bool(success)),
         )
 
     def _status(self, phase: Phase, *, is_success: bool) -> EpisodeStatus:
@@ -201,9 +187,3 @@ class EpisodeRunner:
             episode_return=self._return,
             is_success=is_success,
         )
-
-
-def robot_readings(readings: Readings, index: int) -> dict[str, Array]:
-    """Returns what one of the robots reads, without what it does not have."""
-    fields = ((f.name, getattr(readings, f.name)) for f in dataclasses.fields(readings))
-    return {name: values[index] for name, values in fields if values is not None}

@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
-from fetch_hand_sim.simulation.tasks import Readings, make_task
+from fetch_hand_sim.simulation.tasks import make_task
 from msgs_spec.commands import command_from_action
+from msgs_spec.observations import Readings
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind
 
 Array = NDArray[np.float64]
@@ -57,7 +58,16 @@ class StepResult:
 
 
 class Simulation:
-    """N copies of one task on a pool of threads."""
+    """N copies of one task on a pool of threads.
+
+    Attributes:
+        spec: The task as data.
+        num_envs: Number of copies N.
+        control_hz: Actions per simulated second.
+        metric: What rewards and success are; it may be replaced between steps.
+        goals: (N, goal size) the desired goals, live: what is written counts from the next step.
+        divergences: How often MuJoCo has lost a simulation.
+    """
 
     def __init__(
         self,
@@ -94,7 +104,7 @@ class Simulation:
         self.metric = self._task.goal_metric(success_rule, reward_type)
         self.divergences = 0
         self._warnings = np.zeros(num_envs, dtype=np.int64)
-        self._goals = np.zeros((num_envs, self.spec.goal.size))
+        self.goals = np.zeros((num_envs, self.spec.goal.size))
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._all = np.arange(num_envs)
 
@@ -137,7 +147,7 @@ class Simulation:
         self._seed(selected, seed)
         generators = [self._generator(i) for i in selected.tolist()]
         if selected.size:
-            self._goals[selected] = self._task.reset(selected, generators)
+            self.goals[selected] = self._task.reset(selected, generators)
             self._warnings = self._count_warnings()
         return self._observe()
 
@@ -157,7 +167,7 @@ class Simulation:
             raise ValueError(
                 f'actions must lie in [-1, 1]; actions[{env}, {part}] is {checked[env, part]}'
             )
-        return self._advance(command_from_action(self.spec.robot, checked))
+        return self._result(self._advance(command_from_action(self.spec.robot, checked)))
 
     def step_commands(self, commands: ArrayLike) -> StepResult:
         """Advances every simulation by one tick, with commands in ROS units.
@@ -168,6 +178,14 @@ class Simulation:
 
         Raises:
             ValueError: If the shape is wrong or a value is not finite.
+        """
+        return self._result(self.advance(commands))
+
+    def advance(self, commands: ArrayLike) -> NDArray[np.bool_]:
+        """Does what `step_commands` does, for those who read the sensors themselves.
+
+        Returns:
+            Which simulations diverged, (N,).
         """
         return self._advance(self._check_finite('commands', commands))
 
@@ -211,21 +229,25 @@ class Simulation:
             achieved = self._task.observe()[1][selected]
             flipped = (wanted[:, 3:] * achieved[:, 3:]).sum(axis=1) < 0.0
             wanted[flipped, 3:] *= -1.0
-        self._goals[selected] = wanted
+        self.goals[selected] = wanted
 
     def resting_commands(self) -> Array:
         """Commands (N, action size) that let the robots stay as they are."""
         return self._task.resting_commands()
 
     def readings(self) -> Readings:
-        """What the sensors say now, for the network."""
+        """What the sensors say now, (N, topic.size) for each topic, fresh arrays."""
         return self._task.readings()
 
     def observe(self) -> Observation:
         """The observation as it is now, fresh arrays."""
         return self._observe()
 
-    def _advance(self, commands: NDArray[np.floating]) -> StepResult:
+    def observe_from(self, readings: Readings) -> Observation:
+        """The observation of what `readings` returned."""
+        return self._observation(*self._task.observe_from(readings))
+
+    def _advance(self, commands: NDArray[np.floating]) -> NDArray[np.bool_]:
         self._task.apply_commands(commands)
         try:
             self._task.step()
@@ -235,8 +257,11 @@ class Simulation:
         diverged = failed | self._has_diverged()
         if diverged.any():
             self._restart(diverged)
+        return diverged
+
+    def _result(self, diverged: NDArray[np.bool_]) -> StepResult:
         observation = self._observe()
-        reward, success = self.metric.evaluate(observation['achieved_goal'], self._goals)
+        reward, success = self.metric.evaluate(observation['achieved_goal'], self.goals)
         return StepResult(observation, reward, success, diverged)
 
     def _has_diverged(self) -> NDArray[np.bool_]:
@@ -258,15 +283,17 @@ class Simulation:
             self.spec.name,
             ids.tolist(),
         )
-        self._goals[ids] = self._task.reset(ids, [self._generator(i) for i in ids.tolist()])
+        self.goals[ids] = self._task.reset(ids, [self._generator(i) for i in ids.tolist()])
         self._warnings = self._count_warnings()
 
     def _observe(self) -> Observation:
-        observation, achieved = self._task.observe()
+        return self._observation(*self._task.observe())
+
+    def _observation(self, observation: Array, achieved_goal: Array) -> Observation:
         return {
             'observation': observation,
-            'achieved_goal': achieved,
-            'desired_goal': self._goals.copy(),
+            'achieved_goal': achieved_goal,
+            'desired_goal': self.goals.copy(),
         }
 
     def _check_finite(self, name: str, values: ArrayLike) -> NDArray[np.floating]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from gymnasium_robotics.utils import rotations as reference
@@ -12,7 +10,7 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import decode
 from msgs_spec.commands import command_from_action
-from msgs_spec.observations import ObservationAssembler, fetch_observation
+from msgs_spec.observations import ObservationAssembler, achieved_goal, observation
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import TickEncoder
@@ -57,44 +55,49 @@ def test_sizes_are_those_of_the_specification(task):
     assert observation['desired_goal'].shape == (task.goal.size,)
 
 
-def parts_of(task, observation):
+def parts_of(task, vector):
     """The named parts of an observation vector, as the task's layout has them."""
     ends = np.cumsum([part.size for part in task.observation])
-    pieces = np.split(observation, ends[:-1])
+    pieces = np.split(vector, ends[:-1])
     return {part.name: piece for part, piece in zip(task.observation, pieces, strict=True)}
 
 
 @pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
 def test_layout_names_what_the_vector_holds(task):
     tick = random_tick(task)
+    readings = dict(tick.readings)
     if task.has_object:
-        turn = tick.object_quaternion / np.linalg.norm(tick.object_quaternion)
-        tick = dataclasses.replace(tick, object_quaternion=turn)
-    observation = ObservationAssembler(task, 50.0).assemble(vectors_of(task, tick))['observation']
-    expected = {
-        'joint_position': tick.joint_position,
-        'joint_velocity': tick.joint_velocity,
-        'fingertip_positions': tick.fingertip_positions,
-        'object_pose': tick.object_qpos,
-        'object_velocity': tick.object_qvel,
-    }
-    if task.robot.has_gripper_command:
+        readings['object_pose'][3:] /= np.linalg.norm(readings['object_pose'][3:])
+    found = ObservationAssembler(task, 50.0).assemble(vectors_of(task, tick))['observation']
+    position, velocity, _ = np.split(readings['joint_states'], 3)
+    if not task.robot.has_gripper_command:
+        expected = {'joint_position': position, 'joint_velocity': velocity}
+        expected['fingertip_positions'] = readings['fingertip_poses']
+        if task.has_object:
+            expected['object_pose'] = readings['object_joint'][:7]
+            expected['object_velocity'] = readings['object_joint'][7:]
+    else:
+        gripper, velocity_of_gripper = (
+            readings['end_effector_pose'][:3],
+            readings['end_effector_twist'][:3],
+        )
         expected = {
-            'end_effector_position': tick.end_effector_position,
-            'end_effector_velocity': 0.02 * tick.end_effector_linear_velocity,
-            'gripper_state': tick.joint_position[-2:],
-            'gripper_velocity': 0.02 * tick.joint_velocity[-2:],
+            'end_effector_position': gripper,
+            'end_effector_velocity': 0.02 * velocity_of_gripper,
+            'gripper_state': position[-2:],
+            'gripper_velocity': 0.02 * velocity[-2:],
         }
-    if task.robot.has_gripper_command and task.has_object:
-        expected |= {
-            'object_position': tick.object_position,
-            'object_relative_position': tick.object_position - tick.end_effector_position,
-            'object_rotation': reference.mat2euler(reference.quat2mat(turn)),
-            'object_relative_velocity': 0.02
-            * (tick.object_linear_velocity - tick.end_effector_linear_velocity),
-            'object_angular_velocity': 0.02 * tick.object_angular_velocity,
-        }
-    for name, piece in parts_of(task, observation).items():
+        if task.has_object:
+            place, quaternion = np.split(readings['object_pose'], [3])
+            linear, angular = np.split(readings['object_twist'], 2)
+            expected |= {
+                'object_position': place,
+                'object_relative_position': place - gripper,
+                'object_rotation': reference.mat2euler(reference.quat2mat(quaternion)),
+                'object_relative_velocity': 0.02 * (linear - velocity_of_gripper),
+                'object_angular_velocity': 0.02 * angular,
+            }
+    for name, piece in parts_of(task, found).items():
         np.testing.assert_allclose(piece, expected[name], atol=1e-14, err_msg=name)
 
 
@@ -107,24 +110,14 @@ def test_velocities_scale_with_the_tick():
     np.testing.assert_allclose(slow[5:], 4 * fast[5:])
 
 
-def test_batches_equal_single_calls():
-    generator = np.random.default_rng(3)
-    quaternion = generator.normal(size=(6, 4))
-    parts = [generator.normal(size=(6, size)) for size in (3, 3, 15, 15, 3, 3, 3)]
-    *robot, position, linear, angular = parts
-    batch = fetch_observation(*robot, 0.04, position, quaternion, linear, angular)
-    singles = [
-        fetch_observation(
-            *(p[i] for p in robot), 0.04, position[i], quaternion[i], linear[i], angular[i]
-        )
-        for i in range(6)
-    ]
-    assert batch.tobytes() == np.stack(singles).tobytes()
-
-
-def test_object_needs_all_its_values():
-    with pytest.raises(ValueError, match='object_position given without object_quaternion'):
-        fetch_observation([0] * 3, [0] * 3, [0] * 15, [0] * 15, 0.04, object_position=[0] * 3)
+@pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
+def test_batches_equal_single_calls(task):
+    ticks = [random_tick(task, seed) for seed in range(6)]
+    batch = {name: np.stack([t.readings[name] for t in ticks]) for name in ticks[0].readings}
+    for formula in (observation, achieved_goal):
+        extra = (0.04,) if formula is observation else ()
+        singles = [formula(task, tick.readings, *extra) for tick in ticks]
+        assert formula(task, batch, *extra).tobytes() == np.stack(singles).tobytes()
 
 
 @pytest.mark.parametrize('name', ['FetchPush', 'HandReach', 'HandManipulatePenRotate'])

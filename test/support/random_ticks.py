@@ -6,6 +6,7 @@ import numpy as np
 
 from msgs_spec.tasks import GoalKind, TaskSpec
 from msgs_spec.tick import EpisodeStatus, Tick
+from msgs_spec.topics import topic
 
 STAMP = 12 * 10**9 + 40_000_000
 
@@ -28,25 +29,26 @@ def episode_status(task: TaskSpec) -> EpisodeStatus:
 
 def random_tick(task: TaskSpec, seed: int = 0) -> Tick:
     """A tick with random numbers for all that the task has."""
-    joints = len(task.robot.joints)
-    sizes = dict.fromkeys(('joint_position', 'joint_velocity', 'joint_effort'), joints)
-    if task.robot.has_gripper_command:
-        sizes |= {'end_effector_position': 3, 'end_effector_quaternion': 4}
-        sizes |= {'end_effector_linear_velocity': 3, 'end_effector_angular_velocity': 3}
-    else:
-        sizes['fingertip_positions'] = 15
-    if task.has_object:
-        sizes |= {'object_position': 3, 'object_quaternion': 4}
-        sizes |= {'object_linear_velocity': 3, 'object_angular_velocity': 3}
-    if task.goal is GoalKind.POSE:
-        sizes |= {'object_qpos': 7, 'object_qvel': 6}
+    sizes = {name: topic(task, name).size for name in sensed_topics(task)}
     sizes |= dict.fromkeys(('desired_goal', 'achieved_goal'), task.goal.size)
     sizes['applied_command'] = task.robot.action_size
     generator = np.random.default_rng(seed)
+    vectors = {name: generator.normal(size=size) for name, size in sizes.items()}
     return Tick(
         stamp_ns=STAMP,
+        readings={name: vectors.pop(name) for name in sensed_topics(task)},
         reward=float(generator.normal()),
         is_success=True,
         status=episode_status(task),
-        **{name: generator.normal(size=size) for name, size in sizes.items()},
+        **vectors,
     )
+
+
+def sensed_topics(task: TaskSpec) -> list[str]:
+    """Topics that say what sensors say, in order."""
+    if task.robot.has_gripper_command:
+        robot = ['joint_states', 'end_effector_pose', 'end_effector_twist']
+    else:
+        robot = ['joint_states', 'fingertip_poses']
+    objects = ['object_pose', 'object_twist'] if task.has_object else []
+    return [*robot, *objects, *(['object_joint'] if task.goal is GoalKind.POSE else [])]

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from fetch_hand_sim.simulation.tasks.registry import make_task
-from fetch_hand_sim.simulation.tasks.task import Readings, Task
+from fetch_hand_sim.simulation.tasks.task import Task
 
-__all__ = ['Readings', 'Task', 'make_task']
+__all__ = ['Task', 'make_task']

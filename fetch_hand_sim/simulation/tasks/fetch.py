@@ -25,12 +25,10 @@ from fetch_hand_sim.simulation.tasks.task import (
     Array,
     Generators,
     Ids,
-    Readings,
     Task,
     integration_state,
     joint_qpos_slice,
 )
-from msgs_spec.observations import fetch_observation
 from msgs_spec.robots import GRIPPER_STEP
 from msgs_spec.rotations import quaternion_multiply
 from msgs_spec.tasks import TaskSpec
@@ -123,8 +121,12 @@ class FetchTask(Task):
         skip_unread_stages(model)
         self._settle(model, spec)
         super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
-        self._grip = _SiteReader(self, 'robot0:grip')
-        self._object = _SiteReader(self, 'object0') if spec.has_object else None
+        sites = {'end_effector': 'robot0:grip'}
+        if spec.has_object:
+            sites['object'] = 'object0'
+        for name, site in sites.items():
+            reader = _SiteReader(self, site)
+            self._sensors |= {f'{name}_pose': reader.pose, f'{name}_twist': reader.twist}
         self._fingers = self._joint_qpos[-2:]
         self._ctrl = self.batch.bind('ctrl')
         self._mocap_pos = self.batch.bind('mocap_pos')
@@ -225,50 +227,6 @@ class FetchTask(Task):
             self._qpos[:, self._fingers] = 0.0
             self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
 
-    def observe(self) -> tuple[Array, Array]:
-        """Returns the observations (N, 10 or 25) and achieved goals (N, 3)."""
-        joint_position, joint_velocity = self._joint_state()
-        grip_linear, _ = self._grip.velocity()
-        if self._object is None:
-            grip = self._grip.position()
-            observation = fetch_observation(
-                grip, grip_linear, joint_position, joint_velocity, self.tick_duration
-            )
-            return observation, grip
-        place = self._object.position()
-        linear, angular = self._object.velocity()
-        observation = fetch_observation(
-            self._grip.position(),
-            grip_linear,
-            joint_position,
-            joint_velocity,
-            self.tick_duration,
-            place,
-            self._object.quaternion(),
-            linear,
-            angular,
-        )
-        return observation, place
-
-    def readings(self) -> Readings:
-        """Returns joint states and the poses and velocities of gripper and object."""
-        joint_position, joint_velocity = self._joint_state()
-        grip_linear, grip_angular = self._grip.velocity()
-        object_linear, object_angular = self._object.velocity() if self._object else (None, None)
-        return Readings(
-            joint_position=joint_position,
-            joint_velocity=joint_velocity,
-            joint_effort=self._joint_effort(),
-            end_effector_position=self._grip.position(),
-            end_effector_quaternion=self._grip.quaternion(),
-            end_effector_linear_velocity=grip_linear,
-            end_effector_angular_velocity=grip_angular,
-            object_position=self._object.position() if self._object else None,
-            object_quaternion=self._object.quaternion() if self._object else None,
-            object_linear_velocity=object_linear,
-            object_angular_velocity=object_angular,
-        )
-
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
         """Returns the distance to a point."""
         return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)
@@ -290,26 +248,24 @@ class _SiteReader:
         self._cdof = batch.bind('cdof')
         self._qvel = batch.bind('qvel')
 
-    def position(self) -> Array:
-        """World position, (N, 3)."""
-        return self._position.copy()
+    def pose(self) -> Array:
+        """World position and orientation wxyz, (N, 7)."""
+        quaternion = self._body_quaternion
+        if not self._site_aligned:
+            site = np.broadcast_to(self._site_quaternion, quaternion.shape)
+            quaternion = quaternion_multiply(quaternion, site)
+        return np.concatenate([self._position, quaternion], axis=1)
 
-    def quaternion(self) -> Array:
-        """World orientation wxyz, (N, 4)."""
-        if self._site_aligned:
-            return self._body_quaternion.copy()
-        site = np.broadcast_to(self._site_quaternion, self._body_quaternion.shape)
-        return quaternion_multiply(self._body_quaternion, site)
-
-    def velocity(self) -> tuple[Array, Array]:
-        """Linear and angular world velocity, (N, 3) each: `mj_jacSite` times qvel.
+    def twist(self) -> Array:
+        """Linear and angular world velocity, (N, 6): `mj_jacSite` times qvel.
 
         The sum runs over degrees of freedom in a fixed order, so that one simulation and sixty-four
         give the same bits.
         """
         spatial = (self._cdof[:, self._dofs] * self._qvel[:, self._dofs, None]).sum(axis=1)
         angular, linear = spatial[:, :3], spatial[:, 3:]
-        return linear + _cross(angular, self._position - self._center), angular
+        linear = linear + _cross(angular, self._position - self._center)
+        return np.concatenate([linear, angular], axis=1)
 
 
 def _cross(first: Array, second: Array) -> Array:

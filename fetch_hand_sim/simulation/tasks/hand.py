@@ -44,6 +44,7 @@ class HandTask(Task):
         self._ctrl: Array = self.batch.bind('ctrl')
         self._site_xpos: Array = self.batch.bind('site_xpos')
         self._fingertip_sites = fingertip_sites(model)
+        self._sensors['fingertip_poses'] = self._fingertips
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
         """Sets the position actuators to absolute joint angles, radians."""

@@ -20,13 +20,11 @@ from fetch_hand_sim.simulation.tasks.task import (
     Array,
     Generators,
     Ids,
-    Readings,
     integration_state,
     joint_qpos_slice,
     joint_qvel_slice,
 )
 from msgs_spec.commands import resting_command
-from msgs_spec.observations import hand_object_observation
 from msgs_spec.rotations import (
     euler_to_matrix,
     euler_to_quaternion,
@@ -91,6 +89,11 @@ class HandManipulateTask(HandTask):
         super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
         self._object_qpos = self._qpos[:, joint_qpos_slice(model, _OBJECT_JOINT)]
         self._object_qvel = self._qvel[:, joint_qvel_slice(model, _OBJECT_JOINT)]
+        self._sensors |= {
+            'object_pose': self._object_qpos.copy,
+            'object_twist': self._object_twist,
+            'object_joint': self._object_joint,
+        }
         self._object_site = model.site(_OBJECT_SITE).id
         self._resting_command = resting_command(spec.robot)
         self._parallel_quaternions = euler_to_quaternion(_parallel_rotations())
@@ -155,33 +158,15 @@ class HandManipulateTask(HandTask):
         quaternion = self._sample_rotation(generator)
         return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
 
-    def observe(self) -> tuple[Array, Array]:
-        """Returns the observations (N, 61) and achieved goals (N, 7)."""
-        joint_position, joint_velocity = self._joint_state()
-        pose = self._object_qpos.copy()
-        observation = hand_object_observation(
-            joint_position, joint_velocity, self._object_qvel, pose
-        )
-        return observation, pose
+    def _object_twist(self) -> Array:
+        """The object's velocity in world axes, (N, 6); MuJoCo holds it in the object's own."""
+        rotation = quaternion_to_matrix(self._object_qpos[:, 3:])
+        angular = np.einsum('nij,nj->ni', rotation, self._object_qvel[:, 3:])
+        return np.concatenate([self._object_qvel[:, :3], angular], axis=1)
 
-    def readings(self) -> Readings:
-        """Returns joint states, fingertips and the object."""
-        joint_position, joint_velocity = self._joint_state()
-        pose, velocity = self._object_qpos.copy(), self._object_qvel.copy()
-        rotation = quaternion_to_matrix(pose[:, 3:])
-        angular = np.einsum('nij,nj->ni', rotation, velocity[:, 3:])
-        return Readings(
-            joint_position=joint_position,
-            joint_velocity=joint_velocity,
-            joint_effort=self._joint_effort(),
-            fingertip_positions=self._fingertips(),
-            object_position=pose[:, :3],
-            object_quaternion=pose[:, 3:],
-            object_linear_velocity=velocity[:, :3],
-            object_angular_velocity=angular,
-            object_qpos=pose,
-            object_qvel=velocity,
-        )
+    def _object_joint(self) -> Array:
+        """The free joint as MuJoCo holds it, (N, 13)."""
+        return np.concatenate([self._object_qpos, self._object_qvel], axis=1)
 
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
         """Returns the distance between poses."""

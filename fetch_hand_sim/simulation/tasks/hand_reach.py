@@ -7,8 +7,7 @@ import numpy as np
 
 from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
 from fetch_hand_sim.simulation.tasks.hand import HandTask, fingertip_sites, load_hand_model
-from fetch_hand_sim.simulation.tasks.task import Array, Generators, Ids, Readings, integration_state
-from msgs_spec.observations import hand_reach_observation
+from fetch_hand_sim.simulation.tasks.task import Array, Generators, Ids, integration_state
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import TaskSpec
 
@@ -89,22 +88,6 @@ class HandReachTask(HandTask):
         if generator.uniform() < _PROBABILITY_OF_INITIAL_POSE:
             goal = self._start_fingertips
         return goal.flatten()
-
-    def observe(self) -> tuple[Array, Array]:
-        """Returns the observations (N, 63) and achieved goals (N, 15)."""
-        joint_position, joint_velocity = self._joint_state()
-        fingertips = self._fingertips()
-        return hand_reach_observation(joint_position, joint_velocity, fingertips), fingertips
-
-    def readings(self) -> Readings:
-        """Returns joint states and fingertips."""
-        joint_position, joint_velocity = self._joint_state()
-        return Readings(
-            joint_position=joint_position,
-            joint_velocity=joint_velocity,
-            joint_effort=self._joint_effort(),
-            fingertip_positions=self._fingertips(),
-        )
 
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
         """Returns the distance between fingertips."""

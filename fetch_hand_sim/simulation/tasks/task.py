@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 
 import mujoco
 import numpy as np
@@ -13,36 +12,12 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.engine import prepare_engine
 from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
+from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
 from msgs_spec.tasks import TaskSpec
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.intp]
 Generators = Sequence[np.random.Generator]
-
-
-@dataclass(frozen=True, slots=True)
-class Readings:
-    """What the robots' sensors say, SI units, world frame, leading axis the simulation.
-
-    Quaternions are wxyz. Parts the task does not have are None. `object_qpos` (N, 7) and
-    `object_qvel` (N, 6) are MuJoCo's free joint: linear velocity in the world frame, angular
-    velocity in the object's.
-    """
-
-    joint_position: Array
-    joint_velocity: Array
-    joint_effort: Array
-    end_effector_position: Array | None = None
-    end_effector_quaternion: Array | None = None
-    end_effector_linear_velocity: Array | None = None
-    end_effector_angular_velocity: Array | None = None
-    fingertip_positions: Array | None = None
-    object_position: Array | None = None
-    object_quaternion: Array | None = None
-    object_linear_velocity: Array | None = None
-    object_angular_velocity: Array | None = None
-    object_qpos: Array | None = None
-    object_qvel: Array | None = None
 
 
 class Task(ABC):
@@ -81,6 +56,9 @@ class Task(ABC):
         joints = [model.joint(name) for name in spec.robot.joints]
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._joint_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
+        # What reads the vectors (N, topic.size) of a topic; families add theirs.
+        self._sensors: dict[str, Callable[[], Array]] = {'joint_states': self._joint_states}
+        self._observed = observed_topics(spec)
 
     @property
     @abstractmethod
@@ -108,14 +86,6 @@ class Task(ABC):
         """Returns the commands (N, action size) that change nothing about what the robots hold."""
 
     @abstractmethod
-    def observe(self) -> tuple[Array, Array]:
-        """Returns the observations (N, observation size) and achieved goals (N, goal size)."""
-
-    @abstractmethod
-    def readings(self) -> Readings:
-        """Returns what the sensors say, for the network."""
-
-    @abstractmethod
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
         """Returns the distances, success rule and reward of the task."""
 
@@ -123,12 +93,33 @@ class Task(ABC):
         """Advances all simulations by one tick under the commands applied last."""
         self.batch.step(nstep=self.substeps)
 
-    def _joint_state(self) -> tuple[Array, Array]:
-        """Positions and velocities of the robot's scalar joints, (N, joints) each."""
-        return self._qpos[:, self._joint_qpos], self._qvel[:, self._joint_dofs]
+    def readings(self, names: Iterable[str] = ()) -> Readings:
+        """Returns what the sensors say, fresh arrays.
 
-    def _joint_effort(self) -> Array:
-        return self._actuator_force[:, self._joint_dofs]
+        Args:
+            names: Topics to read; none for all that the task has.
+        """
+        return {name: self._sensors[name]() for name in names or self._sensors}
+
+    def observe(self) -> tuple[Array, Array]:
+        """Returns the observations (N, observation size) and achieved goals (N, goal size)."""
+        return self.observe_from(self.readings(self._observed))
+
+    def observe_from(self, readings: Readings) -> tuple[Array, Array]:
+        """Returns the same from what the sensors said."""
+        goal = achieved_goal(self.spec, readings)
+        return observation(self.spec, readings, self.tick_duration), goal
+
+    def _joint_states(self) -> Array:
+        """Positions, velocities and efforts of the robot's scalar joints, (N, 3 * joints)."""
+        return np.concatenate(
+            [
+                self._qpos[:, self._joint_qpos],
+                self._qvel[:, self._joint_dofs],
+                self._actuator_force[:, self._joint_dofs],
+            ],
+            axis=1,
+        )
 
 
 def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:

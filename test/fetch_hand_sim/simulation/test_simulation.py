@@ -35,7 +35,7 @@ def state_of(simulation: Simulation) -> bytes:
     generators = [
         generator and generator.bit_generator.state for generator in simulation._generators
     ]
-    state = simulation._task.batch.state.tobytes() + simulation._goals.tobytes()
+    state = simulation._task.batch.state.tobytes() + simulation.goals.tobytes()
     return state + repr(generators).encode()
 
 
