@@ -1,6 +1,9 @@
 # `make demo` and `make test` create the environment they need; see CONTRIBUTING.md.
 
 VENV ?= .venv
+ifdef VIEW
+TASK ?= HandManipulateBlockRotateZ
+endif
 TASK ?= FetchReach
 EPISODES ?= 5
 SECONDS ?= 60
@@ -18,6 +21,7 @@ unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOO
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
+	@echo 'make demo VIEW=1 [TASK=...]  the same on a page in the browser, until Ctrl-C'
 	@echo 'make test       lint, types and all tests'
 	@echo 'make lint       ruff and mypy only'
 	@echo 'make format     let ruff rewrite the code'
@@ -41,7 +45,11 @@ $(STAMP): setup.py setup.cfg constraints.txt tools/make_environment.sh
 	@touch $@
 
 demo: env
+ifdef VIEW
+	@$(BIN)/python -m fetch_hand_sim.view --task $(TASK)
+else
 	@$(BIN)/python -m fetch_hand_sim.commands.demo --task $(TASK) --episodes $(EPISODES)
+endif
 
 test: lint
 	$(BIN)/python -m pytest

@@ -85,6 +85,7 @@ setup(
             'benchmark = policy_node.training.commands:benchmark',
             'train_her = policy_node.training.commands:train_her',
             'evaluate_policy = policy_node.training.commands:evaluate_policy',
+            'view = fetch_hand_sim.view:main',
             'replay_node = fetch_hand_sim.replay_node:main',
             'list_episodes = fetch_hand_sim.commands.list_episodes:main',
             'check_episode = fetch_hand_sim.commands.check_episode:main',

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -24,7 +23,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from fetch_hand_sim.commands.executables import executable, is_actor_shipped
+from fetch_hand_sim.commands.executables import is_actor_shipped
+from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import EpisodeReadError, read_episode
 from msgs_spec.codecs import decode_status
 from msgs_spec.qos import rclpy_profile
@@ -33,7 +33,6 @@ from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
 
-_SHUTDOWN_TIMEOUT = 10.0
 _START_TIMEOUT = 60.0
 _COLUMNS = '{:>7}  {:>5}  {:>5}  {:>7}  {:<7}  {}'
 
@@ -124,12 +123,12 @@ class Demo:
         watcher = Watcher(self._spec)
         began = time.monotonic()
         with _logs() as logs:
-            policy = self._start('policy_node', [f'checkpoint:={self._checkpoint()}'], logs)
-            sim = self._start('sim_node', self._sim_parameters(), logs)
+            policy = start_node('policy_node', [f'checkpoint:={self._checkpoint()}'], logs)
+            sim = start_node('sim_node', self._sim_parameters(), logs)
             try:
                 self._watch(watcher, sim, policy, stop)
             finally:
-                codes = [_stop(process) for process in (sim, policy)]
+                codes = [stop_node(process) for process in (sim, policy)]
                 watcher.close()
             self._print_new_rows()
             if any(codes) or (len(self._rows) < self._options.episodes and not stop):
@@ -155,17 +154,6 @@ class Demo:
             f'episode_dir:={self._directory}',
             'wait_for_commands:=true',
         ]
-
-    def _start(self, name: str, parameters: Sequence[str], logs: IO[str]) -> subprocess.Popen[str]:
-        pairs = [word for parameter in parameters for word in ('-p', parameter)]
-        # A process group of its own: Ctrl-C reaches the demo, which ends its nodes in order.
-        return subprocess.Popen(
-            [*executable(name), '--ros-args', *pairs],
-            stdout=logs,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-        )
 
     def _watch(
         self,
@@ -225,17 +213,6 @@ def _show(progress: Progress, bar: TaskID, watcher: Watcher) -> None:
     progress.update(
         bar, description=f'episode {status.episode}', completed=watcher.ticks, note=note
     )
-
-
-def _stop(process: subprocess.Popen[str]) -> int:
-    """Asks a node to end and returns its exit code."""
-    if process.poll() is None:
-        process.send_signal(signal.SIGINT)
-    try:
-        return process.wait(_SHUTDOWN_TIMEOUT)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        return process.wait()
 
 
 @contextmanager

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.gym_envs.spaces import action_space, observation_space
 from fetch_hand_sim.simulation import Observation, Simulation
-from fetch_hand_sim.simulation.rendering import SceneRenderer
+from fetch_hand_sim.simulation.rendering import SceneRenderer, simulation_frame
 from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
+from fetch_hand_sim.simulation.scene import Scene
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
 Array = NDArray[np.float64]
@@ -128,8 +129,8 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if self.render_mode is None:
             return None
         if self._renderer is None:
-            self._renderer = SceneRenderer(self.simulation)
-        return self._renderer.render()
+            self._renderer = SceneRenderer(Scene(self.spec_of_task.name))
+        return self._renderer.render(simulation_frame(self.simulation))
 
     def close(self) -> None:
         """Frees the renderer."""

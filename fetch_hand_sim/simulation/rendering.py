@@ -1,76 +1,133 @@
-"""Pictures of a simulation and its goal, through `mujoco.Renderer`."""
+"""Pictures of a scene, through `mujoco.Renderer`."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from fetch_hand_sim.simulation.opengl import ADVICE, prepare_opengl
+from fetch_hand_sim.simulation.scene import SHOWN_SITES, Frame, Scene
 from fetch_hand_sim.simulation.simulation import Simulation
-from msgs_spec.tasks import GoalKind
 
-_HEIGHT, _WIDTH = 480, 640
-_GOAL_COLOR = np.array([0.9, 0.2, 0.2, 0.6], dtype=np.float32)
-# Radius of a goal's marker, metres.
-_POINT_RADIUS = {'fetch': 0.02, 'shadow_hand': 0.006}
-# Camera: the point looked at (m), distance (m), azimuth and elevation (degrees).
-_VIEWS = {
-    'fetch': ((1.3, 0.75, 0.55), 1.8, 132.0, -20.0),
-    'shadow_hand': ((1.0, 0.93, 0.18), 0.5, 55.0, -35.0),
-}
+Array = NDArray[np.float64]
+
+WIDTH, HEIGHT = 640, 480
+LARGEST_SIDE = 4096
 
 
 class SceneRenderer:
-    """Draws the first copy of a simulation: spheres for points, a ghost object for poses."""
+    """Draws frames of a scene without a display."""
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        width: int = WIDTH,
+        height: int = HEIGHT,
+        camera: str | None = None,
+    ) -> None:
         """Opens an OpenGL context.
 
-        Raises:
-            RuntimeError: If there is none.
-        """
-        self._simulation = simulation
-        try:
-            self._renderer = mujoco.Renderer(simulation.model, _HEIGHT, _WIDTH)
-        except Exception as error:
-            raise RuntimeError(
-                'rendering needs OpenGL; without a display set MUJOCO_GL=egl or MUJOCO_GL=osmesa '
-                f'before Python starts ({error})'
-            ) from error
-        # The model's own goal markers are sites that nobody moves.
-        self._options = mujoco.MjvOption()
-        self._options.sitegroup[:] = 0
-        self._camera = mujoco.MjvCamera()
-        view = _VIEWS[simulation.spec.robot.name]
-        self._camera.lookat[:] = view[0]
-        self._camera.distance, self._camera.azimuth, self._camera.elevation = view[1:]
+        Args:
+            scene: What to draw.
+            width: Pixels.
+            height: Pixels.
+            camera: A camera of the model by name; None for the scene's own view.
 
-    def render(self) -> NDArray[np.uint8]:
-        """Returns the picture, (480, 640, 3)."""
-        data = self._simulation.data(0)
-        goal = self._simulation.observe()['desired_goal'][0]
-        if self._simulation.spec.goal is GoalKind.POSE:
-            data.joint('target:joint').qpos = goal
-        mujoco.mj_forward(self._simulation.model, data)
-        self._renderer.update_scene(data, self._camera, self._options)
-        if self._simulation.spec.goal is not GoalKind.POSE:
-            for point in goal.reshape(-1, 3):
-                self._add_sphere(point)
+        Raises:
+            ValueError: If the model has no such camera or the size is not allowed.
+            RuntimeError: If there is no OpenGL.
+        """
+        for side in (width, height):
+            if not 1 <= side <= LARGEST_SIDE:
+                raise ValueError(f'size {width}x{height}; allowed: 1 ... {LARGEST_SIDE} pixels')
+        self._scene = scene
+        self._camera = make_camera(scene, camera)
+        self._options = make_options()
+        scene.model.vis.global_.offwidth = max(width, int(scene.model.vis.global_.offwidth))
+        scene.model.vis.global_.offheight = max(height, int(scene.model.vis.global_.offheight))
+        prepare_opengl()
+        try:
+            self._renderer = mujoco.Renderer(scene.model, height, width)
+        except Exception as error:
+            raise RuntimeError(f'{ADVICE} ({error})') from error
+
+    def render(self, frame: Frame, trail: Sequence[Array] = ()) -> NDArray[np.uint8]:
+        """Returns the picture of a frame, (height, width, 3).
+
+        Args:
+            frame: The tick.
+            trail: Where the object or gripper was before.
+        """
+        self._update(frame)
+        scene = self._renderer.scene
+        for marker in self._scene.markers(frame, trail):
+            marker.draw(scene.geoms[scene.ngeom])
+            scene.ngeom += 1
         return np.asarray(self._renderer.render())
+
+    def render_depth(self, frame: Frame) -> NDArray[np.float32]:
+        """Returns the distance of what is seen from the camera plane, (height, width), metres.
+
+        Markers are left out: they are no part of the world.
+        """
+        self._update(frame)
+        self._renderer.enable_depth_rendering()
+        try:
+            return np.asarray(self._renderer.render())
+        finally:
+            self._renderer.disable_depth_rendering()
 
     def close(self) -> None:
         """Frees the OpenGL context."""
         self._renderer.close()
 
-    def _add_sphere(self, position: NDArray[np.float64]) -> None:
-        scene = self._renderer.scene
-        radius = _POINT_RADIUS[self._simulation.spec.robot.name]
-        mujoco.mjv_initGeom(
-            scene.geoms[scene.ngeom],
-            mujoco.mjtGeom.mjGEOM_SPHERE.value,
-            np.array([radius, 0.0, 0.0]),
-            position,
-            np.eye(3).flatten(),
-            _GOAL_COLOR,
-        )
-        scene.ngeom += 1
+    def _update(self, frame: Frame) -> None:
+        self._scene.show(frame)
+        mujoco.mj_forward(self._scene.model, self._scene.data)
+        self._renderer.update_scene(self._scene.data, self._camera, self._options)
+
+
+def make_options() -> mujoco.MjvOption:
+    """Returns what of a model is drawn: no helper lines, and of the sites those that tell ends."""
+    options = mujoco.MjvOption()
+    options.flags[mujoco.mjtVisFlag.mjVIS_RANGEFINDER.value] = 0
+    options.sitegroup[:] = 0
+    options.sitegroup[SHOWN_SITES] = 1
+    return options
+
+
+def make_camera(scene: Scene, name: str | None) -> mujoco.MjvCamera:
+    """Returns a camera of the model by name, or the scene's own view for None.
+
+    Raises:
+        ValueError: If there is none; the message lists those there are.
+    """
+    camera = mujoco.MjvCamera()
+    if name is None:
+        scene.view.apply(camera)
+        return camera
+    names = [scene.model.camera(index).name for index in range(scene.model.ncam)]
+    if name not in names:
+        raise ValueError(f'camera {name!r} is not known; allowed: {", ".join(names) or "none"}')
+    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
+    camera.fixedcamid = names.index(name)
+    return camera
+
+
+def simulation_frame(simulation: Simulation, index: int = 0) -> Frame:
+    """Returns how one copy of a simulation looks now."""
+    readings, observation = simulation.readings(), simulation.observe()
+    achieved, desired = observation['achieved_goal'][index], observation['desired_goal'][index]
+    pose = None
+    if readings.object_position is not None and readings.object_quaternion is not None:
+        pose = np.concatenate([readings.object_position[index], readings.object_quaternion[index]])
+    return Frame(
+        joint_position=readings.joint_position[index],
+        desired_goal=desired,
+        achieved_goal=achieved,
+        object_pose=pose,
+        is_success=bool(simulation.compute_success(achieved, desired)),
+    )

@@ -30,6 +30,9 @@ NODES = (
     'fetch_hand_sim.commands.demo',
     'fetch_hand_sim.replay_node',
     'fetch_hand_sim.sim_node',
+    'fetch_hand_sim.view.live',
+    'fetch_hand_sim.view.live_session',
+    'fetch_hand_sim.view.remote_node',
     'policy_node.node',
 )
 ROS = (

@@ -11,7 +11,7 @@ from fetch_hand_sim.simulation.tasks.task import Array, Generators, Ids, integra
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import TaskSpec
 
-_ASSET = 'hand/reach.xml'
+REACH_ASSET = 'hand/reach.xml'
 # Where fingers meet, relative to the palm, and how far that place scatters, metres.
 _MEETING_OFFSET = np.array([0.0, -0.09, 0.05])
 _MEETING_SCATTER = 0.005
@@ -53,7 +53,7 @@ class HandReachTask(HandTask):
 
     def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
         """Keeps the initial pose, its fingertips and the palm, from which goals are made."""
-        model = load_hand_model(_ASSET)
+        model = load_hand_model(REACH_ASSET)
         data = mujoco.MjData(model)
         for joint, value in _INITIAL_QPOS.items():
             data.joint(joint).qpos = value
@@ -67,7 +67,7 @@ class HandReachTask(HandTask):
     @property
     def asset(self) -> str:
         """The MJCF asset."""
-        return _ASSET
+        return REACH_ASSET
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Restores the initial pose and samples goals."""

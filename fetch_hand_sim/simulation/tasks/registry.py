@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
-from fetch_hand_sim.simulation.tasks.hand_manipulate import HandManipulateTask
-from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
+from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
+from fetch_hand_sim.simulation.tasks.hand_reach import REACH_ASSET, HandReachTask
 from fetch_hand_sim.simulation.tasks.task import Task
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, substeps_per_tick, task_spec
 
@@ -37,3 +37,17 @@ def make_task(
     else:
         family = HandManipulateTask
     return family(spec, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
+
+
+def task_asset(name: str) -> str:
+    """Returns the MJCF asset of a task, for example `fetch/reach.xml`.
+
+    Raises:
+        ValueError: If the task is unknown.
+    """
+    spec = task_spec(name)
+    if spec.name in FETCH_CONFIGS:
+        return FETCH_CONFIGS[spec.name].asset
+    if spec.name in MANIPULATE_CONFIGS:
+        return MANIPULATE_CONFIGS[spec.name].asset
+    return REACH_ASSET

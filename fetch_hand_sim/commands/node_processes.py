@@ -1,0 +1,49 @@
+"""Nodes as child processes, for commands that run everything themselves."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections.abc import Sequence
+from typing import IO
+
+from fetch_hand_sim.commands.executables import executable
+
+_SHUTDOWN_TIMEOUT = 10.0
+
+
+def start_node(
+    name: str, parameters: Sequence[str], output: IO[str], namespace: str = ''
+) -> subprocess.Popen[str]:
+    """Starts a node in a process group of its own: Ctrl-C reaches only who started it.
+
+    Args:
+        name: Of the executable.
+        parameters: `name:=value` each.
+        output: Gets what the node prints.
+        namespace: Of the node.
+
+    Raises:
+        UnknownExecutableError: If there is none of that name.
+    """
+    words = [word for parameter in parameters for word in ('-p', parameter)]
+    if namespace:
+        words += ['-r', f'__ns:=/{namespace.strip("/")}']
+    return subprocess.Popen(
+        [*executable(name), '--ros-args', *words],
+        stdout=output,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def stop_node(process: subprocess.Popen[str]) -> int:
+    """Asks a node to end and returns its exit code."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(_SHUTDOWN_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()

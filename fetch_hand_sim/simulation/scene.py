@@ -1,0 +1,285 @@
+"""What people look at: a task's model dressed for pictures, its goal as a ghost, markers, cameras.
+
+Pages and films share it. It follows what is known of a robot at a tick, live or from a file, and
+computes no physics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.models import load_spec
+from fetch_hand_sim.simulation.tasks import task_asset
+from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
+
+Array = NDArray[np.float64]
+Color = tuple[float, float, float, float]
+
+REACHED: Color = (0.15, 0.75, 0.25, 0.65)
+MISSED: Color = (0.9, 0.2, 0.15, 0.65)
+_ACHIEVED: Color = (0.15, 0.4, 0.9, 0.8)
+_LINK: Color = (0.35, 0.35, 0.4, 0.5)
+_TRAIL: Color = (0.15, 0.4, 0.9, 0.35)
+# Opacity of what surrounds a goal: the ball of its threshold, or the shell of a ghost.
+_HALO_OPACITY = 0.16
+_SHELL_SCALE = 1.08
+# Where the position of a pose does not count, its ghost stands beside the hand, metres
+# (Gymnasium-Robotics draws it there too).
+GHOST_OFFSET = np.array([0.15, 0.0, 0.0])
+_GHOST = 'target'
+SHOWN_SITES = 0
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A free camera: the point looked at (m), distance (m), azimuth and elevation (degrees)."""
+
+    lookat: tuple[float, float, float]
+    distance: float
+    azimuth: float
+    elevation: float
+
+    def apply(self, camera: mujoco.MjvCamera) -> None:
+        """Sets a camera to it."""
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE.value
+        camera.fixedcamid = camera.trackbodyid = -1
+        camera.lookat[:] = self.lookat
+        camera.distance, camera.azimuth, camera.elevation = (
+            self.distance,
+            self.azimuth,
+            self.elevation,
+        )
+
+
+_FETCH_VIEW = View((1.2, 0.75, 0.58), 1.75, 140.0, -18.0)
+_SLIDE_VIEW = View((1.4, 0.75, 0.5), 2.2, 140.0, -24.0)
+_REACH_VIEW = View((1.0, 0.93, 0.17), 0.5, 55.0, -38.0)
+_MANIPULATE_VIEW = View((1.05, 0.9, 0.18), 0.55, 62.0, -38.0)
+
+
+def default_view(spec: TaskSpec) -> View:
+    """The camera from which a task is seen best."""
+    if spec.robot.has_gripper_command:
+        return _SLIDE_VIEW if spec.name == 'FetchSlide' else _FETCH_VIEW
+    return _REACH_VIEW if spec.goal is GoalKind.FINGERTIPS else _MANIPULATE_VIEW
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What is known of a robot at one tick.
+
+    Attributes:
+        joint_position: (joints,) in the order of `joint_states`, rad or m.
+        desired_goal: (goal size,), m and quaternion wxyz.
+        achieved_goal: Likewise.
+        object_pose: (7,) m and quaternion wxyz; None where there is no object.
+        is_success: Whether the goal is reached.
+    """
+
+    joint_position: Array
+    desired_goal: Array
+    achieved_goal: Array
+    object_pose: Array | None
+    is_success: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """A shape in the world.
+
+    Attributes:
+        shape: `mujoco.mjtGeom`.
+        size: (3,) as MuJoCo has it for the shape, m.
+        position: (3,) m.
+        quaternion: (4,) wxyz.
+        color: Red, green, blue, opacity.
+    """
+
+    shape: int
+    size: Array
+    position: Array
+    color: Color
+    quaternion: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def draw(self, geom: mujoco.MjvGeom) -> None:
+        """Writes the shape into a geom of a scene."""
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, self.quaternion)
+        color = np.array(self.color, dtype=np.float32)
+        mujoco.mjv_initGeom(geom, self.shape, self.size, self.position, rotation, color)
+
+
+class Scene:
+    """A task's robot, object and ghost, posed as frames say.
+
+    Attributes:
+        spec: The task.
+        model: The compiled `mujoco.MjModel`, for looking at only.
+        data: Its `mujoco.MjData`, posed as the last frame.
+    """
+
+    def __init__(self, task: str) -> None:
+        """Compiles the model.
+
+        Raises:
+            ValueError: If there is no such task.
+        """
+        self.spec = task_spec(task)
+        mjcf = load_spec(task_asset(task))
+        _dress(mjcf)
+        self.model = mjcf.compile()
+        self.data = mujoco.MjData(self.model)
+        self.view = default_view(self.spec)
+        joints = [self.model.joint(name) for name in self.spec.robot.joints]
+        self._joints = np.array([int(joint.qposadr[0]) for joint in joints])
+        self._object = self._free_joint(self.spec.object_name)
+        self._ghost = self._free_joint(_GHOST if self.has_ghost else None)
+
+    @property
+    def has_ghost(self) -> bool:
+        """Whether the goal is shown as a ghost of the object."""
+        return self.spec.goal is GoalKind.POSE
+
+    def show(self, frame: Frame) -> None:
+        """Poses robot, object and ghost."""
+        self.data.qpos[self._joints] = frame.joint_position
+        if self._object is not None and frame.object_pose is not None:
+            self.data.qpos[self._object] = frame.object_pose
+        if self._ghost is not None:
+            self.data.qpos[self._ghost] = ghost_pose(self.spec, frame.desired_goal)
+
+    def markers(self, frame: Frame, trail: Sequence[Array] = ()) -> list[Marker]:
+        """What is drawn beside the model: goal, achieved goal, the way the object took.
+
+        Args:
+            frame: The tick.
+            trail: Positions (3,) of the object or gripper before, the oldest first.
+        """
+        color = REACHED if frame.is_success else MISSED
+        if self.spec.goal is GoalKind.POSE:
+            shapes = self._shell(frame, color)
+        elif self.spec.goal is GoalKind.FINGERTIPS:
+            shapes = _fingertip_markers(frame, color)
+        else:
+            shapes = _point_markers(self.spec, frame, color)
+        width = 0.004 if self.spec.robot.has_gripper_command else 0.0012
+        return [*shapes, *_line(trail, width)]
+
+    def _shell(self, frame: Frame, color: Color) -> list[Marker]:
+        """A tinted skin around the ghost."""
+        geom = self.model.geom(_GHOST)
+        pose = ghost_pose(self.spec, frame.desired_goal)
+        tint = (*color[:3], 2.0 * _HALO_OPACITY)
+        size = _SHELL_SCALE * np.asarray(geom.size)
+        return [Marker(int(geom.type[0]), size, pose[:3], tint, pose[3:])]
+
+    def _free_joint(self, body: str | None) -> slice | None:
+        if body is None:
+            return None
+        start = int(self.model.joint(f'{body}:joint').qposadr[0])
+        return slice(start, start + 7)
+
+
+def ghost_pose(spec: TaskSpec, goal: Array) -> Array:
+    """Where the ghost of a pose goal (7,) is drawn, (7,)."""
+    pose = np.array(goal)
+    if not spec.position_counts:
+        pose[:3] += GHOST_OFFSET
+    return pose
+
+
+def tracked_position(frame: Frame) -> Array:
+    """The point (3,) whose way is worth drawing: the object, or the gripper."""
+    if frame.object_pose is not None:
+        return frame.object_pose[:3].copy()
+    return frame.achieved_goal[:3].copy()
+
+
+def _sphere(position: Array, radius: float, color: Color) -> Marker:
+    return Marker(mujoco.mjtGeom.mjGEOM_SPHERE.value, np.full(3, radius), position, color)
+
+
+def _point_markers(spec: TaskSpec, frame: Frame, color: Color) -> list[Marker]:
+    halo = (*color[:3], _HALO_OPACITY)
+    goal = frame.desired_goal
+    shapes = [_sphere(goal, 0.02, color), _sphere(goal, spec.distance_threshold, halo)]
+    if not spec.has_object:
+        shapes.append(_sphere(frame.achieved_goal, 0.012, _ACHIEVED))
+    return [*shapes, *_line([frame.achieved_goal, goal], 0.002, _LINK)]
+
+
+def _fingertip_markers(frame: Frame, color: Color) -> list[Marker]:
+    shapes = []
+    pairs = zip(frame.desired_goal.reshape(-1, 3), frame.achieved_goal.reshape(-1, 3), strict=True)
+    for goal, finger in pairs:
+        shapes += [_sphere(goal, 0.006, color), _sphere(finger, 0.004, _ACHIEVED)]
+        shapes += _line([finger, goal], 0.001, _LINK)
+    return shapes
+
+
+def _line(points: Iterable[Array], width: float, color: Color = _TRAIL) -> list[Marker]:
+    """Capsules from point to point."""
+    return [
+        _capsule(start, end, width, color)
+        for start, end in pairwise(points)
+        if np.linalg.norm(end - start) > 1e-6
+    ]
+
+
+def _capsule(start: Array, end: Array, width: float, color: Color) -> Marker:
+    along = end - start
+    length = float(np.linalg.norm(along))
+    quaternion = np.zeros(4)
+    mujoco.mju_quatZ2Vec(quaternion, along / length)
+    size = np.array([width, length / 2.0, 0.0])
+    shape = mujoco.mjtGeom.mjGEOM_CAPSULE.value
+    return Marker(shape, size, (start + end) / 2.0, color, quaternion)
+
+
+def _dress(mjcf: mujoco.MjSpec) -> None:
+    """Gives the published model a floor, a sky and a shadow; hides its own goal markers."""
+    for texture in mjcf.textures:
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            texture.rgb1, texture.rgb2 = [0.93, 0.95, 0.97], [0.66, 0.73, 0.8]
+            texture.width = texture.height = 64
+    mjcf.add_texture(
+        name='view:floor',
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.55, 0.58, 0.62],
+        rgb2=[0.48, 0.51, 0.55],
+        width=256,
+        height=256,
+    )
+    floor = mjcf.add_material(name='view:floor', texrepeat=[8, 8], texuniform=False)
+    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB.value] = 'view:floor'
+    for geom in mjcf.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            geom.material = 'view:floor'
+            geom.rgba = [1.0, 1.0, 1.0, 1.0]
+    for body in mjcf.bodies:
+        if body.mocap:
+            for geom in body.geoms:
+                geom.group = 5
+    for site in mjcf.sites:
+        # The ends of the pen tell them apart; all else marks what nobody looks for.
+        is_end = site.name.endswith((':top', ':bottom'))
+        site.group = SHOWN_SITES if is_end else 5
+    for light in mjcf.lights:
+        light.castshadow = True
+        light.dir = [0.3, 0.25, -1.0]
+        light.diffuse = [0.5, 0.5, 0.5]
+        light.ambient = [0.1, 0.1, 0.1]
+    mjcf.visual.headlight.ambient = [0.2, 0.2, 0.2]
+    mjcf.visual.headlight.diffuse = [0.3, 0.3, 0.3]
+    mjcf.visual.headlight.specular = [0.1, 0.1, 0.1]
+    mjcf.visual.map.shadowclip = 1.5
+    mjcf.visual.quality.offsamples = 4
+    # The page fetches the model: its textures are most of it.
+    mjcf.visual.quality.shadowsize = 2048

@@ -1,0 +1,70 @@
+"""The command line of `view`.
+
+Exit code 0: ended by the user; 1: no robot, no port, a node that failed; 2: bad usage or an
+unreadable file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from msgs_spec.command_line import require_extra, run_command
+from msgs_spec.tasks import TASKS
+
+_LOOPBACK = '127.0.0.1'
+_DESCRIPTION = (
+    'Shows a running robot, or episode files, on a page in the browser. Without arguments: the '
+    'robot that runs; with --task: starts simulation and actor itself if none does.'
+)
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Reads the command line; what follows `--ros-args` is kept for ROS."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    cut = words.index('--ros-args') if '--ros-args' in words else len(words)
+    parser = argparse.ArgumentParser(prog='view', description=_DESCRIPTION)
+    parser.add_argument(
+        'path', nargs='?', type=Path, help='an episode, or a folder of episodes, to play'
+    )
+    parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='one of the tasks')
+    parser.add_argument('--robot', default='', help='namespace of the robot')
+    parser.add_argument('--checkpoint', default='', help='actor to start with --task')
+    parser.add_argument('--episode-dir', default='', help='log episodes of --task here')
+    parser.add_argument('--port', type=int, default=0, help='default: the first free from 8080')
+    parser.add_argument(
+        '--host', default=_LOOPBACK, help='listen on another interface than this machine alone'
+    )
+    parser.add_argument('--read-only', action='store_true', help='the page may only watch')
+    parser.add_argument(
+        '--browser', action=argparse.BooleanOptionalAction, default=True, help='open a browser'
+    )
+    parser.add_argument(
+        '--wait', type=float, default=10.0, help='seconds to wait for a robot; default: 10'
+    )
+    options = parser.parse_args(words[:cut])
+    options.ros_arguments = words[cut:]
+    if not 0 <= options.port <= 65535:
+        parser.error(f'--port {options.port}; allowed: 0 ... 65535')
+    if options.path is not None and (options.task or options.robot):
+        parser.error('a file and --task or --robot exclude each other')
+    return options
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    options = parse(arguments)
+    if options.path is not None:
+        from fetch_hand_sim.view.file_session import run_files
+
+        return run_command('view', lambda: run_files(options))
+    return run_command('view', lambda: _run_live(options))
+
+
+def _run_live(options: argparse.Namespace) -> int:
+    require_extra('ros')
+    from fetch_hand_sim.view.live_session import run_live
+
+    return run_live(options)

@@ -1,0 +1,87 @@
+"""Curves of the last seconds: distances, reward, commands and what they move."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from fetch_hand_sim.simulation.scene import Frame
+from fetch_hand_sim.view.messages import Series
+from msgs_spec.tasks import TaskSpec
+
+Array = NDArray[np.float64]
+
+
+class Curves:
+    """The latest ticks as curves."""
+
+    def __init__(self, spec: TaskSpec, metric: GoalMetric, length: int = 250) -> None:
+        """Keeps `length` ticks."""
+        self._spec = spec
+        self._metric = metric
+        commands = spec.robot.action_size
+        # Columns: time, distance, rotation, reward, commands, positions.
+        self._rows = np.full((length, 4 + 2 * commands), np.nan)
+        self._count = 0
+        self._commanded = [
+            spec.robot.joints.index(part.name) if part.name in spec.robot.joints else None
+            for part in spec.robot.command
+        ]
+
+    def clear(self) -> None:
+        """Forgets everything."""
+        self._count = 0
+
+    def add(self, time: float, frame: Frame, reward: float | None, command: Array | None) -> None:
+        """Appends a tick.
+
+        Args:
+            time: Simulated seconds.
+            frame: The tick.
+            reward: Its reward; None at a reset.
+            command: (action size,) what was applied; None at a reset.
+        """
+        distance, rotation = self._metric.distances(frame.achieved_goal, frame.desired_goal)
+        nothing = np.full(len(self._commanded), np.nan)
+        row = self._rows[self._count % len(self._rows)]
+        row[:4] = time, distance, rotation, np.nan if reward is None else reward
+        row[4:] = np.concatenate([nothing if command is None else command, self._positions(frame)])
+        self._count += 1
+
+    @property
+    def distance(self) -> Series | None:
+        """Distance to the goal, metres; None where it does not count."""
+        counts = self._spec.rotation_threshold is None or self._spec.position_counts
+        return self._series(1) if counts else None
+
+    @property
+    def rotation(self) -> Series | None:
+        """Rotation to the goal, radians; None where there is none."""
+        return None if self._spec.rotation_threshold is None else self._series(2)
+
+    @property
+    def reward(self) -> Series:
+        """Reward of each tick."""
+        return self._series(3)
+
+    @property
+    def commands(self) -> Series:
+        """Commands, (ticks, action size)."""
+        return self._series(slice(4, 4 + len(self._commanded)))
+
+    @property
+    def positions(self) -> Series:
+        """The joints that the commands move, rad; for Fetch the gripper's path in x 0.05 m."""
+        return self._series(slice(4 + len(self._commanded), None))
+
+    def _positions(self, frame: Frame) -> Array:
+        """What the commands move; a gripper's axes are no joints and stay out."""
+        joints = frame.joint_position
+        return np.array([np.nan if i is None else joints[i] for i in self._commanded])
+
+    def _series(self, columns: int | slice) -> Series:
+        size = len(self._rows)
+        order = np.arange(max(0, self._count - size), self._count) % size
+        rows = self._rows[order]
+        return Series(rows[:, 0].copy(), rows[:, columns].copy())

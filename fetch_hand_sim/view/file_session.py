@@ -1,0 +1,55 @@
+"""Plays episode files on the page; no ROS is needed."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from fetch_hand_sim.episode_log import EpisodeReadError
+from fetch_hand_sim.episode_log.summary import expand_episodes
+from fetch_hand_sim.view.announce import announce
+from fetch_hand_sim.view.page import Page
+from fetch_hand_sim.view.player import Player
+from fetch_hand_sim.view.session import Requests, Session
+from fetch_hand_sim.view.web import open_page
+from msgs_spec.command_line import EXIT_SUCCESS, UsageError
+from msgs_spec.ros import StopSignals
+
+_FRAME_TIME = 1.0 / 60.0
+
+
+def run_files(options: argparse.Namespace) -> int:
+    """Runs until the user ends it; returns the exit code.
+
+    Raises:
+        UsageError: If there is nothing to play.
+        CannotServe: If the page cannot be served.
+    """
+    stop = StopSignals()
+    try:
+        player = Player(find_playable(options.path))
+    except EpisodeReadError as error:
+        raise UsageError(str(error)) from None
+    handle, address = open_page(options.host, options.port, [Page(), Requests(player.perform)])
+    try:
+        announce(address, options.browser)
+        session = Session(handle, player)
+        while not stop:
+            session.update()
+            time.sleep(_FRAME_TIME)
+    finally:
+        handle.close()
+    return EXIT_SUCCESS
+
+
+def find_playable(path: Path) -> list[Path]:
+    """Returns the episodes of a path, the first of which can be read.
+
+    Raises:
+        EpisodeReadError: If there are none.
+    """
+    paths = list(expand_episodes(path))
+    if not paths:
+        raise EpisodeReadError(f'{path}: no episodes')
+    return paths

@@ -1,0 +1,136 @@
+"""Shows a running robot; starts one where there is none and a task is given."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import IO
+
+import rclpy
+from rclpy.node import Node
+
+from fetch_hand_sim.commands.executables import is_actor_shipped
+from fetch_hand_sim.commands.node_processes import start_node, stop_node
+from fetch_hand_sim.view.announce import announce
+from fetch_hand_sim.view.live import LiveRobot
+from fetch_hand_sim.view.page import Page
+from fetch_hand_sim.view.session import Requests, Session
+from fetch_hand_sim.view.web import open_page
+from msgs_spec.ros import EventLoop, NodeFailure, StopSignals, run_node
+
+NODE_NAME = 'view'
+_FRAME_TIME = 1.0 / 60.0
+_SERVED_FIRST = 200
+# Seconds in which a robot that runs is found for sure.
+_DISCOVERY_TIME = 2.0
+# The page never takes a processor that the robot wants.
+_NICENESS = 10
+_LAST_LINES = 5
+
+
+def run_live(options: argparse.Namespace) -> int:
+    """Runs until the user ends it; returns the exit code."""
+    return run_node(NODE_NAME, lambda stop: _run(options, stop), options.ros_arguments)
+
+
+def _run(options: argparse.Namespace, stop: StopSignals) -> None:
+    with ExitStack() as stack:
+        node = rclpy.create_node(NODE_NAME, namespace=options.robot)
+        stack.callback(node.destroy_node)
+        robot = LiveRobot(node, may_command=not options.read_only)
+        loop = EventLoop(node)
+        stack.callback(loop.close)
+        handle, address = open_page(options.host, options.port, [Page(), Requests(robot.perform)])
+        stack.callback(handle.close)
+        nodes = stack.enter_context(_nodes(options, node, robot, loop, stop))
+        os.nice(_NICENESS)
+        announce(address, options.browser)
+        _serve(Session(handle, robot), loop, nodes, stop)
+
+
+@contextmanager
+def _nodes(
+    options: argparse.Namespace,
+    node: Node,
+    robot: LiveRobot,
+    loop: EventLoop,
+    stop: StopSignals,
+) -> Iterator[list[subprocess.Popen[str]]]:
+    """Finds a robot, or starts one with its actor and ends both afterwards."""
+    patience = _DISCOVERY_TIME if options.task else options.wait
+    _wait_for_robot(robot, loop, stop, patience)
+    if robot.spec is not None and options.task not in (None, robot.spec.name):
+        where = node.get_namespace()
+        raise NodeFailure(f'a robot in {where} runs already and does {robot.spec.name}')
+    if robot.spec is not None or stop:
+        yield []
+    elif options.task is None:
+        raise NodeFailure(_nobody(node, options.robot))
+    else:
+        with tempfile.NamedTemporaryFile('w+', prefix='view_', suffix='.log') as log:
+            started = _start(options, log)
+            try:
+                yield started
+                _check_alive(started, log, stop)
+            finally:
+                for process in started:
+                    stop_node(process)
+
+
+def _wait_for_robot(robot: LiveRobot, loop: EventLoop, stop: StopSignals, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while robot.spec is None and not stop and time.monotonic() < end:
+        loop.wait(_FRAME_TIME)
+
+
+def _nobody(node: Node, namespace: str) -> str:
+    """What to say where no robot answers."""
+    suffix = '/episode_status'
+    topics = (name for name, _ in node.get_topic_names_and_types() if name.endswith(suffix))
+    found = sorted(
+        name.removesuffix(suffix) or '/' for name in topics if node.count_publishers(name)
+    )
+    where = f'/{namespace.strip("/")}'
+    hint = (
+        f'robots found: {", ".join(found)} (--robot chooses)'
+        if found
+        else ('start sim_node, or both with: view --task FetchReach')
+    )
+    return f'no robot in namespace {where}; {hint}'
+
+
+def _start(options: argparse.Namespace, log: IO[str]) -> list[subprocess.Popen[str]]:
+    checkpoint = options.checkpoint or options.task
+    if not options.checkpoint and not is_actor_shipped(options.task):
+        print(f'No actor is shipped for {options.task} yet: commands are random.', flush=True)
+        checkpoint = 'random'
+    settings = [f'task:={options.task}', 'wait_for_commands:=true']
+    if options.episode_dir:
+        settings.append(f'episode_dir:={Path(options.episode_dir)}')
+    return [
+        start_node('policy_node', [f'checkpoint:={checkpoint}'], log, options.robot),
+        start_node('sim_node', settings, log, options.robot),
+    ]
+
+
+def _check_alive(nodes: list[subprocess.Popen[str]], log: IO[str], stop: StopSignals) -> None:
+    """Raises what a node said before it ended by itself."""
+    ended = [node for node in nodes if node.poll() is not None]
+    if ended and not stop:
+        lines = Path(log.name).read_text().strip().splitlines()[-_LAST_LINES:]
+        raise NodeFailure(f'a node ended with exit code {ended[0].poll()}: {" / ".join(lines)}')
+
+
+def _serve(
+    session: Session, loop: EventLoop, nodes: list[subprocess.Popen[str]], stop: StopSignals
+) -> None:
+    while not stop and all(node.poll() is None for node in nodes):
+        loop.wait(_FRAME_TIME)
+        loop.serve_pending(_SERVED_FIRST)
+        session.update()

@@ -1,0 +1,230 @@
+"""What the page and the robot's side of the viewer tell each other.
+
+Snapshots are replaced by newer ones, events all arrive (`mujoco.studio.messages`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from mujoco.studio import messages
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.scene import Frame, Scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What the page says in words.
+
+    Attributes:
+        source: `live` or `file`.
+        phase: Of the episode.
+        episode: Its number.
+        seed: Its seed.
+        tick: Steps of it so far.
+        ticks: Steps it will have.
+        episode_return: Sum of its rewards.
+        commander: Who commands.
+        is_paused: Whether time stands still.
+        speed: Simulated seconds per second, asked for.
+        rate: Ticks per second, measured; 0 if unknown.
+        missed_ticks: Since the robot started.
+        may_push: Whether the robot accepts pushes.
+        may_command: Whether this page may act at all.
+        actors: Actors to choose from; empty where there is no policy.
+        is_commanding: Whether the page sends commands.
+        notice: What the last action led to.
+    """
+
+    source: str = 'live'
+    phase: str = 'waiting'
+    episode: int = 0
+    seed: int = 0
+    tick: int = 0
+    ticks: int = 0
+    episode_return: float = 0.0
+    commander: str = ''
+    is_paused: bool = False
+    speed: float = 1.0
+    rate: float = 0.0
+    missed_ticks: int = 0
+    may_push: bool = False
+    may_command: bool = True
+    actors: tuple[str, ...] = ()
+    is_commanding: bool = False
+    notice: str = ''
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A curve: times in simulated seconds and values of the same length."""
+
+    times: Array
+    values: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """Where a file is being played.
+
+    Attributes:
+        index: Frame shown, from 0.
+        frames: How many there are.
+        time: Seconds since the first.
+        title: Name of the episode.
+        number: Which one of the list, from 0.
+        count: How many there are in the list.
+    """
+
+    index: int
+    frames: int
+    time: float
+    title: str
+    number: int
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Picture(messages.Snapshot):
+    """Everything the page shows of one tick.
+
+    Attributes:
+        task: Name of the task.
+        frame: Robot, object and goals; None before the first tick.
+        trail: Where the object or gripper was before.
+        facts: In words.
+        distance: Distance to the goal, m, as a curve.
+        rotation: Rotation to the goal, rad, likewise.
+        reward: Likewise.
+        commands: One curve per command: (ticks,) times and (ticks, commands) values.
+        positions: The joints that the commands drive, likewise; for Fetch the gripper.
+        command: The last applied command.
+        timeline: Where a file is being played; None for a running robot.
+    """
+
+    task: str
+    frame: Frame | None = None
+    trail: tuple[Array, ...] = ()
+    facts: Facts = field(default_factory=Facts)
+    distance: Series | None = None
+    rotation: Series | None = None
+    reward: Series | None = None
+    commands: Series | None = None
+    positions: Series | None = None
+    command: Array | None = None
+    timeline: Timeline | None = None
+
+
+class Request(messages.Event):
+    """What the page asks for, once."""
+
+
+class LatestRequest(messages.Snapshot):
+    """What the page asks for again and again; only the newest counts."""
+
+
+@dataclass(frozen=True)
+class SetPaused(Request):
+    """Stops time or lets it go on."""
+
+    is_paused: bool
+
+
+@dataclass(frozen=True)
+class StepOnce(Request):
+    """Runs one tick, or shows the next frames of a file (negative: earlier ones)."""
+
+    frames: int = 1
+
+
+@dataclass(frozen=True)
+class Reset(Request):
+    """Ends the episode; the next one has this seed, or the next in order for None."""
+
+    seed: int | None = None
+
+
+@dataclass(frozen=True)
+class SetSpeed(Request):
+    """Changes the simulated seconds per second."""
+
+    factor: float
+
+
+@dataclass(frozen=True)
+class ChooseActor(Request):
+    """Lets another actor command."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class SetCommanding(Request):
+    """Lets the page's sliders command, or no longer."""
+
+    is_commanding: bool
+
+
+@dataclass(frozen=True, eq=False)
+class SetCommand(LatestRequest):
+    """The sliders' command (action size,), command units."""
+
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SetGoal(LatestRequest):
+    """A new goal (goal size,).
+
+    Attributes:
+        values: m and quaternion wxyz.
+        is_kept: Whether later episodes get it as well.
+    """
+
+    values: Array
+    is_kept: bool = True
+
+
+@dataclass(frozen=True)
+class ReleaseGoal(Request):
+    """Lets later episodes draw their own goals again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Push(LatestRequest):
+    """A pull at a body, as long as it is sent.
+
+    Attributes:
+        body: Name of the body.
+        force: (3,) N, world axes, at the centre of mass.
+        torque: (3,) N m, world axes.
+    """
+
+    body: str
+    force: Array
+    torque: Array
+
+
+@dataclass(frozen=True)
+class Seek(Request):
+    """Shows a frame of a file."""
+
+    index: int
+
+
+@dataclass(frozen=True)
+class ChangeEpisode(Request):
+    """Opens another episode of the list, relative to this one."""
+
+    by: int
+
+
+@dataclass(frozen=True, eq=False)
+class ShowScene(messages.Event):
+    """The page shows another robot from now on."""
+
+    scene: Scene

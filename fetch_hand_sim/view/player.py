@@ -1,0 +1,200 @@
+"""Plays episode files: a playhead over the frames of one of them, and the list they come from."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.episode_log import EpisodeReadError
+from fetch_hand_sim.simulation.scene import tracked_position
+from fetch_hand_sim.view.curves import Curves
+from fetch_hand_sim.view.messages import (
+    ChangeEpisode,
+    Facts,
+    LatestRequest,
+    Picture,
+    Request,
+    Seek,
+    SetPaused,
+    SetSpeed,
+    StepOnce,
+    Timeline,
+)
+from fetch_hand_sim.view.recording import Recording, load_recording
+
+Array = NDArray[np.float64]
+
+_TRAIL_TICKS = 40
+# Seconds the last frame stays before the episode starts again.
+_PAUSE_AT_END = 1.0
+
+
+class Player:
+    """Shows one frame after the other, as fast as asked for."""
+
+    def __init__(self, paths: Sequence[Path], clock: Callable[[], float] = time.monotonic) -> None:
+        """Opens the first episode.
+
+        Args:
+            paths: Episodes, at least one.
+            clock: A steady clock, seconds.
+
+        Raises:
+            EpisodeReadError: If the first one cannot be read.
+        """
+        self._paths = list(paths)
+        self._clock = clock
+        self._number = 0
+        self._speed = 1.0
+        self._is_paused = False
+        self._position = 0.0
+        self._then = clock()
+        self._notice = ''
+        self._shown: tuple[object, ...] = ()
+        self._open(0)
+
+    @property
+    def index(self) -> int:
+        """The frame at the playhead."""
+        times = self._recording.times
+        last = int(np.searchsorted(times, self._position + 1e-9, side='right')) - 1
+        return min(max(last, 0), len(times) - 1)
+
+    @property
+    def recording(self) -> Recording:
+        """What is being played."""
+        return self._recording
+
+    def picture(self) -> Picture | None:
+        """Moves the playhead; returns what to show if that has changed."""
+        self._advance()
+        now = (self._number, self.index, self._is_paused, self._speed, self._notice)
+        if now == self._shown:
+            return None
+        self._shown = now
+        return self._make_picture()
+
+    def perform(self, request: Request | LatestRequest) -> None:
+        """Plays as the page asks for."""
+        match request:
+            case SetPaused():
+                self._set_paused(request.is_paused)
+            case SetSpeed():
+                self._speed = request.factor
+            case StepOnce():
+                self._is_paused = True
+                self._show(self.index + request.frames)
+            case Seek():
+                self._is_paused = True
+                self._show(request.index)
+            case ChangeEpisode():
+                self._change(request.by)
+
+    def _set_paused(self, is_paused: bool) -> None:
+        self._is_paused = is_paused
+        if not is_paused and self.index == len(self._recording.frames) - 1:
+            self._position = 0.0
+
+    def _show(self, index: int) -> None:
+        last = len(self._recording.frames) - 1
+        self._position = float(self._recording.times[min(max(index, 0), last)])
+
+    def _change(self, by: int) -> None:
+        """Opens the next episode that can be read."""
+        number = self._number
+        for _ in self._paths:
+            number = (number + by) % len(self._paths)
+            try:
+                self._open(number)
+            except EpisodeReadError as error:
+                self._notice = f'skipped {error}'
+                continue
+            return
+
+    def _open(self, number: int) -> None:
+        self._recording = recording = load_recording(self._paths[number])
+        self._number = number
+        self._position = 0.0
+        arrays = recording.arrays
+        self._curves = Curves(recording.spec, recording.metric, length=len(recording.frames))
+        for tick, frame in enumerate(recording.frames):
+            step = tick - 1
+            reward = float(arrays.rewards[step]) if tick else None
+            command = arrays.commands[step] if tick else None
+            self._curves.add(float(recording.times[tick]), frame, reward, command)
+
+    def _advance(self) -> None:
+        now = self._clock()
+        elapsed, self._then = now - self._then, now
+        if self._is_paused:
+            return
+        self._position += self._speed * elapsed
+        if self._position > self._recording.times[-1] + _PAUSE_AT_END * self._speed:
+            self._position = 0.0
+
+    def _make_picture(self) -> Picture:
+        recording, index = self._recording, self.index
+        frames, arrays, curves = recording.frames, recording.arrays, self._curves
+        trail = [tracked_position(f) for f in frames[max(0, index - _TRAIL_TICKS) : index + 1]]
+        picture = Picture(
+            task=recording.spec.name,
+            frame=frames[index],
+            trail=tuple(trail),
+            facts=self._facts(index),
+            distance=curves.distance,
+            rotation=curves.rotation,
+            reward=curves.reward,
+            commands=curves.commands,
+            positions=curves.positions,
+            command=arrays.commands[index - 1] if index else None,
+            timeline=Timeline(
+                index=index,
+                frames=len(frames),
+                time=float(recording.times[index]),
+                title=recording.title,
+                number=self._number,
+                count=len(self._paths),
+            ),
+        )
+        return _until(picture, float(recording.times[index]))
+
+    def _facts(self, index: int) -> Facts:
+        arrays = self._recording.arrays
+        return Facts(
+            source='file',
+            phase='finished' if index == len(arrays) else 'running',
+            episode=_number(arrays.metadata.get('episode')),
+            seed=_number(arrays.metadata.get('seed')),
+            tick=index,
+            ticks=len(arrays),
+            episode_return=float(arrays.rewards[:index].sum()),
+            commander=arrays.metadata.get('commander', 'as logged'),
+            is_paused=self._is_paused,
+            speed=self._speed,
+            notice=self._notice,
+        )
+
+
+def _until(picture: Picture, time: float) -> Picture:
+    """The curves up to a time."""
+    cut = {}
+    for name in ('distance', 'rotation', 'reward', 'commands', 'positions'):
+        series = getattr(picture, name)
+        if series is not None:
+            known = series.times <= time + 1e-9
+            cut[name] = dataclasses.replace(
+                series, times=series.times[known], values=series.values[known]
+            )
+    return dataclasses.replace(picture, **cut)
+
+
+def _number(text: str | None) -> int:
+    try:
+        return int(text or 0)
+    except ValueError:
+        return 0

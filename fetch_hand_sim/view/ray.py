@@ -1,0 +1,71 @@
+"""From the mouse to the world: rays through pixels of a free camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Ray:
+    """A half line, and the axes of the camera it comes from.
+
+    Attributes:
+        origin: (3,) m.
+        direction: (3,) unit length.
+        forward: (3,) where the camera looks.
+        right: (3,) its right.
+        up: (3,) its up.
+    """
+
+    origin: Array
+    direction: Array
+    forward: Array
+    right: Array
+    up: Array
+
+    def distance_to(self, point: Array) -> float:
+        """How far a point (3,) is from the line, metres; infinite behind the camera."""
+        offset = point - self.origin
+        along = float(offset @ self.direction)
+        if along <= 0.0:
+            return float('inf')
+        return float(np.linalg.norm(offset - along * self.direction))
+
+    def meets_plane(self, point: Array, normal: Array) -> Array | None:
+        """Where the line meets a plane, (3,); None if it does not."""
+        slope = float(self.direction @ normal)
+        if abs(slope) < 1e-6:
+            return None
+        along = float((point - self.origin) @ normal) / slope
+        return self.origin + along * self.direction if along > 0.0 else None
+
+
+def mouse_ray(
+    camera: tuple[Array, float, float, float],
+    fovy: float,
+    position: tuple[float, float],
+    aspect: float,
+) -> Ray:
+    """Returns the ray under the mouse.
+
+    Args:
+        camera: Point looked at (3,) m, distance m, azimuth and elevation in degrees.
+        fovy: Vertical field of view, degrees.
+        position: Of the mouse, 0 ... 1 from the left and from the top.
+        aspect: Width of the picture divided by its height.
+    """
+    lookat, distance, azimuth, elevation = camera
+    a, e = np.radians(azimuth), np.radians(elevation)
+    forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([np.sin(a), -np.cos(a), 0.0])
+    up = np.cross(right, forward)
+    half = np.tan(np.radians(fovy) / 2.0)
+    x, y = (2.0 * position[0] - 1.0) * half * aspect, (1.0 - 2.0 * position[1]) * half
+    direction = forward + x * right + y * up
+    direction /= np.linalg.norm(direction)
+    return Ray(np.asarray(lookat) - distance * forward, direction, forward, right, up)

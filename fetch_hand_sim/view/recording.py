@@ -1,0 +1,93 @@
+"""An episode file as frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.episode_log import EpisodeReadError
+from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode
+from fetch_hand_sim.episode_log.messages import read_messages
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from fetch_hand_sim.simulation.scene import Frame
+from msgs_spec.cdr import TopicCodec
+from msgs_spec.tasks import GoalKind, TaskSpec
+from msgs_spec.topics import topic
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One episode, ready to be shown.
+
+    Attributes:
+        arrays: The episode of N steps as arrays.
+        frames: N + 1.
+        times: (N + 1,) seconds since the first frame.
+        title: Name of the file.
+    """
+
+    arrays: EpisodeArrays
+    frames: list[Frame]
+    times: Array
+    title: str
+
+    @property
+    def spec(self) -> TaskSpec:
+        """The task."""
+        return self.arrays.spec
+
+    @property
+    def metric(self) -> GoalMetric:
+        """Distances by the rule the episode was logged with."""
+        rule = self.arrays.metadata.get('success_rule', 'gymnasium')
+        return GoalMetric(self.spec, success_rule='paper' if rule == 'paper' else 'gymnasium')
+
+
+def load_recording(path: Path) -> Recording:
+    """Reads an episode.
+
+    Raises:
+        EpisodeReadError: If it cannot be read; the message is one line.
+    """
+    arrays = load_episode(path)
+    ticks = len(arrays) + 1
+    spec = arrays.spec
+    joints = _vectors(path, spec, 'joint_states', ticks)[:, : len(spec.robot.joints)]
+    poses = _object_poses(path, arrays, ticks)
+    achieved, desired = arrays.observations['achieved_goal'], arrays.goals
+    frames = [
+        Frame(
+            joint_position=joints[tick],
+            desired_goal=desired[tick],
+            achieved_goal=achieved[tick],
+            object_pose=None if poses is None else poses[tick],
+            is_success=bool(arrays.success[tick]),
+        )
+        for tick in range(ticks)
+    ]
+    times = (arrays.stamps - arrays.stamps[0]) * 1e-9
+    return Recording(arrays, frames, times, arrays.path.stem.removesuffix('_0'))
+
+
+def _object_poses(path: Path, arrays: EpisodeArrays, ticks: int) -> Array | None:
+    if not arrays.spec.has_object:
+        return None
+    if arrays.spec.goal is GoalKind.POSE:
+        return arrays.observations['achieved_goal']
+    return _vectors(path, arrays.spec, 'object_pose', ticks)
+
+
+def _vectors(path: Path, spec: TaskSpec, name: str, ticks: int) -> Array:
+    """The vectors (ticks, size) of a topic that every tick has."""
+    file = read_messages(path)
+    resolved = next((each for each in file.offsets if each.rpartition('/')[2] == name), name)
+    try:
+        rows = file.rows(resolved).data[:ticks]
+        return TopicCodec(topic(spec, name)).decode_many(rows)[1]
+    except (ValueError, KeyError) as error:
+        raise EpisodeReadError(f'{file.path}: no readable {name}: {error}') from error

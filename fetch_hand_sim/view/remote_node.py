@@ -1,0 +1,76 @@
+"""Calls services and sets parameters of another node without waiting for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+
+from msgs_spec.ros import ros_service_class
+
+_SET_PARAMETERS = 'rcl_interfaces/srv/SetParameters'
+
+
+class RemoteNode:
+    """A node in the namespace of ours, by name."""
+
+    def __init__(self, node: Node, name: str, notice: Callable[[str], None]) -> None:
+        """Takes what is needed to call it.
+
+        Args:
+            node: Of this process.
+            name: Of the other one.
+            notice: Gets a line about what a call led to.
+        """
+        self._node = node
+        self._name = name
+        self._notice = notice
+        self._clients: dict[str, Any] = {}
+
+    def is_there(self) -> bool:
+        """Whether it answers services."""
+        return bool(self._client('set_parameters', _SET_PARAMETERS).service_is_ready())
+
+    def call(self, service: str, type_name: str, **fields: Any) -> None:
+        """Calls a service of the kind that says whether it worked and why or why not."""
+        self._call(service, type_name, fields, lambda response: self._notice(response.message))
+
+    def set_parameter(
+        self, name: str, value: str | int | float, then: Callable[[], None] | None = None
+    ) -> None:
+        """Sets a parameter and goes on where it was accepted."""
+        from rclpy.parameter import Parameter
+
+        def answered(response: Any) -> None:
+            result = response.results[0]
+            if not result.successful:
+                self._notice(f'{self._name} refuses {name}: {result.reason}')
+            elif then is not None:
+                then()
+            else:
+                self._notice(f'{name}: {value}')
+
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        self._call('set_parameters', _SET_PARAMETERS, {'parameters': [parameter]}, answered)
+
+    def _call(
+        self,
+        service: str,
+        type_name: str,
+        fields: dict[str, Any],
+        answered: Callable[[Any], None],
+    ) -> None:
+        client = self._client(service, type_name)
+        if not client.service_is_ready():
+            self._notice(f'{self._name} does not answer')
+            return
+        request = ros_service_class(type_name).Request(**fields)
+        client.call_async(request).add_done_callback(lambda future: answered(future.result()))
+
+    def _client(self, service: str, type_name: str) -> Any:
+        if service not in self._clients:
+            self._clients[service] = self._node.create_client(
+                ros_service_class(type_name), f'{self._name}/{service}'
+            )
+        return self._clients[service]

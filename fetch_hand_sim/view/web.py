@@ -1,0 +1,173 @@
+"""Starts MuJoCo's web viewer behind a guard, on a socket of our choice."""
+
+from __future__ import annotations
+
+import http.client
+import logging
+import os
+import socket
+import sys
+import threading
+import time
+import webbrowser
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mujoco.studio import (
+    endpoints,
+    launch_thread,
+    messages,
+    plugin,
+    viewer_handle,
+    viewer_protocol,
+    web_viewer,
+)
+from mujoco.studio.web import web_server
+
+from fetch_hand_sim.view.guard import Guard, guarded_serve, is_loopback, new_token
+from msgs_spec.command_line import CommandError
+
+_LOOPBACK = '127.0.0.1'
+_START_TIMEOUT = 10.0
+_bind_public_socket = web_server.bind_public_socket
+
+
+class CannotServe(CommandError):
+    """The page cannot be served; the message is one line that says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """Where the page is.
+
+    Attributes:
+        host: Interface that is listened on.
+        port: Its port.
+        token: What visitors must show; None where only this machine can connect.
+    """
+
+    host: str
+    port: int
+    token: str | None
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser."""
+        host = socket.getfqdn() if self.host in ('::', '0.0.0.0') else self.host
+        host = f'[{host}]' if ':' in host else host
+        query = f'?token={self.token}' if self.token else ''
+        return f'http://{host}:{self.port}/{query}'
+
+    @property
+    def warning(self) -> str | None:
+        """What to say where others can connect."""
+        if self.token is None:
+            return None
+        return (
+            f'listening on {self.host}: whoever has this address can watch and command the robot, '
+            'and nothing is encrypted. Browsers draw the page only over HTTPS or on this machine: '
+            f'ssh -L {self.port}:localhost:{self.port} is safer and works everywhere'
+        )
+
+
+class _Viewer(web_viewer.WebViewer):
+    """The web viewer without what it tells the terminal, and without files from visitors."""
+
+    @messages.handler(priority=messages.Priority.INTERNAL)
+    def _on_post_model(self, event: messages.PostModelEvent) -> None:
+        del event
+        self._update_model()
+
+    def get_drop_file(self) -> str:
+        """Takes none."""
+        return ''
+
+
+def open_page(
+    host: str,
+    port: int,
+    plugins: Sequence[plugin.Plugin],
+    token: str | None = None,
+) -> tuple[viewer_handle.ViewerHandle, Address]:
+    """Binds, serves the page from a thread and checks that the guard stands; once per process.
+
+    Args:
+        host: Interface to listen on.
+        port: A port, or 0 for the first free one from 8080.
+        plugins: Of the page and of the robot's side.
+        token: Secret of the address where others can connect; None makes one.
+
+    Raises:
+        CannotServe: If the port is taken or the host is not ours.
+    """
+    needs_token = not is_loopback(host)
+    guard = Guard((token or new_token()) if needs_token else None)
+    listening = _bind(host, port)
+    address = Address(host, listening.getsockname()[1], guard.token)
+    # The two places where the viewer meets the network; it offers no option for either.
+    web_server.bind_public_socket = lambda *_: listening
+    web_server.serve = guarded_serve(guard)
+    web_viewer._print_url_banner = lambda *_: None
+    logging.getLogger('WebServer').setLevel(logging.WARNING)
+    viewer_plugins, sim_plugins = plugin.split_plugins(plugins)
+
+    def run(endpoint: endpoints.ViewerEndpoint) -> None:
+        config = viewer_protocol.ViewerConfig(title='fetch_hand_sim', gfx='web')
+        viewer = _Viewer(config, endpoint, plugins=viewer_plugins)
+        viewer_protocol.run_viewer_loop(viewer)
+
+    handle = launch_thread.launch_thread(run, sim_plugins=sim_plugins)
+    try:
+        _check_guarded(address)
+    except BaseException:
+        handle.close()
+        raise
+    return handle, address
+
+
+def _bind(host: str, port: int) -> socket.socket:
+    try:
+        listening: socket.socket = _bind_public_socket(host, port)
+        # At once, so that nobody else can take the port before the server is up.
+        listening.listen()
+    except (RuntimeError, OSError, OverflowError) as error:
+        line = str(error).split('.')[0]
+        raise CannotServe(f'cannot listen on {host} port {port or "8080 ..."}: {line}') from None
+    return listening
+
+
+def _check_guarded(address: Address) -> None:
+    """Asks as a foreign site would; a server that answers must not run."""
+    host = _LOOPBACK if address.host in ('::', '0.0.0.0') else address.host
+    deadline = time.monotonic() + _START_TIMEOUT
+    while True:
+        connection = http.client.HTTPConnection(host, address.port, timeout=_START_TIMEOUT)
+        try:
+            connection.request('GET', '/', headers={'Host': 'elsewhere.example'})
+            status = connection.getresponse().status
+        except OSError as error:
+            if time.monotonic() > deadline:
+                raise CannotServe(f'the page does not answer: {error}') from None
+            time.sleep(0.05)
+            continue
+        finally:
+            connection.close()
+        if status != 403:
+            raise CannotServe(
+                f'mujoco.studio serves past the guard (status {status}); this version of mujoco '
+                'is not supported'
+            )
+        return
+
+
+def has_display() -> bool:
+    """Whether a browser could show itself."""
+    if not sys.platform.startswith('linux'):
+        return True
+    return bool(os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
+
+
+def open_browser(url: str, browser: Callable[[str], Any] = webbrowser.open) -> None:
+    """Opens a page without waiting for the browser."""
+    threading.Thread(target=browser, args=(url,), daemon=True).start()

@@ -1,0 +1,116 @@
+"""The mouse over the scene: rays, what they hit, where a goal goes."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from fetch_hand_sim.simulation.scene import Scene, ghost_pose
+from fetch_hand_sim.view.goal_drag import find_handle, handles, moved_goal
+from fetch_hand_sim.view.ray import mouse_ray
+from msgs_spec.rotations import quaternion_to_matrix
+from msgs_spec.tasks import TASKS
+
+VIEW = (np.array([1.3, 0.75, 0.5]), 1.8, 132.0, -20.0)
+ASPECT = 1.5
+
+
+def project(point, fovy=45.0):
+    """Where a point appears, 0 ... 1 from the left and top: the inverse of `mouse_ray`."""
+    center = mouse_ray(VIEW, fovy, (0.5, 0.5), ASPECT)
+    offset = point - center.origin
+    depth = offset @ center.forward
+    half = np.tan(np.radians(fovy) / 2.0)
+    x, y = offset @ center.right / depth / half / ASPECT, offset @ center.up / depth / half
+    return (x + 1.0) / 2.0, (1.0 - y) / 2.0
+
+
+def ray_at(point):
+    return mouse_ray(VIEW, 45.0, project(point), ASPECT)
+
+
+def test_rays_agree_with_the_camera_of_mujoco():
+    model = Scene('FetchReach').model
+    scene, camera = mujoco.MjvScene(model, 1000), mujoco.MjvCamera()
+    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = VIEW
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    category = mujoco.mjtCatBit.mjCAT_ALL.value
+    mujoco.mjv_updateScene(
+        model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), camera, category, scene
+    )
+    eyes = scene.camera
+    ray = mouse_ray(VIEW, 45.0, (0.5, 0.5), ASPECT)
+    np.testing.assert_allclose(ray.direction, eyes[0].forward, atol=1e-6)
+    np.testing.assert_allclose(ray.up, eyes[0].up, atol=1e-6)
+    middle = (np.array(eyes[0].pos) + np.array(eyes[1].pos)) / 2.0
+    np.testing.assert_allclose(ray.origin, middle, atol=1e-4)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_point_under_the_mouse_is_on_its_ray(seed):
+    point = np.random.default_rng(seed).uniform([1.0, 0.5, 0.3], [1.6, 1.0, 0.8])
+    assert ray_at(point).distance_to(point) < 1e-9
+    assert ray_at(point).distance_to(point + 0.1) > 0.05
+
+
+def example_goal(spec):
+    rng = np.random.default_rng(0)
+    if spec.goal.size == 7:
+        return np.array([1.0, 0.87, 0.2, 1.0, 0.0, 0.0, 0.0])
+    return rng.uniform([1.2, 0.6, 0.45], [1.4, 0.9, 0.6], (spec.goal.size // 3, 3)).ravel()
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_every_handle_can_be_taken_and_moves_only_its_own_part(task):
+    spec = TASKS[task]
+    goal = example_goal(spec)
+    for handle in handles(spec, goal):
+        ray = ray_at(handle.position)
+        assert find_handle(spec, goal, ray).index == handle.index
+        moved = moved_goal(
+            spec, goal, handle, ray_at(handle.position + 0.01), True, np.array([0.1, 0.05])
+        )
+        assert np.abs(moved - goal).max() > 1e-3
+        assert np.isfinite(moved).all()
+        if spec.goal.size == 7:
+            np.testing.assert_array_equal(moved[:3], goal[:3])
+            assert np.linalg.norm(moved[3:]) == pytest.approx(1.0)
+        else:
+            others = np.delete(np.arange(goal.size), np.arange(3) + 3 * handle.index)
+            np.testing.assert_array_equal(moved[others], goal[others])
+
+
+def test_nothing_is_taken_beside_the_goal():
+    spec = TASKS['FetchReach']
+    goal = example_goal(spec)
+    assert find_handle(spec, goal, ray_at(goal + np.array([0.0, 0.0, 0.2]))) is None
+
+
+@pytest.mark.parametrize('task', ['FetchPush', 'FetchSlide'])
+def test_goals_on_the_table_stay_on_it(task):
+    spec = TASKS[task]
+    goal = np.array([1.3, 0.7, 0.42])
+    (handle,) = handles(spec, goal)
+    place = np.array([1.2, 0.8, 0.42])
+    moved = moved_goal(spec, goal, handle, ray_at(place), True, np.zeros(2))
+    np.testing.assert_allclose(moved, place, atol=1e-9)
+
+
+def test_the_block_of_rotate_z_turns_about_z_alone():
+    spec = TASKS['HandManipulateBlockRotateZ']
+    goal = example_goal(spec)
+    (handle,) = handles(spec, goal)
+    moved = moved_goal(spec, goal, handle, ray_at(handle.position), True, np.array([0.3, 0.4]))
+    np.testing.assert_allclose(quaternion_to_matrix(moved[3:])[2], [0.0, 0.0, 1.0], atol=1e-12)
+
+
+def test_a_pose_moves_only_where_its_position_counts():
+    delta, full = np.array([0.2, 0.2]), TASKS['HandManipulateBlockFull']
+    goal = example_goal(full)
+    (handle,) = handles(full, goal)
+    np.testing.assert_array_equal(handle.position, ghost_pose(full, goal)[:3])
+    moved = moved_goal(full, goal, handle, ray_at(goal[:3] + 0.02), False, delta)
+    np.testing.assert_array_equal(moved[3:], goal[3:])
+    assert np.abs(moved[:3] - goal[:3]).max() > 1e-3

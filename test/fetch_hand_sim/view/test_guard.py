@@ -1,0 +1,122 @@
+"""The page is for this machine, or for who has the token; other sites may neither read nor act."""
+
+from __future__ import annotations
+
+import http.client
+
+import pytest
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from fetch_hand_sim.view.guard import Guard, is_loopback
+from fetch_hand_sim.view.page import Page
+from fetch_hand_sim.view.session import Requests
+from fetch_hand_sim.view.web import CannotServe, open_page
+
+TOKEN = 'a-token'
+
+
+def refusal(guard, target, **headers):
+    return guard.refusal(target, Headers(list(headers.items())))
+
+
+@pytest.mark.parametrize('host', ['localhost:8080', '127.0.0.1:8080', '[::1]:8080', 'LOCALHOST'])
+def test_this_machine_is_served(host):
+    assert refusal(Guard(), '/', Host=host) is None
+    assert refusal(Guard(), '/ui?sid=1', Host=host, Origin=f'http://{host}') is None
+
+
+@pytest.mark.parametrize('host', ['evil.example', '192.168.0.7:8080', 'localhost.evil.example', ''])
+def test_a_name_that_points_here_is_not(host):
+    assert refusal(Guard(), '/', Host=host).status == 403
+
+
+@pytest.mark.parametrize('path', ['/ui', '/state', '/state?sid=1'])
+@pytest.mark.parametrize(
+    'origin', ['http://evil.example', 'http://localhost:9999', 'null', '', 'http://[', None]
+)
+@pytest.mark.parametrize('token', [None, TOKEN])
+def test_a_web_socket_of_another_site_is_refused(path, origin, token):
+    headers = {'Host': 'localhost:8080', 'Cookie': f'fetch_hand_sim_view={TOKEN}'}
+    if origin is not None:
+        headers['Origin'] = origin
+    assert refusal(Guard(token), path, **headers).status == 403
+
+
+@pytest.mark.parametrize('headers', [[], [('Host', 'localhost'), ('Host', 'evil.example')]])
+def test_one_host_is_needed(headers):
+    assert Guard().refusal('/', Headers(headers)).status == 400
+
+
+def test_no_files_from_visitors():
+    headers = {'Host': 'localhost', 'Origin': 'http://localhost'}
+    assert refusal(Guard(), '/drop?sid=1', **headers).status == 403
+
+
+@pytest.mark.parametrize(
+    ('target', 'cookie'),
+    [('/', ''), ('/?token=wrong', ''), ('/', 'fetch_hand_sim_view=wrong'), ('/', 'other=a-token')],
+)
+def test_without_the_token_nobody_is_served(target, cookie):
+    assert refusal(Guard(TOKEN), target, Host='robot.example', Cookie=cookie).status == 403
+    assert Guard(TOKEN).admission(target) is None
+
+
+def test_the_token_admits_and_leaves_the_address():
+    guard = Guard(TOKEN)
+    assert refusal(guard, f'/?token={TOKEN}', Host='robot.example') is None
+    cookie = guard.admission(f'/?token={TOKEN}')
+    assert 'HttpOnly' in cookie and 'SameSite=Strict' in cookie
+    assert refusal(guard, '/', Host='robot.example', Cookie=cookie.partition(';')[0]) is None
+
+
+def test_loopback_is_told_from_the_rest():
+    assert is_loopback('127.0.0.1') and is_loopback('127.9.9.9') and is_loopback('localhost')
+    assert not is_loopback('0.0.0.0') and not is_loopback('::') and not is_loopback('10.0.0.1')
+
+
+# The server itself
+
+
+@pytest.fixture(scope='module')
+def address():
+    handle, address = open_page('127.0.0.1', 0, [Page(), Requests(lambda request: None)])
+    yield address
+    handle.close()
+
+
+def get(address, path, **headers):
+    connection = http.client.HTTPConnection('127.0.0.1', address.port, timeout=10)
+    connection.request('GET', path, headers=headers)
+    return connection.getresponse()
+
+
+def test_server_gives_the_page_and_opens_it_to_no_other_site(address):
+    assert address.host == '127.0.0.1' and address.token is None and address.warning is None
+    for path in ('/', '/model', '/web_client.js'):
+        response = get(address, path)
+        assert response.status == 200, path
+        assert response.getheader('Access-Control-Allow-Origin') is None
+        assert response.getheader('X-Frame-Options') == 'DENY'
+    assert get(address, '/', Host='evil.example').status == 403
+    assert get(address, '/drop').status == 403
+
+
+def test_server_refuses_web_sockets_of_other_sites(address):
+    url = f'ws://127.0.0.1:{address.port}/state?sid=x'
+    with connect(url, origin=f'http://127.0.0.1:{address.port}') as socket:
+        assert socket.recv(timeout=10)
+    for origin in ('http://evil.example', None):
+        with pytest.raises(InvalidStatus):
+            connect(url, origin=origin)
+
+
+def test_a_taken_port_is_one_line(address):
+    with pytest.raises(CannotServe, match=rf'cannot listen on 127.0.0.1 port {address.port}: '):
+        open_page('127.0.0.1', address.port, [Page()])
+
+
+def test_a_foreign_address_is_one_line():
+    with pytest.raises(CannotServe, match=r'cannot listen on 203\.0\.113\.1'):
+        open_page('203.0.113.1', 0, [Page()])

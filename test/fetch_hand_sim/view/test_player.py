@@ -1,0 +1,141 @@
+"""Playing files: frames equal the log, the playhead obeys, damaged neighbours are skipped."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError
+from fetch_hand_sim.episode_log.arrays import load_episode
+from fetch_hand_sim.view.file_session import find_playable
+from fetch_hand_sim.view.messages import ChangeEpisode, Seek, SetPaused, SetSpeed, StepOnce
+from fetch_hand_sim.view.player import Player
+from fetch_hand_sim.view.recording import load_recording
+from msgs_spec.tasks import TASKS
+from support.episode_recorder import Recorder
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    directory = tmp_path_factory.mktemp('episodes')
+    recorder = Recorder('FetchPush')
+    for _ in range(3):
+        recorder.record(EpisodeDirectory(directory))
+    return directory
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def player(folder, clock):
+    return Player(find_playable(folder), clock)
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_frames_are_what_was_logged(task, tmp_path):
+    recorder = Recorder(task)
+    path = recorder.record(EpisodeDirectory(tmp_path))
+    recording, arrays = load_recording(path), load_episode(path)
+    assert len(recording.frames) == len(arrays) + 1 == TASKS[task].episode_ticks + 1
+    for tick, frame in enumerate(recording.frames):
+        observation = {name: rows[tick] for name, rows in arrays.observations.items()}
+        np.testing.assert_array_equal(frame.desired_goal, observation['desired_goal'])
+        np.testing.assert_array_equal(frame.achieved_goal, observation['achieved_goal'])
+        assert (frame.object_pose is not None) == TASKS[task].has_object
+        assert frame.joint_position.shape == (len(TASKS[task].robot.joints),)
+    if task.startswith('Hand'):
+        joints = arrays.observations['observation'][:, : len(TASKS[task].robot.joints)]
+        shown = np.array([frame.joint_position for frame in recording.frames])
+        np.testing.assert_array_equal(shown, joints)
+
+
+def test_it_plays_as_fast_as_asked(player, clock):
+    assert player.picture().timeline.index == 0
+    clock.now = 0.4
+    assert player.picture().timeline.index == 10
+    player.perform(SetSpeed(2.0))
+    clock.now = 0.6
+    assert player.picture().timeline.index == 20
+
+
+def test_nothing_new_is_no_picture(player, clock):
+    player.picture()
+    clock.now = 0.01
+    assert player.picture() is None
+
+
+def test_pause_steps_and_seeking(player, clock):
+    player.perform(SetPaused(True))
+    clock.now = 5.0
+    assert player.picture().timeline.index == 0
+    player.perform(StepOnce())
+    assert player.picture().timeline.index == 1
+    player.perform(Seek(40))
+    assert player.picture().timeline.index == 40
+    player.perform(StepOnce(-1))
+    assert player.picture().timeline.index == 39
+    for beyond, end in ((-5, 0), (10**9, 50)):
+        player.perform(Seek(beyond))
+        assert player.index == end
+    assert len(player.picture().distance.times) == 51
+
+
+def test_it_starts_again_after_the_end(player, clock):
+    clock.now = 2.5
+    assert player.picture().timeline.index == 50
+    clock.now = 3.2
+    assert player.picture().timeline.index == 0
+
+
+def test_next_and_previous_go_round(player):
+    titles = []
+    for by in (1, 1, 1, -1):
+        player.perform(ChangeEpisode(by))
+        titles.append(player.picture().timeline.number)
+    assert titles == [1, 2, 0, 2]
+
+
+def test_what_cannot_be_read_is_skipped_and_said(folder, tmp_path, clock):
+    good = find_playable(folder)
+    damaged = tmp_path / 'damaged.mcap'
+    damaged.write_bytes(b'nothing')
+    player = Player([good[0], damaged, good[1]], clock)
+    player.perform(ChangeEpisode(1))
+    picture = player.picture()
+    assert picture.timeline.number == 2
+    assert 'damaged.mcap' in picture.facts.notice
+
+
+def test_curves_end_at_the_playhead(player):
+    player.perform(Seek(10))
+    picture = player.picture()
+    for series in (picture.distance, picture.reward, picture.commands):
+        assert len(series.times) == len(series.values) == 11
+    assert dataclasses.asdict(picture.timeline)['frames'] == 51
+
+
+@pytest.mark.parametrize('content', [None, b'', b'no mcap'])
+def test_an_unreadable_file_is_one_line(tmp_path, content):
+    path = tmp_path / 'episode.mcap'
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(EpisodeReadError) as caught:
+        Player(find_playable(path))
+    assert '\n' not in str(caught.value)
+
+
+def test_an_empty_folder_is_one_line(tmp_path):
+    with pytest.raises(EpisodeReadError, match='no episodes'):
+        find_playable(tmp_path)
