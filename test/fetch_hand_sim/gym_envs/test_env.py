@@ -184,7 +184,9 @@ def test_rendering_gives_a_picture_or_says_what_it_needs(task, monkeypatch):
     code = RENDER.format(task=task)
     result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
     picture = '(480, 640, 3) uint8 True'
-    reason = 'rendering needs OpenGL: apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6'
+    reason = (
+        'rendering needs OpenGL: apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6'
+    )
     assert result.stdout.strip() in (picture, reason[:80].strip()), result.stderr
 
 
