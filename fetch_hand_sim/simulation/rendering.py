@@ -121,13 +121,11 @@ def simulation_frame(simulation: Simulation, index: int = 0) -> Frame:
     """Returns how one copy of a simulation looks now."""
     readings, observation = simulation.readings(), simulation.observe()
     achieved, desired = observation['achieved_goal'][index], observation['desired_goal'][index]
-    pose = None
-    if readings.object_position is not None and readings.object_quaternion is not None:
-        pose = np.concatenate([readings.object_position[index], readings.object_quaternion[index]])
+    spec = simulation.spec
     return Frame(
-        joint_position=readings.joint_position[index],
+        joint_position=readings['joint_states'][index, : len(spec.robot.joints)],
         desired_goal=desired,
         achieved_goal=achieved,
-        object_pose=pose,
+        object_pose=readings['object_pose'][index] if spec.has_object else None,
         is_success=bool(simulation.compute_success(achieved, desired)),
     )
