@@ -1,5 +1,10 @@
 """The robots: thirteen tasks on MuJoCo, from one batched simulation, and the ROS node around it."""
 
-from fetch_hand_sim.gym_envs.registration import register_environments
+from fetch_hand_sim.gym_envs.registration import (
+    register_environments,
+    register_gymnasium_robotics,
+)
+
+__all__ = ['register_gymnasium_robotics']
 
 register_environments()

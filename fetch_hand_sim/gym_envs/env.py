@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fetch_hand_sim.gym_envs.spaces import action_space, observation_space
+from fetch_hand_sim.gym_envs.pictures import HEIGHT, RENDER_MODES, WIDTH, Pictures
+from fetch_hand_sim.gym_envs.shared_physics import SharedPhysics
+from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
 from fetch_hand_sim.simulation import Observation, Simulation
-from fetch_hand_sim.simulation.rendering import SceneRenderer, simulation_frame
 from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
-from fetch_hand_sim.simulation.scene import Scene
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
 Array = NDArray[np.float64]
+Image = NDArray[np.uint8] | NDArray[np.float32]
 
 
 class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """One task with dictionary observations, for hindsight experience replay.
 
     Episodes never terminate; `gymnasium.make` truncates them after the task's number of steps. Give
-    it the keyword arguments of this class.
+    it the keyword arguments of this class. `pickle` and `copy.deepcopy` keep the state: both go on
+    to the same bits.
 
     Attributes:
         spec_of_task: The task as data.
@@ -30,7 +34,7 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """
 
     metadata = {  # noqa: RUF012 - as in gymnasium.Env
-        'render_modes': ['rgb_array'],
+        'render_modes': RENDER_MODES,
         'render_fps': int(DEFAULT_CONTROL_HZ),
     }
 
@@ -41,21 +45,34 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         success_rule: SuccessRule = 'gymnasium',
         control_hz: float = DEFAULT_CONTROL_HZ,
         render_mode: str | None = None,
+        width: int = WIDTH,
+        height: int = HEIGHT,
+        default_camera_config: Mapping[str, Any] | None = None,
+        distance_threshold: float | None = None,
+        rotation_threshold: float | None = None,
     ) -> None:
         """Compiles the model.
 
         Args:
-            task: One of the thirteen tasks (`msgs_spec.tasks.TASKS`).
+            task: One of the tasks (`msgs_spec.tasks.TASKS`).
             reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
             success_rule: `gymnasium` (released code) or `paper` (its text).
             control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
-            render_mode: `rgb_array` or None.
+            render_mode: One of `metadata['render_modes']` or None.
+            width: Pixels of a picture.
+            height: Pixels of a picture.
+            default_camera_config: Attributes of `mujoco.MjvCamera`, such as `distance` (m),
+                `azimuth`, `elevation` (degrees) and `lookat` (m); None for the task's view.
+            distance_threshold: Success within this distance, metres; None for the task's own.
+            rotation_threshold: Success within this rotation, radians; None for the task's own.
 
         Raises:
             ValueError: If an argument is not allowed; the message says what is.
         """
-        if render_mode not in (None, *self.metadata['render_modes']):
-            raise ValueError(f'render_mode {render_mode!r} is not known; allowed: None, rgb_array')
+        modes = self.metadata['render_modes']
+        if render_mode not in (None, *modes):
+            allowed = ', '.join(('None', *modes))
+            raise ValueError(f'render_mode {render_mode!r} is not known; allowed: {allowed}')
         self.simulation = Simulation(
             task,
             num_envs=1,
@@ -63,13 +80,20 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             reward_type=reward_type,
             success_rule=success_rule,
             control_hz=control_hz,
+            keeps_data=True,
         )
         self.spec_of_task = self.simulation.spec
-        self.metadata = {**self.metadata, 'render_fps': control_hz}
+        self.metadata = {**self.metadata, 'render_fps': round(control_hz)}
         self.observation_space = observation_space(self.spec_of_task)
         self.action_space = action_space(self.spec_of_task)
         self.render_mode = render_mode
-        self._renderer: SceneRenderer | None = None
+        self.width, self.height = width, height
+        self._pictures = Pictures(self.simulation, width, height, default_camera_config)
+        self._physics = SharedPhysics(self.simulation)
+        if distance_threshold is not None:
+            self.distance_threshold = distance_threshold
+        if rotation_threshold is not None:
+            self.rotation_threshold = rotation_threshold
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -90,7 +114,10 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         check_reset_options(options, allowed=())
         super().reset(seed=seed)
+        self._physics.send()
         observation = self.simulation.reset(seed=[self.np_random])
+        self._physics.receive()
+        self._show()
         return _first(observation), {}
 
     def step(
@@ -99,7 +126,7 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Advances one tick.
 
         Args:
-            action: (action size,) in [-1, 1].
+            action: (action size,); what lies outside [-1, 1] is clipped.
 
         Returns:
             Observation, reward, terminated (never), truncated (only if MuJoCo lost the simulation:
@@ -107,36 +134,118 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             and `diverged`.
 
         Raises:
-            ValueError: If the action has a wrong shape, is not finite or out of range.
+            ValueError: If the action has a wrong shape or is not finite.
         """
-        result = self.simulation.step(np.asarray(action)[None])
+        self._physics.send()
+        result = self.simulation.step(clip_actions(np.asarray(action)[None]))
+        self._physics.receive()
+        self._show()
         diverged = bool(result.diverged[0])
         info = {'is_success': float(result.success[0]), 'diverged': diverged}
         return _first(result.observation), float(result.reward[0]), False, diverged, info
 
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
-    ) -> Array:
+    ) -> Any:
         """Reward of goals of any batch shape (..., goal size)."""
         return self.simulation.compute_reward(achieved_goal, desired_goal, info)
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Returns a picture (480, 640, 3) of the robot and its goal; None without a render mode.
+    def compute_terminated(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
+    ) -> bool:
+        """Never: a reached goal is to be kept."""
+        return False
+
+    def compute_truncated(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
+    ) -> bool:
+        """Whether MuJoCo lost the simulation at the step that gave `info`."""
+        return bool(info and info.get('diverged', False))
+
+    @property
+    def model(self) -> Any:
+        """The compiled `mujoco.MjModel`; what is written into it counts from the next call on."""
+        return self._physics.model
+
+    @property
+    def data(self) -> Any:
+        """The `mujoco.MjData`, live; what is written into it counts from the next call on."""
+        return self._physics.data
+
+    @property
+    def dt(self) -> float:
+        """Simulated seconds per step."""
+        return self.simulation.tick_duration
+
+    @property
+    def goal(self) -> Array:
+        """The desired goal of the episode, (goal size,), live."""
+        return np.asarray(self.simulation.goals[0])
+
+    @goal.setter
+    def goal(self, goal: ArrayLike) -> None:
+        self.simulation.goals[0] = goal
+
+    @property
+    def reward_type(self) -> str:
+        """`sparse` or `dense`."""
+        return self.simulation.metric.reward_type
+
+    @reward_type.setter
+    def reward_type(self, reward_type: RewardType) -> None:
+        self.simulation.metric = replace(self.simulation.metric, reward_type=reward_type)
+
+    @property
+    def distance_threshold(self) -> float:
+        """Success within this distance, metres."""
+        return self.simulation.metric.spec.distance_threshold
+
+    @distance_threshold.setter
+    def distance_threshold(self, threshold: float) -> None:
+        self._set_threshold('distance_threshold', threshold)
+
+    @property
+    def rotation_threshold(self) -> float | None:
+        """Success within this rotation, radians; None where rotations do not count."""
+        return self.simulation.metric.spec.rotation_threshold
+
+    @rotation_threshold.setter
+    def rotation_threshold(self, threshold: float) -> None:
+        if self.rotation_threshold is None:
+            raise ValueError(f'{self.spec_of_task.name} has no rotation_threshold')
+        self._set_threshold('rotation_threshold', threshold)
+
+    def render(self) -> Image | None:
+        """Returns a picture of the robot and its goal.
+
+        Returns:
+            `rgb_array`: (height, width, 3) bytes. `depth_array`: (height, width), metres from the
+            camera plane. `human`: None, after drawing into a window. None without a render mode.
 
         Raises:
-            RuntimeError: If there is no OpenGL.
+            RuntimeError: If there is no OpenGL or, for `human`, no display.
         """
-        if self.render_mode is None:
-            return None
-        if self._renderer is None:
-            self._renderer = SceneRenderer(Scene(self.spec_of_task.name))
-        return self._renderer.render(simulation_frame(self.simulation))
+        return None if self.render_mode is None else self._pictures.render(self.render_mode)
 
     def close(self) -> None:
-        """Frees the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        """Frees renderer and window."""
+        self._pictures.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but what belongs to this process; writes into `model` and `data` included."""
+        self._physics.send()
+        return self.__dict__.copy()
+
+    def _show(self) -> None:
+        if self.render_mode == 'human':
+            self.render()
+
+    def _set_threshold(self, name: str, value: float) -> None:
+        if not (np.isfinite(value) and value >= 0.0):
+            raise ValueError(f'{name} must be a number of at least 0, not {value!r}')
+        metric = self.simulation.metric
+        changed: dict[str, Any] = {name: float(value)}
+        self.simulation.metric = replace(metric, spec=replace(metric.spec, **changed))
 
 
 def check_reset_options(options: Any, allowed: tuple[str, ...]) -> None:

@@ -1,9 +1,12 @@
-"""Registers the thirteen tasks with Gymnasium, as `fetch_hand_sim/<Task>-v0`."""
+"""Registers the tasks with Gymnasium: `fetch_hand_sim/<Task>-v0`, and the reference's ids."""
 
 from __future__ import annotations
 
+from typing import Any, NoReturn
+
 import gymnasium
 
+from fetch_hand_sim.gym_envs.goal_env import import_goal_env
 from msgs_spec.tasks import TASKS
 
 NAMESPACE = 'fetch_hand_sim'
@@ -27,3 +30,92 @@ def register_environments() -> None:
             max_episode_steps=spec.episode_ticks,
             kwargs={'task': task},
         )
+
+
+_REFERENCE_ENV = 'fetch_hand_sim.gym_envs.gymnasium_robotics_env:make_env'
+_WITHOUT_TOUCH = 'fetch_hand_sim.gym_envs.registration:refuse_touch_sensors'
+_TOUCH_SENSORS = ('_BooleanTouchSensors', '_ContinuousTouchSensors')
+
+
+def register_gymnasium_robotics(override: bool = False) -> None:
+    """Registers the ids of Gymnasium-Robotics 1.4.2: `FetchPush-v4`, `HandReachDense-v3`, ...
+
+    Code written for them then runs on this package, without another change. Ids with touch sensors
+    say in one line that they are not there.
+
+    Args:
+        override: Whether ids that Gymnasium-Robotics itself has registered are replaced. It is
+            imported first then, so that importing it later changes nothing.
+
+    Raises:
+        gymnasium.error.Error: If it has registered them and override is False; nothing is
+            registered then.
+    """
+    if override:
+        import_goal_env()
+    ids = reference_ids()
+    foreign = [name for name in ids if _is_foreign(name)]
+    if foreign and not override:
+        raise gymnasium.error.Error(
+            f'{foreign[0]} and {len(foreign) - 1} more are registered by another package; '
+            'register_gymnasium_robotics(override=True) replaces them'
+        )
+    for name, (task, reward_type) in ids.items():
+        gymnasium.registry.pop(name, None)
+        gymnasium.register(
+            name,
+            entry_point=_REFERENCE_ENV,
+            vector_entry_point='fetch_hand_sim.gym_envs.vector_env:FetchHandVectorEnv',
+            max_episode_steps=TASKS[task].episode_ticks,
+            kwargs={'task': task, 'reward_type': reward_type},
+        )
+    for name, without in _touch_ids(ids).items():
+        if name not in gymnasium.registry:
+            kwargs = {'name': name, 'without': without}
+            gymnasium.register(name, entry_point=_WITHOUT_TOUCH, kwargs=kwargs)
+
+
+def reference_ids() -> dict[str, tuple[str, str]]:
+    """Task and reward type of each id of the reference that means the same physics.
+
+    Its other versions (Fetch -v1, HandReach -v0, HandManipulate* -v0) need mujoco-py.
+    """
+    ids = {}
+    for task, spec in TASKS.items():
+        if spec.reference_id is None:
+            continue
+        name, version = spec.reference_id.split('-')
+        # `HandManipulateBlock` is another name of `HandManipulateBlockFull`.
+        for alias in dict.fromkeys((name, name.removesuffix('Full'))):
+            ids[f'{alias}-{version}'] = (task, 'sparse')
+            ids[f'{alias}Dense-{version}'] = (task, 'dense')
+    return ids
+
+
+def refuse_touch_sensors(name: str, without: str, **arguments: Any) -> NoReturn:
+    """Stands in for the environments with touch sensors.
+
+    Raises:
+        gymnasium.error.Error: Always, naming the environment without them.
+    """
+    raise gymnasium.error.Error(
+        f'{name} has touch sensors, which fetch_hand_sim does not simulate; '
+        f'without them it is {without}'
+    )
+
+
+def _touch_ids(ids: dict[str, tuple[str, str]]) -> dict[str, str]:
+    """For each id with touch sensors the one without; only the HandManipulate tasks have them."""
+    touch = {}
+    for name in ids:
+        if name.startswith('HandManipulate') and 'Full' not in name:
+            for sensors in _TOUCH_SENSORS:
+                task, version = name.split('-')
+                plain = task.removesuffix('Dense')
+                touch[f'{plain}{sensors}{task[len(plain) :]}-{version}'] = name
+    return touch
+
+
+def _is_foreign(name: str) -> bool:
+    spec = gymnasium.registry.get(name)
+    return spec is not None and spec.entry_point != _REFERENCE_ENV

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -26,7 +27,7 @@ class SceneRenderer:
         scene: Scene,
         width: int = WIDTH,
         height: int = HEIGHT,
-        camera: str | None = None,
+        camera: str | Mapping[str, Any] | None = None,
     ) -> None:
         """Opens an OpenGL context.
 
@@ -34,7 +35,8 @@ class SceneRenderer:
             scene: What to draw.
             width: Pixels.
             height: Pixels.
-            camera: A camera of the model by name; None for the scene's own view.
+            camera: A camera of the model by name, or attributes of `mujoco.MjvCamera` that differ
+                from the scene's own view; None for that view.
 
         Raises:
             ValueError: If the model has no such camera or the size is not allowed.
@@ -99,15 +101,20 @@ def make_options() -> mujoco.MjvOption:
     return options
 
 
-def make_camera(scene: Scene, name: str | None) -> mujoco.MjvCamera:
-    """Returns a camera of the model by name, or the scene's own view for None.
+def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.MjvCamera:
+    """Returns a camera of the model by name, or the scene's own view with other attributes.
 
     Raises:
         ValueError: If there is none; the message lists those there are.
     """
     camera = mujoco.MjvCamera()
-    if name is None:
+    if name is None or isinstance(name, Mapping):
         scene.view.apply(camera)
+        for attribute, value in (name or {}).items():
+            if np.ndim(value):
+                getattr(camera, attribute)[:] = value
+            else:
+                setattr(camera, attribute, value)
         return camera
     names = [scene.model.camera(index).name for index in range(scene.model.ncam)]
     if name not in names:

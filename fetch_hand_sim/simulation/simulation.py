@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
-from fetch_hand_sim.simulation.tasks import make_task
+from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.commands import command_from_action
 from msgs_spec.observations import Readings
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind
@@ -58,7 +58,7 @@ class StepResult:
 
 
 class Simulation:
-    """N copies of one task on a pool of threads.
+    """N copies of one task on a pool of threads; pickled and copied with its state.
 
     Attributes:
         spec: The task as data.
@@ -77,6 +77,7 @@ class Simulation:
         reward_type: RewardType = 'sparse',
         success_rule: SuccessRule = 'gymnasium',
         control_hz: float = DEFAULT_CONTROL_HZ,
+        keeps_data: bool = False,
     ) -> None:
         """Compiles the model and prepares the copies; call `reset` before `step`.
 
@@ -87,6 +88,8 @@ class Simulation:
             reward_type: `sparse` or `dense`.
             success_rule: `gymnasium` (released code) or `paper` (its text).
             control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
+            keeps_data: Whether each copy keeps an `MjData` of its own, which `read_data` then
+                gives as MuJoCo left it.
 
         Raises:
             ValueError: If an argument is not allowed; the message says what is.
@@ -96,8 +99,15 @@ class Simulation:
         if num_threads < 0:
             raise ValueError(f'num_threads must be 0 (all processors) or more, not {num_threads}')
         self._task = make_task(
-            task, num_envs=num_envs, num_threads=num_threads, control_hz=control_hz
+            task,
+            num_envs=num_envs,
+            num_threads=num_threads,
+            control_hz=control_hz,
+            keeps_data=keeps_data,
         )
+        self._num_threads = num_threads
+        self._keeps_data = keeps_data
+        self._model_may_change = False
         self.spec = self._task.spec
         self.num_envs = num_envs
         self.control_hz = control_hz
@@ -107,6 +117,11 @@ class Simulation:
         self.goals = np.zeros((num_envs, self.spec.goal.size))
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._all = np.arange(num_envs)
+
+    @property
+    def task(self) -> Task:
+        """The physics of the task."""
+        return self._task
 
     @property
     def model(self) -> Any:
@@ -121,6 +136,19 @@ class Simulation:
     def data(self, index: int) -> Any:
         """A copy of simulation `index` as a `mujoco.MjData`, to render or inspect."""
         return self._task.batch.get_data(index)
+
+    def read_data(self, index: int, data: Any) -> None:
+        """Writes simulation `index` into a `mujoco.MjData`; what is derived needs `keeps_data`."""
+        self._task.read_data(index, data)
+
+    def write_data(self, index: int, data: Any) -> None:
+        """Lets simulation `index` go on from a `mujoco.MjData`, changed by whoever had it."""
+        self._task.write_data(index, data)
+
+    def apply_model_changes(self) -> None:
+        """Steps with `model` as it is now; the simulation keeps a copy of its own."""
+        self._model_may_change = True
+        self._task.batch.set_models(self.model)
 
     @property
     def tick_duration(self) -> float:
@@ -242,6 +270,38 @@ class Simulation:
     def observe(self) -> Observation:
         """The observation as it is now, fresh arrays."""
         return self._observe()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Arguments and everything that decides the future, for `pickle` and `copy.deepcopy`."""
+        return {
+            'arguments': {
+                'task': self.spec.name,
+                'num_envs': self.num_envs,
+                'num_threads': self._num_threads,
+                'control_hz': self.control_hz,
+                'keeps_data': self._keeps_data,
+            },
+            'model': self.model if self._model_may_change else None,
+            'metric': self.metric,
+            'physics': self._task.physics_state(),
+            'goals': self.goals.copy(),
+            'generators': self._generators,
+            'divergences': self.divergences,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Compiles the model again and goes on from the state, to the same bits."""
+        Simulation.__init__(self, **state['arguments'])
+        if state['model'] is not None:
+            self._task.batch.set_models(state['model'])
+            self._task.batch.get_model(0, self.model)
+            self.apply_model_changes()
+        self.metric = state['metric']
+        self._task.set_physics_state(state['physics'])
+        self._warnings = self._count_warnings()
+        self.goals[:] = state['goals']
+        self._generators = state['generators']
+        self.divergences = state['divergences']
 
     def observe_from(self, readings: Readings) -> Observation:
         """The observation of what `readings` returned."""

@@ -23,6 +23,7 @@ from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
 from fetch_hand_sim.simulation.tasks.task import (
     Array,
+    BatchConfig,
     Generators,
     Ids,
     Task,
@@ -110,9 +111,15 @@ FETCH_CONFIGS = {
 
 
 class FetchTask(Task):
-    """FetchReach, FetchPush, FetchSlide, FetchPickAndPlace."""
+    """FetchReach, FetchPush, FetchSlide, FetchPickAndPlace.
 
-    def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
+    Attributes:
+        config: In what they differ.
+        gripper_start: (3,) where the gripper is at a reset, m, world.
+        object_height: Where the object's centre is then, m; only with an object.
+    """
+
+    def __init__(self, spec: TaskSpec, batch: BatchConfig) -> None:
         """Lets the robot settle once and keeps that state as the start of every episode."""
         self.config = FETCH_CONFIGS[spec.name]
         mjcf = load_spec(self.config.asset)
@@ -120,7 +127,7 @@ class FetchTask(Task):
         model = mjcf.compile()
         skip_unread_stages(model)
         self._settle(model, spec)
-        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
+        super().__init__(spec, model, batch)
         sites = {'end_effector': 'robot0:grip'}
         if spec.has_object:
             sites['object'] = 'object0'
@@ -132,9 +139,9 @@ class FetchTask(Task):
         self._mocap_pos = self.batch.bind('mocap_pos')
         self._mocap_quat = self.batch.bind('mocap_quat')
         gripper_body = model.body('robot0:gripper_link').id
-        self._gripper_xpos = self.batch.bind('xpos')[:, gripper_body]
-        self._gripper_xquat = self.batch.bind('xquat')[:, gripper_body]
-        self.batch.state[:] = self._start_state
+        self._gripper_xpos = self.output('xpos')[:, gripper_body]
+        self._gripper_xquat = self.output('xquat')[:, gripper_body]
+        self.batch.state[:] = self.start_state
 
     def _settle(self, model: mujoco.MjModel, spec: TaskSpec) -> None:
         """Drives the gripper to its start and records the state after a reset."""
@@ -150,13 +157,13 @@ class FetchTask(Task):
         data.mocap_pos[0] = target + data.site('robot0:grip').xpos
         data.mocap_quat[0] = _GRIPPER_ROTATION
         mujoco.mj_step(model, data, nstep=_SETTLING_SUBSTEPS)
-        self._gripper_start: Array = data.site('robot0:grip').xpos.copy()
+        self.gripper_start: Array = data.site('robot0:grip').xpos.copy()
         if spec.has_object:
-            self._object_height = float(data.site('object0').xpos[2])
+            self.object_height = float(data.site('object0').xpos[2])
         time, qpos, qvel = data.time, data.qpos.copy(), data.qvel.copy()
         mujoco.mj_resetData(model, data)
         data.time, data.qpos[:], data.qvel[:] = time, qpos, qvel
-        self._start_state = integration_state(model, data)
+        self.start_state = integration_state(model, data)
 
     @property
     def asset(self) -> str:
@@ -165,29 +172,30 @@ class FetchTask(Task):
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Restores the settled state, places the objects, samples goals."""
-        self.batch.state[ids] = self._start_state
+        self.batch.state[ids] = self.start_state
         if self.spec.has_object:
             places = [self._sample_object_place(generator) for generator in generators]
             start = joint_qpos_slice(self.model, 'object0:joint').start
             self._qpos[ids, start : start + 2] = places
         self.batch.forward(ids)
-        return np.array([self._sample_goal(generator) for generator in generators])
+        return self.sample_goals(ids, generators)
 
     def _sample_object_place(self, generator: np.random.Generator) -> Array:
         reach = self.config.object_range
-        center = self._gripper_start[:2]
+        center = self.gripper_start[:2]
         place = center
         while np.linalg.norm(place - center) < _OBJECT_CLEARANCE:
             place = center + generator.uniform(-reach, reach, size=2)
         return place
 
-    def _sample_goal(self, generator: np.random.Generator) -> Array:
+    def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
+        """Draws a point around the gripper's start, on the table or, for some tasks, above it."""
         config = self.config
         reach = config.target_range
-        goal = self._gripper_start + generator.uniform(-reach, reach, size=3)
+        goal = self.gripper_start + generator.uniform(-reach, reach, size=3)
         if self.spec.has_object:
             goal += config.target_offset
-            goal[2] = self._object_height
+            goal[2] = self.object_height
             if config.target_in_the_air and generator.uniform() < 0.5:
                 goal[2] += generator.uniform(0, 0.45)
         return np.asarray(goal)
@@ -236,17 +244,17 @@ class _SiteReader:
     """Pose and velocity of a site, as MuJoCo computed them in its last pass."""
 
     def __init__(self, task: FetchTask, site_name: str) -> None:
-        model, batch = task.model, task.batch
+        model = task.model
         site = model.site(site_name).id
         body = int(model.site_bodyid[site])
         self._site_quaternion = model.site_quat[site].copy()
         self._site_aligned = bool((self._site_quaternion == [1.0, 0.0, 0.0, 0.0]).all())
         self._dofs = _chain_dofs(model, body)
-        self._position: Array = batch.bind('site_xpos')[:, site]
-        self._body_quaternion: Array = batch.bind('xquat')[:, body]
-        self._center = batch.bind('subtree_com')[:, int(model.body_rootid[body])]
-        self._cdof = batch.bind('cdof')
-        self._qvel = batch.bind('qvel')
+        self._position: Array = task.output('site_xpos')[:, site]
+        self._body_quaternion: Array = task.output('xquat')[:, body]
+        self._center = task.output('subtree_com')[:, int(model.body_rootid[body])]
+        self._cdof = task.output('cdof')
+        self._qvel = task.batch.bind('qvel')
 
     def pose(self) -> Array:
         """World position and orientation wxyz, (N, 7)."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.model_tuning import list_geom_pairs, skip_unread_stages
 from fetch_hand_sim.simulation.models import load_spec
-from fetch_hand_sim.simulation.tasks.task import Array, Task
+from fetch_hand_sim.simulation.tasks.task import Array, BatchConfig, Task
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import TaskSpec
 
@@ -30,19 +30,11 @@ def fingertip_sites(model: mujoco.MjModel) -> NDArray[np.intp]:
 class HandTask(Task):
     """Base of the hand tasks."""
 
-    def __init__(
-        self,
-        spec: TaskSpec,
-        model: mujoco.MjModel,
-        *,
-        num_envs: int,
-        num_threads: int,
-        substeps: int,
-    ) -> None:
+    def __init__(self, spec: TaskSpec, model: mujoco.MjModel, batch: BatchConfig) -> None:
         """Binds controls and fingertip positions."""
-        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
+        super().__init__(spec, model, batch)
         self._ctrl: Array = self.batch.bind('ctrl')
-        self._site_xpos: Array = self.batch.bind('site_xpos')
+        self._site_xpos: Array = self.output('site_xpos')
         self._fingertip_sites = fingertip_sites(model)
         self._sensors['fingertip_poses'] = self._fingertips
 

@@ -18,6 +18,7 @@ from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRul
 from fetch_hand_sim.simulation.tasks.hand import HandTask, load_hand_model
 from fetch_hand_sim.simulation.tasks.task import (
     Array,
+    BatchConfig,
     Generators,
     Ids,
     integration_state,
@@ -42,7 +43,7 @@ PALM_HEIGHT = 0.04
 _SETTLING_TICKS = 10
 _POSITION_SCATTER = 0.005
 # Box around the object in which `Full` goals lie, metres.
-_TARGET_RANGE = np.array([(-0.04, 0.04), (-0.06, 0.02), (0.0, 0.06)])
+TARGET_RANGE = np.array([(-0.04, 0.04), (-0.06, 0.02), (0.0, 0.06)])
 _Z_AXIS = np.array([0.0, 0.0, 1.0])
 
 
@@ -76,17 +77,22 @@ MANIPULATE_CONFIGS = {
 
 
 class HandManipulateTask(HandTask):
-    """HandManipulateBlock*, HandManipulateEgg*, HandManipulatePen*."""
+    """HandManipulateBlock*, HandManipulateEgg*, HandManipulatePen*.
 
-    def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
+    Attributes:
+        config: In what they differ.
+        parallel_quaternions: (24, 4) wxyz, the rotations that map a cube to itself.
+    """
+
+    def __init__(self, spec: TaskSpec, batch: BatchConfig) -> None:
         """Keeps the fresh state, from which every episode starts."""
         self.config = MANIPULATE_CONFIGS[spec.name]
         model = load_hand_model(self.config.asset)
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        self._start_state = integration_state(model, data)
+        self.start_state = integration_state(model, data)
         self._start_qpos = data.qpos.copy()
-        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
+        super().__init__(spec, model, batch)
         self._object_qpos = self._qpos[:, joint_qpos_slice(model, _OBJECT_JOINT)]
         self._object_qvel = self._qvel[:, joint_qvel_slice(model, _OBJECT_JOINT)]
         self._sensors |= {
@@ -96,8 +102,8 @@ class HandManipulateTask(HandTask):
         }
         self._object_site = model.site(_OBJECT_SITE).id
         self._resting_command = resting_command(spec.robot)
-        self._parallel_quaternions = euler_to_quaternion(_parallel_rotations())
-        self.batch.state[:] = self._start_state
+        self.parallel_quaternions = euler_to_quaternion(_parallel_rotations())
+        self.batch.state[:] = self.start_state
 
     @property
     def asset(self) -> str:
@@ -110,7 +116,7 @@ class HandManipulateTask(HandTask):
         A try that fails is followed by another from the same controls and warm start, as in the
         reference.
         """
-        self.batch.state[ids] = self._start_state
+        self.batch.state[ids] = self.start_state
         generator_of = dict(zip(ids.tolist(), generators, strict=True))
         left = ids
         while left.size:
@@ -121,7 +127,7 @@ class HandManipulateTask(HandTask):
             self.batch.forward(left)
             height = self._site_xpos[left, self._object_site, 2]
             left = left[~(height > PALM_HEIGHT)]
-        return np.array([self._sample_goal(i, generator_of[i]) for i in ids.tolist()])
+        return self.sample_goals(ids, generators)
 
     def _start_again(self, ids: Ids) -> None:
         self.batch.bind('time')[ids] = 0.0
@@ -148,13 +154,14 @@ class HandManipulateTask(HandTask):
         about_z = quaternion_from_axis_angle(_Z_AXIS, angle)
         if self.config.target_rotation == 'z':
             return about_z
-        faces = self._parallel_quaternions
+        faces = self.parallel_quaternions
         return quaternion_multiply(about_z, faces[generator.integers(len(faces))])
 
-    def _sample_goal(self, index: int, generator: np.random.Generator) -> Array:
+    def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
+        """Draws a pose: where the object is now, moved for some tasks, and turned."""
         position = self._object_qpos[index, :3].copy()
         if self.spec.position_counts:
-            position += generator.uniform(_TARGET_RANGE[:, 0], _TARGET_RANGE[:, 1])
+            position += generator.uniform(TARGET_RANGE[:, 0], TARGET_RANGE[:, 1])
         quaternion = self._sample_rotation(generator)
         return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
 

@@ -7,7 +7,13 @@ import numpy as np
 
 from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
 from fetch_hand_sim.simulation.tasks.hand import HandTask, fingertip_sites, load_hand_model
-from fetch_hand_sim.simulation.tasks.task import Array, Generators, Ids, integration_state
+from fetch_hand_sim.simulation.tasks.task import (
+    Array,
+    BatchConfig,
+    Generators,
+    Ids,
+    integration_state,
+)
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import TaskSpec
 
@@ -49,20 +55,25 @@ _INITIAL_QPOS = {
 
 
 class HandReachTask(HandTask):
-    """HandReach."""
+    """HandReach.
 
-    def __init__(self, spec: TaskSpec, *, num_envs: int, num_threads: int, substeps: int) -> None:
+    Attributes:
+        start_fingertips: (5, 3) where the fingertips are at a reset, m, world.
+        palm: (3,) where the palm is, m, world.
+    """
+
+    def __init__(self, spec: TaskSpec, batch: BatchConfig) -> None:
         """Keeps the initial pose, its fingertips and the palm, from which goals are made."""
         model = load_hand_model(REACH_ASSET)
         data = mujoco.MjData(model)
         for joint, value in _INITIAL_QPOS.items():
             data.joint(joint).qpos = value
-        self._start_state = integration_state(model, data)
+        self.start_state = integration_state(model, data)
         mujoco.mj_forward(model, data)
-        self._start_fingertips: Array = data.site_xpos[fingertip_sites(model)].copy()
-        self._palm = data.body('robot0:palm').xpos.copy()
-        super().__init__(spec, model, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
-        self.batch.state[:] = self._start_state
+        self.start_fingertips: Array = data.site_xpos[fingertip_sites(model)].copy()
+        self.palm = data.body('robot0:palm').xpos.copy()
+        super().__init__(spec, model, batch)
+        self.batch.state[:] = self.start_state
 
     @property
     def asset(self) -> str:
@@ -71,22 +82,23 @@ class HandReachTask(HandTask):
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Restores the initial pose and samples goals."""
-        self.batch.state[ids] = self._start_state
+        self.batch.state[ids] = self.start_state
         self.batch.forward(ids)
-        return np.array([self._sample_goal(generator) for generator in generators])
+        return self.sample_goals(ids, generators)
 
-    def _sample_goal(self, generator: np.random.Generator) -> Array:
+    def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
+        """Draws where thumb and one finger meet, or now and then the initial pose."""
         fingers, thumb = list(FINGERTIPS[:-1]), len(FINGERTIPS) - 1
         finger = fingers.index(str(generator.choice(fingers)))
-        meeting = self._palm + _MEETING_OFFSET
+        meeting = self.palm + _MEETING_OFFSET
         meeting += generator.normal(scale=_MEETING_SCATTER, size=3)
-        goal = self._start_fingertips.copy()
+        goal = self.start_fingertips.copy()
         for index in (thumb, finger):
             direction = meeting - goal[index]
             direction /= np.linalg.norm(direction)
             goal[index] = meeting - _MEETING_GAP * direction
         if generator.uniform() < _PROBABILITY_OF_INITIAL_POSE:
-            goal = self._start_fingertips
+            goal = self.start_fingertips
         return goal.flatten()
 
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:

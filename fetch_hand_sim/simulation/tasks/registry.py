@@ -5,7 +5,7 @@ from __future__ import annotations
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
 from fetch_hand_sim.simulation.tasks.hand_reach import REACH_ASSET, HandReachTask
-from fetch_hand_sim.simulation.tasks.task import Task
+from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, substeps_per_tick, task_spec
 
 
@@ -15,6 +15,7 @@ def make_task(
     num_envs: int = 1,
     num_threads: int = 0,
     control_hz: float = DEFAULT_CONTROL_HZ,
+    keeps_data: bool = False,
 ) -> Task:
     """Compiles a task's model and starts its simulations.
 
@@ -23,12 +24,13 @@ def make_task(
         num_envs: Number of simulations.
         num_threads: Threads that step them; 0 for all processors.
         control_hz: Actions per simulated second.
+        keeps_data: Whether each simulation keeps an `MjData` of its own.
 
     Raises:
         ValueError: If the task is unknown or the rate is not a whole number of substeps.
     """
     spec = task_spec(name)
-    substeps = substeps_per_tick(control_hz)
+    batch = BatchConfig(num_envs, num_threads, substeps_per_tick(control_hz), keeps_data)
     family: type[FetchTask] | type[HandReachTask] | type[HandManipulateTask]
     if spec.name in FETCH_CONFIGS:
         family = FetchTask
@@ -36,7 +38,7 @@ def make_task(
         family = HandReachTask
     else:
         family = HandManipulateTask
-    return family(spec, num_envs=num_envs, num_threads=num_threads, substeps=substeps)
+    return family(spec, batch)
 
 
 def task_asset(name: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -20,39 +21,83 @@ Ids = NDArray[np.intp]
 Generators = Sequence[np.random.Generator]
 
 
+@dataclass(frozen=True, slots=True)
+class BatchConfig:
+    """How many simulations of a task, and how they are stepped.
+
+    Attributes:
+        num_envs: Number of simulations N.
+        num_threads: Threads that step them; 0 for all processors.
+        substeps: Physics steps per action.
+        keeps_data: Whether each simulation keeps an `MjData` of its own, so that all that MuJoCo
+            computes can be read, at the cost of its memory.
+    """
+
+    num_envs: int = 1
+    num_threads: int = 0
+    substeps: int = 20
+    keeps_data: bool = False
+
+    @property
+    def threads(self) -> int:
+        """Threads of the pool: never more than simulations."""
+        return min(self.num_threads, self.num_envs) if self.num_threads else 0
+
+
+@dataclass(frozen=True, slots=True)
+class PhysicsState:
+    """All that the next tick and the next observation depend on.
+
+    Attributes:
+        rows: (N, state size), `mjSTATE_INTEGRATION` of each simulation.
+        outputs: What MuJoCo derived in its last pass and the task reads, by the name in `MjData`,
+            each (N, ...): after a step it is one substep older than the rows.
+    """
+
+    rows: Array
+    outputs: dict[str, Array]
+
+
 class Task(ABC):
-    """One task on `num_envs` simulations.
+    """One task on a batch of simulations.
 
     Subclasses fill in the physics of a family. All arrays have the simulation as leading axis.
+
+    Attributes:
+        spec: The task as data.
+        model: The compiled `mujoco.MjModel`; the batch steps with a copy.
+        batch: The simulations.
+        substeps: Physics steps per action.
+        tick_duration: Simulated seconds per action.
+        start_state: (state size,) `mjSTATE_INTEGRATION` in which episodes start, before anything
+            is drawn.
     """
+
+    start_state: Array
 
     def __init__(
         self,
         spec: TaskSpec,
         model: mujoco.MjModel,
-        *,
-        num_envs: int,
-        num_threads: int,
-        substeps: int,
+        batch: BatchConfig,
     ) -> None:
-        """Compiles the model and starts the batch.
+        """Starts the batch.
 
         Args:
             spec: The task.
             model: Its compiled model.
-            num_envs: Number of simulations.
-            num_threads: Threads that step them; 0 for all processors.
-            substeps: Physics steps per action.
+            batch: How many simulations, and how they are stepped.
         """
         prepare_engine()
         self.spec = spec
-        self.substeps = substeps
+        self.substeps = batch.substeps
         self.model = model
-        self.tick_duration = substeps * float(model.opt.timestep)
-        self.batch = Batch(model, num_envs, min(num_threads, num_envs) if num_threads else 0)
+        self.tick_duration = batch.substeps * float(model.opt.timestep)
+        self.batch = Batch(model, batch.num_envs, batch.threads, batch.keeps_data)
+        self._outputs: dict[str, Array] = {}
         self._qpos: Array = self.batch.bind('qpos')
         self._qvel: Array = self.batch.bind('qvel')
-        self._actuator_force: Array = self.batch.bind('qfrc_actuator')
+        self._actuator_force = self.output('qfrc_actuator')
         joints = [model.joint(name) for name in spec.robot.joints]
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._joint_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
@@ -78,6 +123,15 @@ class Task(ABC):
         """
 
     @abstractmethod
+    def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
+        """Draws a goal (goal size,) for simulation `index` as it is now."""
+
+    def sample_goals(self, ids: Ids, generators: Generators) -> Array:
+        """Draws goals (n, goal size), one simulation after the other."""
+        pairs = zip(ids.tolist(), generators, strict=True)
+        return np.array([self.sample_goal(index, generator) for index, generator in pairs])
+
+    @abstractmethod
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
         """Writes commands (N, action size), in command units and within limits, to the physics."""
 
@@ -92,6 +146,48 @@ class Task(ABC):
     def step(self) -> None:
         """Advances all simulations by one tick under the commands applied last."""
         self.batch.step(nstep=self.substeps)
+
+    def output(self, name: str) -> Array:
+        """Binds a derived field of `MjData`, (N, ...), live and read-only: `xpos`, `cdof`, ..."""
+        self._outputs[name] = self.batch.bind(name)
+        return self._outputs[name]
+
+    def physics_state(self) -> PhysicsState:
+        """Returns a copy of the state and of what was derived from it."""
+        outputs = {name: values.copy() for name, values in self._outputs.items()}
+        return PhysicsState(self.batch.state.copy(), outputs)
+
+    def set_physics_state(self, state: PhysicsState) -> None:
+        """Goes on from a state as `physics_state` gave it, to the same bits."""
+        self.batch.state[:] = state.rows
+        # Fills the data that simulations keep; its warm start is not theirs.
+        self.batch.forward()
+        self.batch.state[:] = state.rows
+        for name in self._outputs:
+            self._write_output(name, slice(None), state.outputs[name])
+
+    def new_data(self, state: Array) -> mujoco.MjData:
+        """Returns an `MjData` in a state (state size,), nothing derived from it yet."""
+        data = mujoco.MjData(self.model)
+        mujoco.mj_setState(self.model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
+        return data
+
+    def read_data(self, index: int, data: mujoco.MjData) -> None:
+        """Writes simulation `index` into `data`; what is derived needs `keeps_data`."""
+        self.batch.get_data(index, data)
+
+    def write_data(self, index: int, data: mujoco.MjData) -> None:
+        """Lets simulation `index` go on from `data`, as if it had stepped that itself."""
+        self.batch.state[index] = integration_state(self.model, data)
+        for name in self._outputs:
+            self._write_output(name, index, getattr(data, name))
+
+    def _write_output(self, name: str, where: int | slice, values: Array) -> None:
+        # Read-only since the next call overwrites it; until then it is what the task reads.
+        output = self._outputs[name]
+        output.flags.writeable = True
+        output[where] = values
+        output.flags.writeable = False
 
     def readings(self, names: Iterable[str] = ()) -> Readings:
         """Returns what the sensors say, fresh arrays.

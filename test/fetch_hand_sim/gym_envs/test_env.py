@@ -12,6 +12,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3 import DDPG, HerReplayBuffer
 
+from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.gym_envs.registration import environment_id
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import TASKS
@@ -99,9 +100,7 @@ def test_bad_resets_move_nothing(arguments, error, message):
     assert state_of(env) == before
 
 
-@pytest.mark.parametrize(
-    'action', [np.zeros(3), np.full(4, np.nan), np.full(4, 1.01), np.zeros((1, 4))]
-)
+@pytest.mark.parametrize('action', [np.zeros(3), np.full(4, np.nan), np.zeros((1, 4)), 'up'])
 def test_bad_actions_move_nothing(action):
     env = make('FetchPush').unwrapped
     env.reset(seed=0)
@@ -109,6 +108,17 @@ def test_bad_actions_move_nothing(action):
     with pytest.raises(ValueError, match='actions'):
         env.step(action)
     assert state_of(env) == before
+
+
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_actions_out_of_range_are_clipped(dtype):
+    first, second = make('FetchPush'), make('HandReach')
+    for env in (first, second):
+        size = env.action_space.shape
+        env.reset(seed=0)
+        clipped = env.step(np.ones(size, dtype=dtype))[0]['observation']
+        env.reset(seed=0)
+        assert np.array_equal(env.step(np.full(size, 3, dtype=dtype))[0]['observation'], clipped)
 
 
 def test_a_diverged_episode_is_truncated():
@@ -164,26 +174,60 @@ def test_importing_the_package_registers_without_mujoco():
     assert result.stdout.split() == [environment_id(task) for task in TASKS], result.stderr
 
 
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        ({'render_mode': 'ansi'}, "'ansi' is not known; allowed: None, human, rgb_array, depth_"),
+        ({'height': 0}, 'height must be at least 1 pixel, not 0'),
+        ({'default_camera_config': {'zoom': 2}}, "'zoom' is not known; allowed: azimuth,"),
+        ({'distance_threshold': float('nan')}, 'must be a number of at least 0, not nan'),
+    ],
+)
+def test_bad_pictures_are_refused_before_they_are_drawn(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        FetchHandEnv('FetchReach', **arguments)
+
+
 RENDER = (
     'import gymnasium, numpy as np\n'
-    'env = gymnasium.make("fetch_hand_sim:fetch_hand_sim/{task}-v0", render_mode="rgb_array")\n'
+    'env = gymnasium.make("fetch_hand_sim:fetch_hand_sim/{task}-v0", {arguments})\n'
     'env.reset(seed=0)\n'
     'try:\n'
-    '    picture = env.render()\n'
+    '    env.step(env.action_space.sample())\n'
+    '    picture = np.asarray(env.render())\n'
     'except RuntimeError as error:\n'
     '    print(str(error)[:80])\n'
     'else:\n'
-    '    print(picture.shape, picture.dtype, picture.std() > 10)\n'
+    '    print(picture.shape, picture.dtype, picture.std() > {spread})\n'
     'env.close()\n'
 )
 
 
-@pytest.mark.parametrize('task', ['FetchReach', 'HandReach', 'HandManipulateEggFull'])
-def test_rendering_gives_a_picture_or_says_what_it_needs(task, monkeypatch):
+@pytest.mark.parametrize(
+    ('task', 'arguments', 'spread', 'picture'),
+    [
+        ('FetchReach', 'render_mode="rgb_array"', 10, '(480, 640, 3) uint8 True'),
+        ('HandReach', 'render_mode="rgb_array_list"', 10, '(2, 480, 640, 3) uint8 True'),
+        (
+            'HandManipulateEggFull',
+            'render_mode="rgb_array", width=800, height=60',
+            10,
+            '(60, 800, 3) uint8 True',
+        ),
+        (
+            'FetchPush',
+            'render_mode="depth_array", default_camera_config={"distance": 1.0}',
+            0.1,
+            '(480, 640) float32 True',
+        ),
+    ],
+)
+def test_rendering_gives_a_picture_or_says_what_it_needs(
+    task, arguments, spread, picture, monkeypatch
+):
     monkeypatch.setenv('MUJOCO_GL', 'egl')
-    code = RENDER.format(task=task)
+    code = RENDER.format(task=task, arguments=arguments, spread=spread)
     result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    picture = '(480, 640, 3) uint8 True'
     reason = (
         'rendering needs OpenGL: apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6'
     )
@@ -194,6 +238,15 @@ def test_without_opengl_rendering_says_what_it_needs(monkeypatch):
     monkeypatch.delenv('DISPLAY', raising=False)
     monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
     monkeypatch.setenv('MUJOCO_GL', 'disabled')
-    code = RENDER.format(task='FetchReach')
+    code = RENDER.format(task='FetchReach', arguments='render_mode="rgb_array"', spread=0)
     result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
     assert result.stdout.startswith('rendering needs OpenGL'), result.stderr
+
+
+def test_without_a_display_a_window_says_what_it_needs(monkeypatch):
+    monkeypatch.delenv('DISPLAY', raising=False)
+    monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
+    code = RENDER.format(task='FetchReach', arguments='render_mode="human"', spread=0)
+    code = code.replace('env.reset', 'pass #').replace('    picture', '    env.reset(); picture')
+    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert result.stdout.startswith("render_mode 'human' needs a display"), result.stderr

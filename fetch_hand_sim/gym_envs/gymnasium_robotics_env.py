@@ -1,0 +1,326 @@
+"""The tasks as code written for Gymnasium-Robotics 1.4.2 expects them.
+
+Names, types and defaults are the reference's (`robot_env.py`, `fetch_env.py`, `reach.py`,
+`manipulate.py`). Left out are the hooks that its subclasses override; `docs/gymnasium_robotics.md`
+lists what is equal and what differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fetch_hand_sim.gym_envs.env import FetchHandEnv
+from fetch_hand_sim.gym_envs.goal_env import import_goal_env
+from fetch_hand_sim.gym_envs.pictures import RENDER_MODES
+from fetch_hand_sim.simulation import Observation
+from fetch_hand_sim.simulation.models import asset_path
+from fetch_hand_sim.simulation.rewards import RewardType
+from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
+from fetch_hand_sim.simulation.tasks.hand_manipulate import (
+    MANIPULATE_CONFIGS,
+    TARGET_RANGE,
+    HandManipulateTask,
+)
+from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
+from msgs_spec.tasks import GoalKind, task_spec
+
+if TYPE_CHECKING:
+    GoalEnv = gymnasium.Env[Observation, NDArray[np.float32]]
+else:
+    GoalEnv = import_goal_env()
+
+Array = NDArray[np.float64]
+
+# Pixels, and the cameras of `fetch_env.py` and `hand_env.py`.
+_SIZE = 480
+_CAMERAS: dict[str, dict[str, Any]] = {
+    'fetch': {
+        'distance': 2.5,
+        'azimuth': 132.0,
+        'elevation': -14.0,
+        'lookat': np.array([1.3, 0.75, 0.55]),
+    },
+    'shadow_hand': {
+        'distance': 0.5,
+        'azimuth': 55.0,
+        'elevation': -25.0,
+        'lookat': np.array([1.0, 0.96, 0.14]),
+    },
+}
+
+
+class RobotEnv(FetchHandEnv, GoalEnv):
+    """What all Fetch and hand environments of the reference have (`robot_env.py`).
+
+    Attributes:
+        n_substeps: Physics steps per action.
+        initial_time: Simulated time at which episodes start, s.
+        initial_qpos: Joint positions from which they start, before anything is drawn.
+        initial_qvel: Joint velocities likewise.
+        fullpath: The MJCF file.
+    """
+
+    metadata = {'render_modes': RENDER_MODES, 'render_fps': 25}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str,
+        reward_type: RewardType = 'sparse',
+        render_mode: str | None = None,
+        width: int = _SIZE,
+        height: int = _SIZE,
+        default_camera_config: Mapping[str, Any] | None = None,
+        **arguments: Any,
+    ) -> None:
+        """Compiles the model; arguments as `FetchHandEnv` has them."""
+        self._camera = {**_CAMERAS[task_spec(task).robot.name], **(default_camera_config or {})}
+        self._mujoco_renderer: Any = None
+        super().__init__(
+            task,
+            reward_type=reward_type,
+            render_mode=render_mode,
+            width=width,
+            height=height,
+            default_camera_config=self._camera,
+            **arguments,
+        )
+        physics = self.simulation.task
+        start = physics.new_data(physics.start_state)
+        self._state(
+            n_substeps=physics.substeps,
+            initial_time=float(start.time),
+            initial_qpos=start.qpos.copy(),
+            initial_qvel=start.qvel.copy(),
+            fullpath=str(asset_path(physics.asset)),
+        )
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuses to change what would have no effect."""
+        if name in self.__dict__.get('_stated', ()):
+            raise AttributeError(
+                f'{name} of {self.spec_of_task.name} is fixed; for other values write a task of '
+                'your own (docs/own_task.md)'
+            )
+        super().__setattr__(name, value)
+
+    def _state(self, **facts: Any) -> None:
+        """Makes facts about the task attributes that cannot be changed."""
+        stated: frozenset[str] = self.__dict__.get('_stated', frozenset())
+        self.__dict__.update(facts)
+        self.__dict__['_stated'] = stated | facts.keys()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts an episode; options are ignored, as the reference does."""
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
+        """Advances one tick, with the reference's types: sparse rewards and successes float32."""
+        observation, reward, terminated, truncated, info = super().step(action)
+        info['is_success'] = np.float32(info['is_success'])
+        return observation, self._as_reference(np.float64(reward)), terminated, truncated, info
+
+    def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
+        """Reward of goals of any batch shape: float32 if sparse, a number for a single goal."""
+        return self._as_reference(super().compute_reward(achieved_goal, goal, info)[()])
+
+    @property
+    def has_object(self) -> bool:
+        """Whether there is an object beside the robot."""
+        return self.spec_of_task.has_object
+
+    @property
+    def mujoco_renderer(self) -> Any:
+        """Gymnasium's renderer of `model` and `data`, without markers of the goal."""
+        if self._mujoco_renderer is None:
+            from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+
+            self._mujoco_renderer = MujocoRenderer(
+                self.model, self.data, self._camera, width=self.width, height=self.height
+            )
+        return self._mujoco_renderer
+
+    def close(self) -> None:
+        """Frees renderers and window."""
+        super().close()
+        if self._mujoco_renderer is not None:
+            self._mujoco_renderer.close()
+            self._mujoco_renderer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """As `FetchHandEnv`, without OpenGL."""
+        return super().__getstate__() | {'_mujoco_renderer': None}
+
+    def _as_reference(self, reward: Any) -> Any:
+        return reward.astype(np.float32) if self.reward_type == 'sparse' else reward
+
+    def _get_obs(self) -> Observation:
+        self._physics.send()
+        return {name: rows[0] for name, rows in self.simulation.observe().items()}
+
+    def _get_achieved_goal(self) -> Array:
+        return self._get_obs()['achieved_goal']
+
+    def _is_success(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> Any:
+        return self.simulation.compute_success(achieved_goal, desired_goal).astype(np.float32)[()]
+
+    def _sample_goal(self) -> Array:
+        return self.simulation.task.sample_goal(0, self.np_random)
+
+
+class FetchEnv(RobotEnv):
+    """`fetch_env.py`: FetchReach, FetchPush, FetchSlide, FetchPickAndPlace.
+
+    Attributes:
+        initial_gripper_xpos: (3,) where the gripper starts, m.
+        height_offset: Where the object's centre rests, m; only with an object.
+        gripper_extra_height: Added to the gripper's starting height, m.
+        block_gripper: Whether the fingers are locked shut.
+        target_in_the_air: Whether goals may be above the table.
+        target_offset: Added to goals, (3,) m, or 0.
+        obj_range: Half width of the square in which the object starts, m.
+        target_range: Half width of the cube in which goals lie, m.
+    """
+
+    def __init__(self, task: str, **arguments: Any) -> None:
+        """Compiles the model; arguments as `FetchHandEnv` has them."""
+        super().__init__(task, **arguments)
+        physics = self.simulation.task
+        assert isinstance(physics, FetchTask)
+        config = FETCH_CONFIGS[task]
+        offset = np.array(config.target_offset)
+        if self.has_object:
+            self._state(height_offset=np.float64(physics.object_height))
+        self._state(
+            initial_gripper_xpos=physics.gripper_start.copy(),
+            gripper_extra_height=config.gripper_extra_height,
+            block_gripper=config.block_gripper,
+            target_in_the_air=config.target_in_the_air or not self.has_object,
+            target_offset=offset if offset.any() else 0.0,
+            obj_range=config.object_range,
+            target_range=config.target_range,
+        )
+
+    def _get_gripper_xpos(self) -> Array:
+        return np.asarray(self.data.body('robot0:gripper_link').xpos)
+
+
+class HandReachEnv(RobotEnv):
+    """`shadow_dexterous_hand/reach.py`.
+
+    Attributes:
+        initial_goal: (15,) the fingertips of the initial pose, m.
+        palm_xpos: (3,) where the palm is, m.
+        relative_control: Never.
+    """
+
+    def __init__(self, task: str = 'HandReach', **arguments: Any) -> None:
+        """Compiles the model; arguments as `FetchHandEnv` has them."""
+        super().__init__(task, **arguments)
+        physics = self.simulation.task
+        assert isinstance(physics, HandReachTask)
+        self._state(
+            initial_goal=physics.start_fingertips.flatten(),
+            palm_xpos=physics.palm.copy(),
+            relative_control=False,
+        )
+
+
+class ManipulateEnv(RobotEnv):
+    """`shadow_dexterous_hand/manipulate.py`: block, egg and pen.
+
+    Attributes:
+        target_position: `random` where the position counts, else `ignore`.
+        target_rotation: Which rotations goals have: `z`, `parallel` or `xyz`.
+        target_position_range: (3, 2) the box around the object in which goals lie, m.
+        parallel_quats: The 24 rotations that map a cube to itself, wxyz.
+        ignore_z_target_rotation: Whether turns about the object's own z axis do not count.
+        randomize_initial_position: Always.
+        randomize_initial_rotation: Whether the object starts turned.
+        relative_control: Never.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        target_position: str | None = None,
+        target_rotation: str | None = None,
+        **arguments: Any,
+    ) -> None:
+        """Compiles the model.
+
+        Args:
+            task: The task.
+            target_position: `random` or `ignore`; None for the task's own.
+            target_rotation: `z`, `parallel` or `xyz`; None for the task's own.
+            **arguments: As `FetchHandEnv` has them.
+
+        Raises:
+            ValueError: If no task has such goals for this object; the message lists what is.
+        """
+        task = _task_with_goals(task, target_position, target_rotation)
+        super().__init__(task, **arguments)
+        physics = self.simulation.task
+        assert isinstance(physics, HandManipulateTask)
+        position, rotation = _goal_kind(task)
+        self._state(
+            target_position=position,
+            target_rotation=rotation,
+            target_position_range=TARGET_RANGE.copy(),
+            parallel_quats=list(physics.parallel_quaternions),
+            ignore_z_target_rotation=self.spec_of_task.ignores_z_rotation,
+            randomize_initial_position=True,
+            randomize_initial_rotation=physics.config.randomizes_rotation,
+            relative_control=False,
+        )
+
+    def _goal_distance(self, goal_a: ArrayLike, goal_b: ArrayLike) -> tuple[Any, Any]:
+        distance, rotation = self.simulation.metric.distances(goal_a, goal_b)
+        return distance[()], rotation[()]
+
+
+def make_env(task: str, **arguments: Any) -> RobotEnv:
+    """Makes the environment of a task as the reference has it.
+
+    Raises:
+        ValueError: If the task is unknown or an argument is not allowed.
+    """
+    spec = task_spec(task)
+    if task in FETCH_CONFIGS:
+        return FetchEnv(task, **arguments)
+    return (
+        HandReachEnv(task, **arguments)
+        if spec.goal is GoalKind.FINGERTIPS
+        else (ManipulateEnv(task, **arguments))
+    )
+
+
+def _goal_kind(task: str) -> tuple[str, str]:
+    """What the reference calls `target_position` and `target_rotation`."""
+    position = 'random' if task_spec(task).position_counts else 'ignore'
+    return position, MANIPULATE_CONFIGS[task].target_rotation
+
+
+def _task_with_goals(task: str, position: str | None, rotation: str | None) -> str:
+    """The task of the same object with other goals."""
+    own = _goal_kind(task)
+    wanted = (position or own[0], rotation or own[1])
+    asset = MANIPULATE_CONFIGS[task].asset
+    kinds = {
+        _goal_kind(name): name
+        for name, config in MANIPULATE_CONFIGS.items()
+        if config.asset == asset
+    }
+    if wanted not in kinds:
+        allowed = ', '.join(' and '.join(kind) for kind in kinds)
+        raise ValueError(
+            f'target_position {wanted[0]!r} and target_rotation {wanted[1]!r} are not there '
+            f'together; allowed: {allowed}'
+        )
+    return task if wanted == own else kinds[wanted]

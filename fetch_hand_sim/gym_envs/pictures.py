@@ -1,0 +1,140 @@
+"""What `render` of the environments gives, for every render mode."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.rendering import (
+    HEIGHT,
+    WIDTH,
+    SceneRenderer,
+    make_camera,
+    make_options,
+    simulation_frame,
+)
+from fetch_hand_sim.simulation.scene import Frame, Scene
+
+# `rgb_array_list` and other lists are made of these by `gymnasium.make`.
+RENDER_MODES = ['human', 'rgb_array', 'depth_array']
+
+
+class Pictures:
+    """Draws copies of a simulation; opens OpenGL or a window at the first picture."""
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        width: int = WIDTH,
+        height: int = HEIGHT,
+        camera: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Keeps what pictures are to be like.
+
+        Args:
+            simulation: What to draw.
+            width: Pixels.
+            height: Pixels.
+            camera: Attributes of `mujoco.MjvCamera`; None for the task's view.
+
+        Raises:
+            ValueError: If the size is not positive or the camera has no such attribute.
+        """
+        for name, side in (('width', width), ('height', height)):
+            if side < 1:
+                raise ValueError(f'{name} must be at least 1 pixel, not {side}')
+        known = [name for name in dir(mujoco.MjvCamera) if not name.startswith('_')]
+        for name in camera or {}:
+            if name not in known:
+                allowed = ', '.join(known)
+                raise ValueError(
+                    f'default_camera_config: {name!r} is not known; allowed: {allowed}'
+                )
+        self._simulation = simulation
+        self._size = (width, height)
+        self._camera = dict(camera or {})
+        self._scene: Scene | None = None
+        self._renderer: SceneRenderer | None = None
+        self._window: Any = None
+
+    def render(self, mode: str, index: int = 0) -> NDArray[np.uint8] | NDArray[np.float32] | None:
+        """Draws one copy.
+
+        Args:
+            mode: One of `RENDER_MODES`.
+            index: Which copy.
+
+        Returns:
+            `rgb_array`: (height, width, 3). `depth_array`: (height, width), metres. `human`: None.
+
+        Raises:
+            RuntimeError: If there is no OpenGL or, for `human`, no display.
+        """
+        if self._scene is None:
+            self._scene = Scene(self._simulation.spec.name)
+        frame = simulation_frame(self._simulation, index)
+        if mode == 'human':
+            self._show(self._scene, frame)
+            return None
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self._scene, *self._size, self._camera)
+        draw = self._renderer.render_depth if mode == 'depth_array' else self._renderer.render
+        return draw(frame)
+
+    def close(self) -> None:
+        """Frees the OpenGL context and the window."""
+        if self._renderer is not None:
+            self._renderer.close()
+        if self._window is not None:
+            self._window.close()
+        self._renderer = self._window = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without OpenGL, which belongs to this process; it opens again."""
+        return self.__dict__ | {'_scene': None, '_renderer': None, '_window': None}
+
+    def _show(self, scene: Scene, frame: Frame) -> None:
+        """Draws into a window: Gymnasium's, with its keys."""
+        if self._window is None:
+            self._window = _open_window(scene, *self._size)
+            self._window.cam = make_camera(scene, self._camera)
+            self._window.vopt = make_options()
+        scene.show(frame)
+        mujoco.mj_forward(scene.model, scene.data)
+        for marker in scene.markers(frame):
+            rotation = np.zeros(9)
+            mujoco.mju_quat2Mat(rotation, marker.quaternion)
+            color = np.array(marker.color, dtype=np.float32)
+            self._window.add_marker(
+                type=marker.shape, size=marker.size, pos=marker.position, mat=rotation, rgba=color
+            )
+        self._window.render()
+
+
+def _open_window(scene: Scene, width: int, height: int) -> Any:
+    """Opens a window on a scene.
+
+    Raises:
+        RuntimeError: If there is no display.
+    """
+    try:
+        import glfw
+        from gymnasium.envs.mujoco.mujoco_rendering import WindowViewer
+    except ImportError as error:
+        raise RuntimeError(
+            f"render_mode 'human' needs pip install glfw imageio ({error})"
+        ) from error
+    with warnings.catch_warnings():
+        # GLFW says it again, without the advice.
+        warnings.simplefilter('ignore')
+        if not glfw.init():
+            raise RuntimeError(
+                "render_mode 'human' needs a display; without one use render_mode='rgb_array'"
+            )
+    return WindowViewer(scene.model, scene.data, width, height)

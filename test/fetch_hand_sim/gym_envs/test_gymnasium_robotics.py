@@ -1,0 +1,231 @@
+"""The ids of Gymnasium-Robotics on this package, beside the reference itself."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+import subprocess
+import sys
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+import fetch_hand_sim
+from fetch_hand_sim.gym_envs.goal_env import import_goal_env
+from fetch_hand_sim.gym_envs.registration import reference_ids
+from msgs_spec.tasks import TASKS
+from support import SUPPORT
+
+SIDE_BY_SIDE = SUPPORT / 'gymnasium_robotics_side_by_side.py'
+COMPARED = (
+    'FetchReach-v4',
+    'FetchSlideDense-v4',
+    'FetchPickAndPlace-v4',
+    'HandReach-v3',
+    'HandManipulateBlockRotateParallel-v1',
+    'HandManipulatePenDense-v1',
+)
+# Hooks for subclasses of the reference, and its helpers.
+LEFT_OUT = {
+    '__setstate__',
+    '_env_setup',
+    '_ezpickle_args',
+    '_ezpickle_kwargs',
+    '_initialize_simulation',
+    '_model_names',
+    '_mujoco',
+    '_mujoco_step',
+    '_render_callback',
+    '_reset_sim',
+    '_set_action',
+    '_step_callback',
+    '_utils',
+    'generate_mujoco_observations',
+}
+
+
+@pytest.fixture(scope='module')
+def report() -> dict:
+    """What differs between reference and ours."""
+    result = subprocess.run(
+        [sys.executable, '-O', SIDE_BY_SIDE, *COMPARED], capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(autouse=True)
+def registry():
+    """Gives back the ids as they were."""
+    before = dict(gymnasium.registry)
+    yield gymnasium.registry
+    gymnasium.registry.clear()
+    gymnasium.registry.update(before)
+
+
+@pytest.fixture
+def make(registry):
+    """Makes an environment by the reference's id."""
+    for name in [name for name in registry if name.startswith(('Fetch', 'Hand'))]:
+        del registry[name]
+    fetch_hand_sim.register_gymnasium_robotics()
+    return lambda name, **arguments: gymnasium.make(name, **arguments).unwrapped
+
+
+@pytest.mark.parametrize('name', COMPARED)
+def test_the_reference_and_ours_are_equal_side_by_side(name, report):
+    assert report[name]['apart']['observation'] < 1e-15
+    assert max(report[name]['apart'].values()) < 1e-15
+    assert report[name]['facts'] == []
+    assert report[name]['types'] == []
+    assert report[name]['is_goal_env']
+    assert set(report[name]['missing']) <= LEFT_OUT
+
+
+def test_all_ids_of_the_same_physics_are_there(report):
+    # Other versions need mujoco-py; touch sensors are not simulated.
+    versions = {'Fetch': 'v4', 'HandR': 'v3', 'HandM': 'v1'}
+    same_physics = {
+        name
+        for name in report['known']
+        if name.endswith(versions[name[:5]]) and 'TouchSensors' not in name
+    }
+    assert same_physics == set(reference_ids())
+    assert len(same_physics) == 32
+    assert {task for task, _ in reference_ids().values()} == set(TASKS)
+
+
+def test_ids_of_another_package_are_replaced_only_on_request(registry):
+    registry.pop('FetchPush-v4', None)
+    gymnasium.register('FetchPush-v4', entry_point='somebody:Else')
+    before = dict(registry)
+    with pytest.raises(gymnasium.error.Error, match=r'register_gymnasium_robotics\(override=True\)'):
+        fetch_hand_sim.register_gymnasium_robotics()
+    assert registry == before
+    fetch_hand_sim.register_gymnasium_robotics(override=True)
+    fetch_hand_sim.register_gymnasium_robotics()
+    assert gymnasium.spec('FetchPush-v4').entry_point.startswith('fetch_hand_sim.')
+
+
+def test_importing_gymnasium_robotics_later_takes_nothing_back():
+    code = (
+        'import gymnasium, fetch_hand_sim\n'
+        'fetch_hand_sim.register_gymnasium_robotics(override=True)\n'
+        'import gymnasium_robotics\n'
+        'gymnasium.register_envs(gymnasium_robotics)\n'
+        'env = gymnasium.make("FetchPush-v4")\n'
+        'env.reset(seed=0)\n'
+        'print(type(env.unwrapped).__module__)\n'
+        'print(isinstance(env.unwrapped, gymnasium_robotics.core.GoalEnv))\n'
+    )
+    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert result.stdout.split() == ['fetch_hand_sim.gym_envs.gymnasium_robotics_env', 'True']
+    # Not even its remark about other environments.
+    assert result.stderr == ''
+
+
+def test_touch_sensors_say_in_one_line_that_they_are_not_there(make):
+    with pytest.raises(gymnasium.error.Error, match='without them it is HandManipulateEggDense-v1'):
+        make('HandManipulateEgg_BooleanTouchSensorsDense-v1')
+
+
+def test_an_environment_is_a_goal_env_and_recomputes_its_step(make):
+    env = make('FetchReach-v4')
+    assert isinstance(env, import_goal_env())
+    env.reset(seed=0)
+    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    goals = observation['achieved_goal'], observation['desired_goal']
+    assert reward == env.compute_reward(*goals, info)
+    assert terminated == env.compute_terminated(*goals, info)
+    assert truncated == env.compute_truncated(*goals, info)
+    assert env.compute_reward(goals[0], goal=goals[0], info=info) == 0.0
+
+
+def test_thresholds_goals_and_reward_types_can_be_set(make):
+    env = make('HandReach-v3', distance_threshold=1e-6)
+    env.reset(seed=0)
+    env.goal = env._get_obs()['achieved_goal']
+    assert env.step(np.zeros(20))[1] == -1.0
+    env.distance_threshold = 10.0
+    env.goal[:] += 1.0
+    observation, reward, _, _, info = env.step(np.zeros(20))
+    assert (reward, info['is_success']) == (0.0, 1.0)
+    env.reward_type = 'dense'
+    goals = observation['achieved_goal'], observation['desired_goal']
+    expected = -np.linalg.norm(goals[0] - goals[1])
+    assert env.compute_reward(*goals, {}) == pytest.approx(expected, rel=1e-12)
+    with pytest.raises(ValueError, match='distance_threshold must be a number of at least 0'):
+        env.distance_threshold = -1.0
+    with pytest.raises(ValueError, match='HandReach has no rotation_threshold'):
+        env.rotation_threshold = 0.2
+
+
+def test_goals_of_the_same_object_can_be_asked_for(make):
+    env = make('HandManipulateBlock-v1', target_position='ignore', target_rotation='z')
+    assert env.spec_of_task.name == 'HandManipulateBlockRotateZ'
+    with pytest.raises(ValueError, match='allowed: ignore and xyz, random and xyz'):
+        make('HandManipulateEgg-v1', target_rotation='parallel')
+
+
+def test_what_is_fixed_cannot_be_changed_in_vain(make):
+    with pytest.raises(AttributeError, match='obj_range of FetchPush is fixed'):
+        make('FetchPush-v4').obj_range = 0.3
+
+
+@pytest.mark.parametrize('name', ['FetchPickAndPlace-v4', 'HandManipulateEggRotate-v1'])
+@pytest.mark.parametrize('duplicate', [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_to_the_same_bits(name, duplicate, make):
+    make(name)
+    env = gymnasium.make(name)
+    env.reset(seed=4)
+    env.action_space.seed(0)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    env.unwrapped.distance_threshold = 0.5
+    twin = duplicate(env)
+    for _ in range(3):
+        action = env.action_space.sample()
+        first, second = env.step(action), twin.step(action)
+        assert first[1:] == second[1:]
+        for key, values in first[0].items():
+            assert values.tobytes() == second[0][key].tobytes()
+    # The random generators go on alike too, and apart.
+    first, second = env.reset()[0], twin.reset()[0]
+    assert first['desired_goal'].tobytes() == second['desired_goal'].tobytes()
+    assert twin.unwrapped.distance_threshold == 0.5
+
+
+def test_what_is_written_into_the_data_is_the_simulation(make):
+    env, other = make('FetchPush-v4'), make('FetchPush-v4')
+    env.reset(seed=0)
+    other.reset(seed=1)
+    other.data.qpos[:], other.data.qvel[:] = env.data.qpos, env.data.qvel
+    other.data.time = env.data.time
+    mujoco.mj_forward(other.model, other.data)
+    other.goal = env.goal
+    for key, values in env._get_obs().items():
+        assert np.abs(values - other._get_obs()[key]).max() < 1e-12, key
+    held = other.data
+    before = held.time
+    other.step(np.ones(4, dtype=np.float32))
+    assert held is other.data
+    assert held.time == pytest.approx(before + other.dt)
+
+
+def test_what_is_written_into_the_model_counts(make):
+    heavy, light = make('FetchPush-v4'), make('FetchPush-v4')
+    heavy.model.body('object0').mass *= 50.0
+    twin = pickle.loads(pickle.dumps(heavy))
+    assert twin.model.body('object0').mass == heavy.model.body('object0').mass
+    moved = []
+    for env in (heavy, light, twin):
+        env.reset(seed=0)
+        env.data.joint('object0:joint').qvel[0] = 1.0
+        env.data.qfrc_applied[-6] = 5.0
+        env.step(np.zeros(4))
+        moved.append(env.data.joint('object0:joint').qvel[0])
+    assert moved[0] == moved[2]
+    assert abs(moved[0] - moved[1]) > 0.1

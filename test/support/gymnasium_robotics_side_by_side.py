@@ -1,0 +1,99 @@
+"""Plays an environment of Gymnasium-Robotics and ours under the same id; run with `python -O`.
+
+Usage: gymnasium_robotics_side_by_side.py ID... Prints, as JSON for each id, what differs.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from typing import Any
+
+import gymnasium
+import gymnasium_robotics
+import numpy as np
+
+import fetch_hand_sim
+
+# Objects of their own: compared by what is in them.
+OWN = ('data', 'model', 'mujoco_renderer', 'np_random', 'spec', 'unwrapped', 'metadata')
+STEPS = 30
+
+
+def difference(first: Any, second: Any) -> float:
+    """Largest absolute difference."""
+    return float(np.abs(np.subtract(first, second, dtype=np.float64)).max(initial=0.0))
+
+
+def facts_that_differ(reference: Any, ours: Any) -> list[str]:
+    """Public attributes that are no methods and have another value."""
+    differ = []
+    for name in dir(reference):
+        if name.startswith('_') or name in OWN or callable(getattr(reference, name)):
+            continue
+        expected, got = getattr(reference, name), getattr(ours, name, None)
+        if name in ('goal', 'parallel_quats'):
+            equal = difference(expected, got) < 1e-12
+        else:
+            equal = type(expected) is type(got) and np.array_equal(expected, got)
+        if not equal:
+            differ.append(f'{name}: {expected!r} {got!r}')
+    return differ
+
+
+def types(step: tuple[Any, ...]) -> list[str]:
+    """Types of what `step` and the reward function give."""
+    _, reward, terminated, truncated, info = step
+    return [type(x).__name__ for x in (reward, terminated, truncated, info['is_success'])]
+
+
+def play(name: str, reference: Any) -> dict[str, Any]:
+    """Both environments through the same actions, some of them out of range."""
+    ours = gymnasium.make(name).unwrapped
+    generator = np.random.default_rng(0)
+    apart = {'observation': 0.0, 'reward': 0.0, 'success': 0.0, 'data': 0.0, 'batch_reward': 0.0}
+    differing_types = []
+    first, second = reference.reset(seed=5), ours.reset(seed=5)
+    facts = facts_that_differ(reference, ours)
+    for _ in range(STEPS):
+        action = generator.uniform(-1.5, 1.5, ours.action_space.shape).astype(np.float32)
+        first, second = reference.step(action), ours.step(action)
+        if types(first) != types(second):
+            differing_types.append([types(first), types(second)])
+        for key in first[0]:
+            apart['observation'] = max(apart['observation'], difference(first[0][key], second[0][key]))
+        apart['reward'] = max(apart['reward'], difference(first[1], second[1]))
+        successes = (first[4]['is_success'], second[4]['is_success'])
+        apart['success'] = max(apart['success'], difference(*successes))
+        for field in ('qpos', 'qvel', 'ctrl', 'xpos', 'site_xpos', 'time'):
+            values = (getattr(reference.data, field), getattr(ours.data, field))
+            apart['data'] = max(apart['data'], difference(*values))
+    goals = np.stack([first[0]['achieved_goal']] * 3), np.stack([first[0]['desired_goal']] * 3)
+    # The reference cannot give a batch of rewards for the pen.
+    if 'Pen' not in name:
+        rewards = reference.compute_reward(*goals, {}), ours.compute_reward(*goals, {})
+        apart['batch_reward'] = difference(*rewards)
+        if rewards[0].dtype != rewards[1].dtype:
+            differing_types.append([str(reward.dtype) for reward in rewards])
+    return {
+        'missing': sorted(set(dir(reference)) - set(dir(ours))),
+        'facts': facts,
+        'types': differing_types,
+        'apart': apart,
+        'is_goal_env': isinstance(ours, gymnasium_robotics.core.GoalEnv),
+    }
+
+
+def main() -> None:
+    """Makes the reference's environments, then replaces their ids."""
+    warnings.simplefilter('ignore')
+    names = sys.argv[1:]
+    gymnasium.register_envs(gymnasium_robotics)
+    references = {name: gymnasium.make(name).unwrapped for name in names}
+    known = [name for name in gymnasium.registry if name.startswith(('Fetch', 'Hand'))]
+    fetch_hand_sim.register_gymnasium_robotics(override=True)
+    print(json.dumps({'known': known, **{n: play(n, r) for n, r in references.items()}}))
+
+
+main()
