@@ -62,7 +62,9 @@ def play(name: str, reference: Any) -> dict[str, Any]:
         if types(first) != types(second):
             differing_types.append([types(first), types(second)])
         for key in first[0]:
-            apart['observation'] = max(apart['observation'], difference(first[0][key], second[0][key]))
+            apart['observation'] = max(
+                apart['observation'], difference(first[0][key], second[0][key])
+            )
         apart['reward'] = max(apart['reward'], difference(first[1], second[1]))
         successes = (first[4]['is_success'], second[4]['is_success'])
         apart['success'] = max(apart['success'], difference(*successes))

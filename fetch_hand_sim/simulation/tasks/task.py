@@ -11,7 +11,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation.engine import prepare_engine
+from fetch_hand_sim.simulation.models import prepare_engine
 from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
 from msgs_spec.tasks import TaskSpec

@@ -102,7 +102,7 @@ def test_ids_of_another_package_are_replaced_only_on_request(registry):
     registry.pop('FetchPush-v4', None)
     gymnasium.register('FetchPush-v4', entry_point='somebody:Else')
     before = dict(registry)
-    with pytest.raises(gymnasium.error.Error, match=r'register_gymnasium_robotics\(override=True\)'):
+    with pytest.raises(gymnasium.error.Error, match=r'_robotics\(override=True\)'):
         fetch_hand_sim.register_gymnasium_robotics()
     assert registry == before
     fetch_hand_sim.register_gymnasium_robotics(override=True)
