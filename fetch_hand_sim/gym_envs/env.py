@@ -10,10 +10,11 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fetch_hand_sim.gym_envs.pictures import HEIGHT, RENDER_MODES, WIDTH, Pictures
+from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures
 from fetch_hand_sim.gym_envs.shared_physics import SharedPhysics
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
 from fetch_hand_sim.simulation import Observation, Simulation
+from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
 from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
@@ -225,7 +226,10 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             RuntimeError: If there is no OpenGL or, for `human`, no display.
         """
-        return None if self.render_mode is None else self._pictures.render(self.render_mode)
+        if self.render_mode is None:
+            return None
+        self._physics.send()
+        return self._pictures.render(self.render_mode)
 
     def close(self) -> None:
         """Frees renderer and window."""
