@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
 import math
-from collections.abc import Callable, Iterable
+import textwrap
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS, substeps_per_tick
-
-if TYPE_CHECKING:
-    from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
-    from rclpy.parameter import Parameter
 
 Value = str | int | float | bool
 
@@ -28,9 +26,9 @@ class ParameterSpec:
         choices: Allowed strings; empty for any.
         lower: Smallest allowed number.
         upper: Largest allowed number.
+        or_zero: Whether 0 is allowed too, below the smallest number, to switch something off.
         read_only: Whether it is fixed once the node runs.
-        check: Raises ValueError for what type and limits cannot tell. It comes before ROS's own
-            check of the limits, which are then left out of the descriptor.
+        check: Raises ValueError for what type and limits cannot tell.
     """
 
     name: str
@@ -40,6 +38,7 @@ class ParameterSpec:
     choices: tuple[str, ...] = ()
     lower: float = -math.inf
     upper: float = math.inf
+    or_zero: bool = False
     read_only: bool = True
     check: Callable[[float], object] | None = None
 
@@ -50,22 +49,11 @@ class ParameterSpec:
             return ', '.join(repr(choice) for choice in self.choices)
         if self.type in ('string', 'bool'):
             return 'any string' if self.type == 'string' else 'true, false'
-        kind = 'an integer' if self.type == 'integer' else 'a number'
-        return kind if math.isinf(self.upper) else f'{self.lower:.10g} ... {self.upper:.10g}'
+        limits = f'{self.lower:.10g} ... {self.upper:.10g}'
+        return f'0 or {limits}' if self.or_zero else limits
 
 
 _LARGEST_SEED = 2**32 - 1
-
-_SMALLEST_FACTOR = 0.01
-
-
-def _check_real_time_factor(value: float) -> None:
-    """Raises ValueError for what is too slow to be told from a robot that hangs."""
-    if 0.0 < value < _SMALLEST_FACTOR:
-        raise ValueError(
-            f'real_time_factor: {value!r} given; allowed: 0 or {_SMALLEST_FACTOR:g} ... 1000'
-        )
-
 
 SIM_NODE = (
     ParameterSpec('task', 'string', 'FetchReach', 'Task to run.', choices=tuple(TASKS)),
@@ -120,10 +108,11 @@ SIM_NODE = (
         'double',
         1.0,
         'Simulated seconds per second in mode realtime; 0 is as fast as possible.',
-        lower=0.0,
+        # Slower cannot be told from a robot that hangs.
+        lower=0.01,
         upper=1000.0,
+        or_zero=True,
         read_only=False,
-        check=_check_real_time_factor,
     ),
     ParameterSpec(
         'command_timeout',
@@ -177,6 +166,36 @@ POLICY_NODE = (
 )
 
 
+REPLAY_NODE = (
+    ParameterSpec('path', 'string', '', 'Episode: bag directory or MCAP file.'),
+    ParameterSpec(
+        'rate',
+        'double',
+        1.0,
+        'Recorded seconds per second.',
+        lower=0.01,
+        upper=100.0,
+        read_only=False,
+    ),
+    ParameterSpec('loop', 'bool', False, 'Whether to start again at the end.', read_only=False),
+    ParameterSpec('start_paused', 'bool', False, 'Whether to wait for ~/pause with false.'),
+    ParameterSpec(
+        'start_offset', 'double', 0.0, 'Recorded seconds to leave out.', lower=0.0, upper=1e6
+    ),
+    ParameterSpec(
+        'topics', 'string', '', 'Topics to publish, separated by commas; empty for all published.'
+    ),
+    ParameterSpec(
+        'inputs', 'bool', False, 'Whether to publish also what the robot received: commands, goals.'
+    ),
+    ParameterSpec(
+        'wait_for_commands', 'bool', False, 'Whether to start when somebody publishes commands.'
+    ),
+)
+
+NODES = {'sim_node': SIM_NODE, 'policy_node': POLICY_NODE, 'replay_node': REPLAY_NODE}
+
+
 def validate(spec: ParameterSpec, value: object) -> None:
     """Checks a value; integers pass for doubles.
 
@@ -184,7 +203,8 @@ def validate(spec: ParameterSpec, value: object) -> None:
         ValueError: If it is not allowed; the message is one line and says what is.
     """
     if not _is_allowed(spec, value):
-        raise ValueError(f'{spec.name}: {value!r} given; allowed: {spec.allowed}')
+        hint = _suggestion(str(value), spec.choices)
+        raise ValueError(f'{spec.name}: {value!r} given; allowed: {spec.allowed}{hint}')
 
 
 def _is_allowed(spec: ParameterSpec, value: object) -> bool:
@@ -198,57 +218,54 @@ def _is_allowed(spec: ParameterSpec, value: object) -> bool:
     if spec.check is not None:
         spec.check(value)
     # NaN is not within any limits.
-    return spec.lower <= value <= spec.upper
+    return spec.lower <= value <= spec.upper or (spec.or_zero and value == 0)
 
 
-def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
-    """Returns the ROS descriptor.
+def unknown_parameter(specs: Sequence[ParameterSpec], name: str) -> str | None:
+    """Returns a line about a parameter that a node was given and does not have.
 
-    Doubles are typed dynamically, because ROS takes `1` on a command line for an integer and would
-    refuse it.
+    None if the parameter belongs to another node of this project or to ROS: files of parameters
+    are often written for several nodes.
     """
-    from rcl_interfaces.msg import (
-        FloatingPointRange,
-        IntegerRange,
-        ParameterDescriptor,
-        ParameterType,
-    )
-
-    result = ParameterDescriptor(
-        name=spec.name,
-        type=getattr(ParameterType, f'PARAMETER_{spec.type.upper()}'),
-        description=spec.description,
-        additional_constraints=f'allowed: {spec.allowed}' if spec.choices else '',
-        read_only=spec.read_only,
-        dynamic_typing=spec.type == 'double',
-    )
-    if spec.type == 'integer':
-        limits = IntegerRange(from_value=int(spec.lower), to_value=int(spec.upper), step=1)
-        result.integer_range = [limits]
-    elif spec.type == 'double' and spec.check is None:
-        limits = FloatingPointRange(from_value=spec.lower, to_value=spec.upper)
-        result.floating_point_range = [limits]
-    return result
+    is_known = any(name == spec.name for node in NODES.values() for spec in node)
+    if is_known or name == 'use_sim_time' or name.startswith('qos_overrides.'):
+        return None
+    hint = _suggestion(name, [spec.name for spec in specs])
+    return f'there is no parameter {name!r}{hint or "; it is ignored"}'
 
 
-def set_callback(
-    specs: Iterable[ParameterSpec],
-) -> Callable[[list[Parameter]], SetParametersResult]:
-    """Returns the callback for `Node.add_on_set_parameters_callback` that checks new values.
+def _suggestion(given: str, allowed: Iterable[str]) -> str:
+    """What was probably meant, to end a line with."""
+    by_lower = {name.lower(): name for name in allowed if name}
+    found = difflib.get_close_matches(given.lower(), by_lower, n=1)
+    return f'; did you mean {by_lower[found[0]]!r}?' if found else ''
 
-    Parameters of other names pass: they belong to ROS.
+
+def usage(node: str, summary: str) -> str:
+    """Returns the help text of a node.
+
+    Args:
+        node: Its executable.
+        summary: What it is, in a line.
     """
-    from rcl_interfaces.msg import SetParametersResult
-
-    by_name = {spec.name: spec for spec in specs}
-
-    def check(parameters: list[Parameter]) -> SetParametersResult:
-        try:
-            for parameter in parameters:
-                if parameter.name in by_name:
-                    validate(by_name[parameter.name], parameter.value)
-        except ValueError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-    return check
+    entries = [
+        f'  {spec.name} ({spec.type}, default {spec.default!r}'
+        f'{"" if spec.read_only else ", settable at run time"})\n'
+        + textwrap.fill(
+            f'{spec.description} Allowed: {spec.allowed}.',
+            width=79,
+            initial_indent=' ' * 6,
+            subsequent_indent=' ' * 6,
+        )
+        for spec in NODES[node]
+    ]
+    return '\n'.join(
+        [
+            f'usage: {node} [--ros-args [-p NAME:=VALUE] [--params-file FILE] ...]',
+            '',
+            summary,
+            '',
+            'parameters:',
+            *entries,
+        ]
+    )

@@ -1,22 +1,24 @@
-"""The few lines of rclpy that both nodes share. Nothing else in `msgs_spec` needs ROS."""
+"""All that the nodes share of rclpy. Nothing else in `msgs_spec` needs ROS."""
 
 from __future__ import annotations
 
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from msgs_spec.command_line import EXIT_SUCCESS, CommandError, complain, require_extra
 from msgs_spec.command_line import UsageError as UsageError
-from msgs_spec.parameters import ParameterSpec, descriptor, validate
+from msgs_spec.parameters import ParameterSpec, unknown_parameter, usage, validate
 
 if TYPE_CHECKING:
+    from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
     from rclpy.executors import Executor
     from rclpy.node import Node
+    from rclpy.parameter import Parameter
 
 # Seconds between looks at what no callback announces: signals, the graph.
 BEAT = 0.1
@@ -93,24 +95,84 @@ def _make_executor() -> tuple[Executor, bool]:
 def declare_parameters(node: Node, specs: Sequence[ParameterSpec]) -> dict[str, Any]:
     """Declares parameters with description and range and returns their values.
 
+    Parameters that it was given and does not have are named in a warning.
+
     Raises:
         UsageError: If a value given at the start is not allowed.
     """
-    return {spec.name: _declare(node, spec) for spec in specs}
+    # rclpy has no public way to see what was given before it is declared.
+    given: dict[str, Parameter] = node._parameter_overrides
+    values = {spec.name: _declare(node, spec, given.get(spec.name)) for spec in specs}
+    for other in sorted(given):
+        line = None if node.has_parameter(other) else unknown_parameter(specs, other)
+        if line is not None:
+            node.get_logger().warning(line)
+    return values
 
 
-def _declare(node: Node, spec: ParameterSpec) -> Any:
-    from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-
-    try:
-        value = node.declare_parameter(spec.name, spec.default, descriptor(spec)).value
-        validate(spec, value)
-    except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-        line = ' '.join(str(error).split())
-        raise UsageError(f'{line}; allowed: {spec.allowed}') from None
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+def _declare(node: Node, spec: ParameterSpec, given: Parameter | None) -> Any:
+    if given is not None:
+        # Before rclpy does, whose lines do not say what is allowed.
+        try:
+            validate(spec, given.value)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+    value = node.declare_parameter(spec.name, spec.default, descriptor(spec)).value
     return float(value) if spec.type == 'double' else value
+
+
+def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
+    """Returns the ROS descriptor.
+
+    Doubles are typed dynamically, because ROS takes `1` on a command line for an integer and would
+    refuse it.
+    """
+    from rcl_interfaces.msg import (
+        FloatingPointRange,
+        IntegerRange,
+        ParameterDescriptor,
+        ParameterType,
+    )
+
+    result = ParameterDescriptor(
+        name=spec.name,
+        type=getattr(ParameterType, f'PARAMETER_{spec.type.upper()}'),
+        description=spec.description,
+        additional_constraints=f'allowed: {spec.allowed}' if spec.choices or spec.or_zero else '',
+        read_only=spec.read_only,
+        dynamic_typing=spec.type == 'double',
+    )
+    lower = 0.0 if spec.or_zero else spec.lower
+    if spec.type == 'integer':
+        limits = IntegerRange(from_value=int(lower), to_value=int(spec.upper), step=1)
+        result.integer_range = [limits]
+    elif spec.type == 'double':
+        limits = FloatingPointRange(from_value=float(lower), to_value=float(spec.upper))
+        result.floating_point_range = [limits]
+    return result
+
+
+def set_callback(
+    specs: Iterable[ParameterSpec],
+) -> Callable[[list[Parameter]], SetParametersResult]:
+    """Returns the callback for `Node.add_on_set_parameters_callback` that checks new values.
+
+    Parameters of other names pass: they belong to ROS.
+    """
+    from rcl_interfaces.msg import SetParametersResult
+
+    by_name = {spec.name: spec for spec in specs}
+
+    def check(parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            for parameter in parameters:
+                if parameter.name in by_name:
+                    validate(by_name[parameter.name], parameter.value)
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    return check
 
 
 class StopSignals:
@@ -133,6 +195,48 @@ class StopSignals:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
         self.received = signal.Signals(number).name
+
+
+class RunnableNode(Protocol):
+    """A node that runs until it is done or told to stop."""
+
+    def run(self, stop: StopSignals) -> None:
+        """Runs."""
+
+    def destroy_node(self) -> None:
+        """Closes its topics and services."""
+
+
+def node_main(
+    name: str,
+    summary: str,
+    load: Callable[[], Callable[[], RunnableNode]],
+    args: list[str] | None = None,
+) -> int:
+    """Runs a node of `NODES` as a process, or prints its help; returns the exit code of `run_node`.
+
+    Args:
+        name: Name of the executable and of the node.
+        summary: What it is, in a line.
+        load: Imports the class of the node, which may take long.
+        args: Command line; None for that of the process.
+    """
+    given = sys.argv[1:] if args is None else args
+    if '-h' in given or '--help' in given:
+        print(usage(name, summary))
+        return EXIT_SUCCESS
+    return run_node(name, lambda stop: _run(load, stop), args)
+
+
+def _run(load: Callable[[], Callable[[], RunnableNode]], stop: StopSignals) -> None:
+    make_node = load()
+    if stop:
+        return
+    node = make_node()
+    try:
+        node.run(stop)
+    finally:
+        node.destroy_node()
 
 
 def run_node(name: str, run: Callable[[StopSignals], None], args: list[str] | None = None) -> int:

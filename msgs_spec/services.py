@@ -22,6 +22,9 @@ class ServiceSpec:
     description: str
 
 
+# A call that steps blocks the robot; this many ticks take the slowest task a few seconds.
+MAX_STEPS = 1000
+
 RESET = ServiceSpec(
     '~/reset',
     'std_srvs/srv/Trigger',
@@ -57,7 +60,9 @@ RESET_SIMULATION = _interface(
     '~/reset_simulation', 'ResetSimulation', 'As `~/reset`; time is never set back.'
 )
 STEP_SIMULATION = _interface(
-    '~/step_simulation', 'StepSimulation', 'Runs the given number of ticks; while paused.'
+    '~/step_simulation',
+    'StepSimulation',
+    f'Runs the given number of ticks, 1 ... {MAX_STEPS}; while paused.',
 )
 INTERFACE_SERVICES = (GET_FEATURES, GET_STATE, SET_STATE, RESET_SIMULATION, STEP_SIMULATION)
 SERVICES = (*STANDARD_SERVICES, *INTERFACE_SERVICES)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,13 @@ from msgs_spec.topics import TopicSpec, topics
 
 Array = NDArray[np.float64]
 Phase = Literal['waiting', 'reset', 'running', 'finished']
-PHASES: tuple[Phase, ...] = get_args(Phase)
+# What each says of the tick it comes with. An episode that is given up ends without `finished`.
+PHASES: dict[Phase, str] = {
+    'waiting': 'before the first episode',
+    'reset': 'at tick 0 of an episode',
+    'running': 'at the ticks between',
+    'finished': 'at the last tick of an episode that was not given up',
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,8 +37,7 @@ class EpisodeStatus:
         episode: Index of the episode since the node started, from 0.
         seed: Seed of the episode.
         tick: Steps of the episode so far; 0 is the state after the reset.
-        phase: `waiting` before the first episode, `reset` at tick 0, `finished` at the last tick,
-            `running` between.
+        phase: Where the episode is, see `PHASES`.
         control_hz: Ticks per second of simulated time; observations depend on it.
         reward_type: `sparse` or `dense`.
         success_rule: `gymnasium` or `paper`.

@@ -7,23 +7,20 @@ is not published, unless asked for: the commands of the log would mix with those
 
 from __future__ import annotations
 
-from msgs_spec.ros import StopSignals, run_node
+from collections.abc import Callable
+
+from msgs_spec.ros import RunnableNode, node_main
 
 NODE_NAME = 'replay_node'
+SUMMARY = 'A recorded episode, published once more.'
 
 
 def main(args: list[str] | None = None) -> int:
     """Runs `replay_node`; returns the exit code."""
 
-    def run(stop: StopSignals) -> None:
+    def load() -> Callable[[], RunnableNode]:
         from fetch_hand_sim.replay_node.node import ReplayNode
 
-        if stop:
-            return
-        node = ReplayNode()
-        try:
-            node.run(stop)
-        finally:
-            node.destroy_node()
+        return ReplayNode
 
-    return run_node(NODE_NAME, run, args)
+    return node_main(NODE_NAME, SUMMARY, load, args)

@@ -16,41 +16,16 @@ from std_srvs.srv import SetBool
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.replay_node import NODE_NAME
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
-from msgs_spec.parameters import ParameterSpec, set_callback
+from msgs_spec.parameters import REPLAY_NODE
 from msgs_spec.qos import rclpy_profile
 from msgs_spec.ros import (
     StopSignals,
     UsageError,
     declare_parameters,
     ros_message_class,
+    set_callback,
 )
 
-PARAMETERS = (
-    ParameterSpec('path', 'string', '', 'Episode: bag directory or MCAP file.'),
-    ParameterSpec(
-        'rate',
-        'double',
-        1.0,
-        'Recorded seconds per second.',
-        lower=0.01,
-        upper=100.0,
-        read_only=False,
-    ),
-    ParameterSpec('loop', 'bool', False, 'Whether to start again at the end.', read_only=False),
-    ParameterSpec('start_paused', 'bool', False, 'Whether to wait for ~/pause with false.'),
-    ParameterSpec(
-        'start_offset', 'double', 0.0, 'Recorded seconds to leave out.', lower=0.0, upper=1e6
-    ),
-    ParameterSpec(
-        'topics', 'string', '', 'Topics to publish, separated by commas; empty for all published.'
-    ),
-    ParameterSpec(
-        'inputs', 'bool', False, 'Whether to publish also what the robot received: commands, goals.'
-    ),
-    ParameterSpec(
-        'wait_for_commands', 'bool', False, 'Whether to start when somebody publishes commands.'
-    ),
-)
 # Seconds between looks at the stop flag while nothing is due.
 _SPIN = 0.1
 _LAST_WORDS_TIMEOUT = 1.0
@@ -67,7 +42,7 @@ class ReplayNode(Node):
             UsageError: If a parameter is not allowed or the episode cannot be read.
         """
         super().__init__(NODE_NAME)
-        self._settings = declare_parameters(self, PARAMETERS)
+        self._settings = declare_parameters(self, REPLAY_NODE)
         self._schedule = self._read_schedule()
         self._start_ns = self._schedule.start_ns + round(self._settings['start_offset'] * 1e9)
         if self._start_ns > self._schedule.end_ns:
@@ -87,7 +62,7 @@ class ReplayNode(Node):
             is_paused=self._settings['start_paused'],
         )
         self.create_service(SetBool, '~/pause', self._on_pause)
-        self.add_on_set_parameters_callback(set_callback(PARAMETERS))
+        self.add_on_set_parameters_callback(set_callback(REPLAY_NODE))
         self.add_post_set_parameters_callback(self._apply_changes)
 
     def _read_schedule(self) -> ReplaySchedule:

@@ -6,23 +6,20 @@ it. Nothing is imported here that takes long, so that Ctrl-C finds its handler i
 
 from __future__ import annotations
 
-from msgs_spec.ros import StopSignals, run_node
+from collections.abc import Callable
+
+from msgs_spec.ros import RunnableNode, node_main
 
 NODE_NAME = 'sim_node'
+SUMMARY = 'One simulated robot on the network.'
 
 
 def main(args: list[str] | None = None) -> int:
     """Runs `sim_node`; returns the exit code."""
 
-    def run(stop: StopSignals) -> None:
+    def load() -> Callable[[], RunnableNode]:
         from fetch_hand_sim.sim_node.node import SimNode
 
-        if stop:
-            return
-        node = SimNode()
-        try:
-            node.run(stop)
-        finally:
-            node.destroy_node()
+        return SimNode
 
-    return run_node(NODE_NAME, run, args)
+    return node_main(NODE_NAME, SUMMARY, load, args)

@@ -30,7 +30,7 @@ from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports
-from msgs_spec.parameters import SIM_NODE, set_callback
+from msgs_spec.parameters import SIM_NODE
 from msgs_spec.qos import rclpy_profile
 from msgs_spec.ros import (
     BEAT,
@@ -39,6 +39,7 @@ from msgs_spec.ros import (
     UsageError,
     declare_parameters,
     ros_message_class,
+    set_callback,
 )
 from msgs_spec.tick import Tick
 from msgs_spec.topics import DIAGNOSTICS, MONITORING, REAL_TIME_FACTOR, topics

@@ -14,13 +14,11 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from msgs_spec.diagnostics import Durations
+from msgs_spec.services import MAX_STEPS
 from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import TopicSpec
 
 Messages = list[tuple[TopicSpec, bytes]]
-
-# A call that steps blocks the robot; this many ticks take the slowest task a few seconds.
-MAX_STEPS = 1000
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,23 +7,20 @@ Nothing is imported here that takes long, so that Ctrl-C finds its handler in pl
 
 from __future__ import annotations
 
-from msgs_spec.ros import StopSignals, run_node
+from collections.abc import Callable
+
+from msgs_spec.ros import RunnableNode, node_main
 
 NODE_NAME = 'policy_node'
+SUMMARY = 'Commands for a robot, from an actor that sees its topics.'
 
 
 def main(args: list[str] | None = None) -> int:
     """Runs `policy_node`; returns the exit code."""
 
-    def run(stop: StopSignals) -> None:
+    def load() -> Callable[[], RunnableNode]:
         from policy_node.node.node import PolicyNode
 
-        if stop:
-            return
-        node = PolicyNode()
-        try:
-            node.run(stop)
-        finally:
-            node.destroy_node()
+        return PolicyNode
 
-    return run_node(NODE_NAME, run, args)
+    return node_main(NODE_NAME, SUMMARY, load, args)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import pytest
 
-from msgs_spec.parameters import POLICY_NODE, SIM_NODE, descriptor, set_callback, validate
+from msgs_spec.parameters import NODES, SIM_NODE, unknown_parameter, usage, validate
+from msgs_spec.ros import UsageError, declare_parameters, descriptor, set_callback
 
 SPECS = {
-    f'{node}.{s.name}': s
-    for node, specs in (('sim', SIM_NODE), ('policy', POLICY_NODE))
-    for s in specs
+    f'{node.removesuffix("_node")}.{s.name}': s for node, specs in NODES.items() for s in specs
 }
 every_parameter = pytest.mark.parametrize('spec', SPECS.values(), ids=SPECS)
 
@@ -44,6 +45,8 @@ def test_allowed_values_pass(name, value):
     ('name', 'value', 'message'),
     [
         ('sim.task', 'fetchreach', "task: 'fetchreach' given; allowed: 'FetchReach', "),
+        ('sim.task', 'fetchreach', "; did you mean 'FetchReach'\\?$"),
+        ('sim.mode', 'lock_step', "'realtime', 'lockstep'; did you mean 'lockstep'\\?$"),
         ('sim.task', 3, 'task: 3 given; allowed: '),
         ('sim.task', None, 'task: None given; allowed: '),
         ('sim.seed', -1, 'seed: -1 given; allowed: 0 ... 4294967295'),
@@ -52,9 +55,14 @@ def test_allowed_values_pass(name, value):
         ('sim.reward_type', '', "reward_type: '' given; allowed: 'sparse', 'dense'"),
         ('sim.control_hz', 30.0, 'control_hz 30 is not a whole number .*29.4117647 and 31.25'),
         ('sim.control_hz', 1000, 'control_hz 1000 is not a whole number .*500'),
-        ('sim.real_time_factor', -0.1, 'real_time_factor: -0.1 given; allowed: 0 ... 1000'),
-        ('sim.real_time_factor', math.nan, 'real_time_factor: nan given; allowed: 0 ... 1000'),
-        ('sim.real_time_factor', '2', "real_time_factor: '2' given; allowed: 0 ... 1000"),
+        ('sim.real_time_factor', -0.1, 'factor: -0.1 given; allowed: 0 or 0.01 ... 1000'),
+        ('sim.real_time_factor', 0.005, 'factor: 0.005 given; allowed: 0 or 0.01 ... 1000'),
+        (
+            'sim.real_time_factor',
+            math.nan,
+            'factor: nan given; allowed: 0 or 0.01 ... 1000',
+        ),
+        ('sim.real_time_factor', '2', "real_time_factor: '2' given; allowed: 0 or 0.01 ... 1000"),
         ('sim.command_timeout', True, 'command_timeout: True given; allowed: 0 ... 3600'),
         ('sim.episode_dir', 1, 'episode_dir: 1 given; allowed: any string'),
         ('sim.wait_for_commands', 1, 'wait_for_commands: 1 given; allowed: true, false'),
@@ -103,11 +111,80 @@ def test_ros_takes_an_integer_for_a_number(make_node):
     assert node.declare_parameter(spec.name, spec.default, descriptor(spec)).value == 2
 
 
-def test_ros_refuses_what_is_out_of_range(make_node):
-    spec = SPECS['sim.seed']
-    node = make_node(seed=-1)
-    with pytest.raises(Exception, match=r'Parameter seed out of range\. Min: 0, Max: 4294967295'):
-        node.declare_parameter(spec.name, spec.default, descriptor(spec))
+@every_parameter
+def test_ros_shows_the_range_that_is_checked(spec, make_node):
+    """`ros2 param describe` prints it."""
+    node = make_node()
+    node.declare_parameter(spec.name, spec.default, descriptor(spec))
+    declared = node.describe_parameter(spec.name)
+    ranges = [*declared.integer_range, *declared.floating_point_range]
+    assert len(ranges) == (spec.type in ('integer', 'double'))
+    for limits in ranges:
+        for value in (limits.from_value, limits.to_value):
+            validate(spec, value)
+        with pytest.raises(ValueError, match='allowed'):
+            validate(spec, limits.to_value + 1)
+        with pytest.raises(ValueError, match='allowed'):
+            validate(spec, limits.from_value - 1)
+        if spec.or_zero:
+            assert spec.allowed in declared.additional_constraints
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'line'),
+    [
+        ('seed', -1, 'seed: -1 given; allowed: 0 ... 4294967295'),
+        ('real_time_factor', 0.005, 'real_time_factor: 0.005 given; allowed: 0 or 0.01 ... 1000'),
+        ('control_hz', 30.0, 'control_hz 30 is not a whole number'),
+        ('control_hz', 12.0, 'control_hz 12 is not a whole number'),
+        ('mode', 1, 'mode: 1 given; allowed'),
+        ('task', 'FetchPsh', "did you mean 'FetchPush'?"),
+    ],
+)
+def test_a_node_refuses_what_is_not_allowed_in_our_words(name, value, line, make_node):
+    with pytest.raises(UsageError) as error:
+        declare_parameters(make_node(**{name: value}), SIM_NODE)
+    assert line in str(error.value)
+    assert '\n' not in str(error.value)
+
+
+def test_a_mistyped_parameter_is_named_with_the_nearest(make_node, capfd):
+    node = make_node(tsak='FetchPush', seed=3, nonsense=1, checkpoint='random', use_sim_time=False)
+    values = declare_parameters(node, SIM_NODE)
+    assert (values['task'], values['seed']) == ('FetchReach', 3)
+    said = capfd.readouterr().err
+    assert "there is no parameter 'tsak'; did you mean 'task'?" in said
+    assert "there is no parameter 'nonsense'; it is ignored" in said
+    assert 'checkpoint' not in said  # policy_node's, in a file for both
+    assert 'use_sim_time' not in said
+
+
+@pytest.mark.parametrize('name', ['qos_overrides./clock.publisher.depth', 'use_sim_time', 'rate'])
+def test_parameters_of_others_are_no_mistake(name):
+    assert unknown_parameter(SIM_NODE, name) is None
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_help_names_every_parameter_with_its_default_and_what_is_allowed(node):
+    text = usage(node, 'What it is.')
+    assert text.startswith(f'usage: {node} [--ros-args')
+    assert max(map(len, text.splitlines())) <= 80
+    flowing = ' '.join(text.split())
+    for spec in NODES[node]:
+        assert f'{spec.name} ({spec.type}, default {spec.default!r}' in flowing
+        assert f'{spec.description} Allowed: {spec.allowed}.' in flowing
+
+
+@pytest.mark.parametrize('module', ['fetch_hand_sim.sim_node', 'policy_node.node'])
+@pytest.mark.parametrize('arguments', [['--help'], ['-h'], ['--ros-args', '--help']])
+def test_help_is_printed_before_ros_is_loaded(module, arguments):
+    program = (
+        f'import sys; from {module} import main; code = main({arguments!r}); '
+        'assert not {"rclpy", "mujoco", "torch"} & sys.modules.keys(); sys.exit(code)'
+    )
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.startswith('usage: ')
 
 
 def test_new_values_are_checked_while_the_node_runs(make_node):
@@ -124,7 +201,7 @@ def test_new_values_are_checked_while_the_node_runs(make_node):
     assert put('real_time_factor', 0.5) == (True, '')
     assert put('real_time_factor', 'fast') == (
         False,
-        "real_time_factor: 'fast' given; allowed: 0 ... 1000",
+        "real_time_factor: 'fast' given; allowed: 0 or 0.01 ... 1000",
     )
     assert node.get_parameter('real_time_factor').value == 0.5
     assert put('task', 'FetchPush') == (False, 'Trying to set a read-only parameter: task.')

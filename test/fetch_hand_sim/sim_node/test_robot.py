@@ -15,7 +15,7 @@ from fetch_hand_sim.sim_node.commanders import CommanderWatch, Endpoint
 from fetch_hand_sim.sim_node.health import Health, Surroundings
 from fetch_hand_sim.sim_node.pacing import RealTimePacer
 from fetch_hand_sim.sim_node.receivers import Receivers
-from fetch_hand_sim.sim_node.robot import MAX_STEPS, Robot
+from fetch_hand_sim.sim_node.robot import Robot
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.sim_node.simulation_interfaces import SimulationInterfaces
@@ -24,7 +24,7 @@ from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_message, decode_status
 from msgs_spec.diagnostics import Level, encode_reports
 from msgs_spec.schemas import deserialize, message_class, serialize
-from msgs_spec.services import INTERFACE_SERVICES, SERVICES, STANDARD_SERVICES
+from msgs_spec.services import INTERFACE_SERVICES, MAX_STEPS, SERVICES, STANDARD_SERVICES
 from msgs_spec.topics import DIAGNOSTICS, topic, topics
 
 

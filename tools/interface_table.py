@@ -1,6 +1,6 @@
-"""The interface section of the README, generated from this package.
+"""The interface section of the README, generated from `msgs_spec`.
 
-`python -m msgs_spec.interface_table` prints it, `--write README.md` puts it between its markers.
+`python tools/interface_table.py` prints it, `--write README.md` puts it between its markers.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from msgs_spec.parameters import POLICY_NODE, SIM_NODE, ParameterSpec
+from msgs_spec.parameters import NODES, ParameterSpec
 from msgs_spec.qos import QosSpec
 from msgs_spec.robots import FETCH, FINGERTIPS, SHADOW_HAND, CommandPart
 from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS, GoalKind, TaskSpec, VectorPart
-from msgs_spec.tick import EpisodeStatus
+from msgs_spec.tick import PHASES, EpisodeStatus
 from msgs_spec.topics import MONITORING, TopicSpec, topics
 
 _PREFIX = 'robot0:'
@@ -139,6 +139,7 @@ def _orders() -> str:
         ('`commands`, `applied_command`, hand', _command(SHADOW_HAND.command)),
         ('Fingertips', _names(FINGERTIPS)),
         ('`episode_status` keys', _names(keys)),
+        ('Its `phase`', ', '.join(f'`{phase}` {when}' for phase, when in PHASES.items())),
     )
     return '\n'.join(f'- {title}: {text}' for title, text in lines)
 
@@ -178,7 +179,7 @@ def _observation_table() -> str:
 
 
 def _parameter_table() -> str:
-    rows = [('sim_node', spec) for spec in SIM_NODE] + [('policy_node', s) for s in POLICY_NODE]
+    rows = [(node, spec) for node, specs in NODES.items() for spec in specs]
     return _table(
         ('node', 'parameter', 'type', 'default', 'allowed', 'at run time', 'meaning'),
         (

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import runpy
+
 import pytest
 
-from msgs_spec.interface_table import END, START, interface_markdown, main, replace_section
-from msgs_spec.parameters import POLICY_NODE, SIM_NODE
+from msgs_spec.parameters import NODES
 from msgs_spec.robots import SHADOW_HAND
 from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS
+from msgs_spec.tick import PHASES
 from msgs_spec.topics import topics
 from support import ROOT
 
 README = ROOT / 'README.md'
+TOOL = runpy.run_path(str(ROOT / 'tools' / 'interface_table.py'))
+END, START = TOOL['END'], TOOL['START']
+interface_markdown, main, replace_section = (
+    TOOL[name] for name in ('interface_markdown', 'main', 'replace_section')
+)
 
 
 @pytest.mark.skipif(not README.exists(), reason='installed without README.md')
 def test_readme_holds_the_generated_section():
     text = README.read_text(encoding='utf-8')
     assert replace_section(text) == text, (
-        'README.md is not up to date: python -m msgs_spec.interface_table --write README.md'
+        'README.md is not up to date: python tools/interface_table.py --write README.md'
     )
 
 
@@ -29,13 +36,19 @@ def test_everything_has_its_row():
         for spec in topics(task):
             type_name = spec.type_name.replace('/msg/', '/')
             assert any(line.startswith(f'| `{spec.name}` | {type_name} |') for line in lines)
-    for node, specs in (('sim_node', SIM_NODE), ('policy_node', POLICY_NODE)):
+    for node, specs in NODES.items():
         for spec in specs:
             assert any(
                 line.startswith(f'| {node} | `{spec.name}` | {spec.type} |') for line in lines
             )
     for spec in SERVICES:
         assert any(line.startswith(f'| `{spec.name}` |') for line in lines)
+
+
+def test_phases_and_the_limit_of_steps_are_told():
+    text = interface_markdown()
+    assert all(f'`{phase}` {when}' in text for phase, when in PHASES.items())
+    assert 'Runs the given number of ticks, 1 ... 1000; while paused.' in text
 
 
 def test_hand_commands_are_listed_in_order_with_their_ranges():
