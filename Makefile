@@ -17,7 +17,7 @@ STAMP := $(VENV)/.complete
 # not leak in.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo test lint format twin bench-sim bench-her bench-paper bench-lockstep bench-rate bench-episodes torture clean distclean
+.PHONY: help env demo test lint format twin bench-sim bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -33,6 +33,7 @@ help:
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
 	@echo 'make torture    100,000 hostile messages per test, an hour of memory at 20x, 200 killed'
 	@echo '                writers and 10,000 damaged episode files'
+	@echo 'make test-release  build wheel and sdist, install them elsewhere, run the demo from there'
 	@echo 'make bench-episodes  what logging costs and how fast logs load'
 	@echo 'make env        only create $(VENV)'
 	@echo 'make clean      remove build products; distclean removes $(VENV) too'
@@ -46,9 +47,9 @@ $(STAMP): setup.py setup.cfg constraints.txt tools/make_environment.sh
 
 demo: env
 ifdef VIEW
-	@$(BIN)/python -m fetch_hand_sim.view --task $(TASK)
+	@$(BIN)/python -m fetch_hand_sim view --task $(TASK)
 else
-	@$(BIN)/python -m fetch_hand_sim.commands.demo --task $(TASK) --episodes $(EPISODES)
+	@$(BIN)/python -m fetch_hand_sim demo --task $(TASK) --episodes $(EPISODES)
 endif
 
 test: lint
@@ -89,6 +90,9 @@ torture: env
 	EPISODE_KILLS=200 EPISODE_MUTATIONS=10000 $(BIN)/python -m pytest --timeout 0 -s \
 		test/fetch_hand_sim/episode_log/test_episode_endings.py \
 		test/fetch_hand_sim/episode_log/test_episode_untrusted.py
+
+test-release: env
+	PYTHON=$(abspath $(BIN)/python) tools/test_release.sh
 
 bench-episodes: env
 	$(BIN)/python bench/bench_load.py

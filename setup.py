@@ -1,8 +1,14 @@
 """Builds the ROS package `fetch_hand_sim`, with colcon or with pip alone."""
 
+import sys
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
+
+# Said here as well, because pip looks at `python_requires` after it has fetched what is needed.
+if sys.version_info < (3, 11):  # noqa: UP036
+    sys.exit(f'fetch_hand_sim needs Python 3.11 or newer; this is {sys.version.split()[0]}')
 
 PACKAGE = 'fetch_hand_sim'
 
@@ -38,7 +44,22 @@ setup(
     name=PACKAGE,
     version='0.1.0',
     description='The Fetch and Shadow hand tasks of Plappert et al. 2018 as ROS 2 nodes on MuJoCo',
+    long_description=Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
     license='Apache-2.0',
+    license_files=['LICENSE'],
+    author='The fetch_hand_sim maintainers',
+    project_urls={'Paper': 'https://arxiv.org/abs/1802.09464'},
+    keywords=['robotics', 'reinforcement learning', 'mujoco', 'ros2', 'gymnasium', 'her', 'mcap'],
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3 :: Only',
+        *(f'Programming Language :: Python :: 3.{minor}' for minor in range(11, 15)),
+        'Topic :: Scientific/Engineering :: Artificial Intelligence',
+        'Typing :: Typed',
+    ],
     python_requires='>=3.11',
     packages=find_packages(
         include=[
@@ -47,7 +68,10 @@ setup(
             for suffix in ('', '.*')
         ]
     ),
-    package_data={'policy_node': ['actors/*']},
+    package_data={
+        **{name: ['py.typed'] for name in ('msgs_spec', 'fetch_hand_sim')},
+        'policy_node': ['py.typed', 'actors/*'],
+    },
     # Critics, to train on from a shipped actor: in the repository only.
     exclude_package_data={'policy_node': ['actors/*.training.safetensors']},
     data_files=[
@@ -69,6 +93,7 @@ setup(
         'PyYAML>=6',
         'rich>=13',
         'rosbags>=0.10',
+        'shtab>=1.7',
         'zstandard>=0.20',
     ],
     extras_require={
@@ -79,6 +104,8 @@ setup(
     },
     entry_points={
         'console_scripts': [
+            # All of the following under one name; `ros2 run` finds each by its own.
+            'fetch_hand_sim = fetch_hand_sim.commands.main:main',
             'sim_node = fetch_hand_sim.sim_node:main',
             'policy_node = policy_node.node:main',
             'export_actor = policy_node.training.commands:export_actor',

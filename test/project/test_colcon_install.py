@@ -31,6 +31,19 @@ def tracked_files() -> list[str]:
     return [name for name in listing.stdout.split('\0') if name and (ROOT / name).exists()]
 
 
+def colcon(workspace, verb, *arguments):
+    """Runs colcon on the package in a workspace."""
+    environment = os.environ | {
+        'PATH': f'{BIN}{os.pathsep}{os.environ["PATH"]}',
+        'COLCON_HOME': str(workspace / 'home'),
+        'COLCON_LOG_PATH': str(workspace / 'log'),
+    }
+    # The workspace must be tested, not the checkout that this run may have on its path.
+    environment.pop('PYTHONPATH', None)
+    command = [BIN / 'colcon', verb, '--packages-select', PACKAGE, *arguments]
+    return subprocess.run(command, cwd=workspace, env=environment, capture_output=True, text=True)
+
+
 @pytest.fixture(scope='module')
 def workspace(tmp_path_factory):
     """A colcon workspace with the package in `src`, built into `install`."""
@@ -39,14 +52,7 @@ def workspace(tmp_path_factory):
         target = workspace / 'src' / PACKAGE / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(ROOT / name, target)
-    environment = os.environ | {
-        'PATH': f'{BIN}{os.pathsep}{os.environ["PATH"]}',
-        'COLCON_HOME': str(workspace / 'home'),
-        'COLCON_LOG_PATH': str(workspace / 'log'),
-    }
-    build = subprocess.run(
-        [BIN / 'colcon', 'build'], cwd=workspace, env=environment, capture_output=True, text=True
-    )
+    build = colcon(workspace, 'build')
     assert build.returncode == 0, build.stdout + build.stderr
     # colcon repairs an incomplete `data_files` and says so; pip would not.
     assert 'WARNING' not in build.stderr
@@ -162,6 +168,21 @@ def test_the_install_is_what_python_imports(workspace, prefix, in_install):
     assert result.returncode == 0, result.stderr
     for path in result.stdout.splitlines():
         assert Path(path).is_relative_to(prefix), path
+
+
+def test_colcon_test_runs_the_tests(workspace):
+    """A requirement that colcon cannot read makes it find none, and be content with that."""
+    file = 'test/msgs_spec/test_rotations.py'
+    result = colcon(workspace, 'test', '--return-code-on-test-failure', '--pytest-args', file)
+    assert result.returncode == 0, result.stdout + result.stderr
+    report = ElementTree.parse(workspace / 'build' / PACKAGE / 'pytest.xml').getroot()
+    suite = report if report.tag == 'testsuite' else report.find('testsuite')
+    counts = {name: int(suite.get(name)) for name in ('tests', 'failures', 'errors', 'skipped')}
+    command = [sys.executable, '-m', 'pytest', '--collect-only', '-q', file]
+    listing = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    expected = listing.count('::')
+    assert expected > 10
+    assert counts == {'tests': expected, 'failures': 0, 'errors': 0, 'skipped': 0}
 
 
 def test_installed_sim_node_runs_an_episode(prefix, in_install, start_process, tmp_path):

@@ -28,6 +28,7 @@ NEEDS = {
     'benchmark': ['torch', 'safetensors', 'matplotlib', 'tensorboard'],
     'export_actor': ['torch', 'onnx', 'onnxscript'],
     'export_episodes': ['pyarrow', 'minari'],
+    'fetch_hand_sim': [],
     'list_episodes': [],
     'check_episode': [],
     'recover_episodes': [],

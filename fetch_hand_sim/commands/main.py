@@ -1,0 +1,158 @@
+"""`fetch_hand_sim <command>`: everything this package does, under one name.
+
+The commands are the executables that `ros2 run fetch_hand_sim` also finds, under shorter names.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+
+import shtab
+
+from fetch_hand_sim.commands.executables import UnknownExecutableError, find_executable
+from msgs_spec.command_line import EXIT_USAGE, UsageError, run_command, start_command
+
+_NAME = 'fetch_hand_sim'
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One word of the command line.
+
+    Attributes:
+        help: What it does.
+        executable: The executable it stands for; '' if there is none.
+        module: What it runs where there is no executable: the `main` of this module.
+        extras: Extras that the module needs.
+        is_node: Whether the executable takes ROS parameters instead of options.
+        commands: Commands of its own, by name.
+    """
+
+    help: str
+    executable: str = ''
+    module: str = ''
+    extras: tuple[str, ...] = ()
+    is_node: bool = False
+    commands: dict[str, Command] = field(default_factory=dict)
+
+
+COMMANDS = {
+    'demo': Command(
+        'a robot and its actor in two processes, every episode logged',
+        module='fetch_hand_sim.commands.demo',
+        extras=('ros',),
+    ),
+    'view': Command('a robot or episodes in the browser', 'view'),
+    'sim': Command('the simulated robot, a ROS node', 'sim_node', is_node=True),
+    'policy': Command('the actor, a ROS node', 'policy_node', is_node=True),
+    'replay': Command('a logged episode as a ROS node', 'replay_node', is_node=True),
+    'train': Command('train an actor', 'train_her'),
+    'evaluate': Command('success of an actor over many episodes', 'evaluate_policy'),
+    'benchmark': Command("the paper's comparison, four arms", 'benchmark'),
+    'export': Command('write an actor as ONNX', 'export_actor'),
+    'episodes': Command(
+        'logged episodes: list, check, recover, export, generate',
+        commands={
+            'list': Command('what is in a directory', 'list_episodes'),
+            'check': Command('run episodes again and compare every bit', 'check_episode'),
+            'recover': Command('make bags of what a crash cut off', 'recover_episodes'),
+            'export': Command('as Parquet or Minari datasets', 'export_episodes'),
+            'generate': Command('log an actor in the batched simulation', 'generate_episodes'),
+        },
+    ),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command named by the first words with the rest; returns its exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    path, rest = _split(given)
+    command = _find(path)
+    if command is None or command.commands:
+        # Help, the version, or an error: the parser says it and exits.
+        make_parser().parse_args(given if rest else [*path, '--help'])
+        return EXIT_USAGE
+    sys.argv = [command.executable or path[-1], *(ros_arguments(rest) if command.is_node else rest)]
+    return run_command(_NAME, lambda: _start(command, path[-1]))
+
+
+def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Returns the words that name a command, and those that follow."""
+    commands, path = COMMANDS, []
+    for word in words:
+        if word not in commands:
+            break
+        path.append(word)
+        commands = commands[word].commands
+    return path, list(words[len(path) :])
+
+
+def _find(path: Sequence[str]) -> Command | None:
+    commands, command = COMMANDS, None
+    for word in path:
+        command = commands[word]
+        commands = command.commands
+    return command
+
+
+def ros_arguments(words: Sequence[str]) -> list[str]:
+    """Returns the arguments of a node; `task:=FetchPush` is enough for `--ros-args -p ...`."""
+    if '--ros-args' in words or not all(':=' in word for word in words):
+        return list(words)
+    parameters = [part for word in words for part in ('-p', word)]
+    return ['--ros-args', *parameters] if parameters else []
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Returns the parser of the command names: for help, errors and completion."""
+    parser = _Parser(prog=_NAME, description=__doc__)
+    parser.add_argument('--version', action='version', version=f'{_NAME} {version(_NAME)}')
+    shtab.add_argument_to(parser, help='print a script that completes commands in your shell')
+    _add_commands(parser, COMMANDS)
+    return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what was probably meant instead of an unknown command."""
+
+    def error(self, message: str) -> None:  # type: ignore[override]
+        if "invalid choice: '" in message:
+            given = message.split("invalid choice: '")[1].split("'")[0]
+            near = difflib.get_close_matches(given, list(self._names()), 1)
+            message = f'no command {given!r}; ' + (
+                f'did you mean {near[0]!r}?' if near else f'allowed: {", ".join(self._names())}'
+            )
+        self.exit(2, f'{self.prog}: {message}\n')
+
+    def _names(self) -> list[str]:
+        words = self.prog.split()[1:]
+        command = _find(words)
+        return list(command.commands if command else COMMANDS)
+
+
+def _add_commands(parser: argparse.ArgumentParser, commands: dict[str, Command]) -> None:
+    subparsers = parser.add_subparsers(metavar='command', required=True)
+    for name, command in commands.items():
+        added = subparsers.add_parser(name, help=command.help, description=command.help)
+        if command.commands:
+            _add_commands(added, command.commands)
+
+
+def _start(command: Command, name: str) -> int:
+    if command.module:
+        return start_command(name, command.module, *command.extras)
+    try:
+        point = find_executable(command.executable)
+    except UnknownExecutableError as error:
+        raise UsageError(str(error)) from None
+    code: int = point.load()()
+    return code
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,108 @@
+"""The one command: finds what it is asked for, passes the rest on, says what it does not know."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import distribution, version
+
+import pytest
+
+from fetch_hand_sim.commands.main import COMMANDS, main, ros_arguments
+
+
+def leaves(commands=COMMANDS, path=()):
+    """Every command that runs something, with the words that name it."""
+    for name, command in commands.items():
+        if command.commands:
+            yield from leaves(command.commands, (*path, name))
+        else:
+            yield (*path, name), command
+
+
+def test_every_executable_has_a_command_and_every_command_its_executable():
+    named = [command.executable for _, command in leaves() if command.executable]
+    points = distribution('fetch_hand_sim').entry_points.select(group='console_scripts')
+    assert sorted([*named, 'fetch_hand_sim']) == sorted(points.names)
+
+
+@pytest.mark.parametrize(
+    'path', [path for path, each in leaves() if not each.is_node], ids=' '.join
+)
+def test_a_command_has_the_help_of_what_it_stands_for(path, capsys, monkeypatch):
+    monkeypatch.setattr(sys, 'argv', [])
+    with pytest.raises(SystemExit) as caught:
+        main([*path, '--help'])
+    assert caught.value.code == 0
+    assert 'usage: ' in (shown := capsys.readouterr().out)
+    assert 'fetch_hand_sim [-h]' not in shown
+
+
+def test_options_and_exit_code_are_those_of_the_executable(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys, 'argv', [])
+    assert main(['episodes', 'list', str(tmp_path), '--task', 'FetchPush']) == 0
+    assert capsys.readouterr().out.startswith('0 episodes')
+    assert main(['episodes', 'list', str(tmp_path / 'none')]) == 2
+    assert capsys.readouterr().err.startswith('list_episodes: ')
+
+
+@pytest.mark.parametrize('arguments', [[], ['--help'], ['episodes'], ['episodes', '--help']])
+def test_without_a_command_there_is_help(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 0
+    shown = capsys.readouterr().out
+    for name in COMMANDS['episodes'].commands if 'episodes' in arguments else COMMANDS:
+        assert f' {name} ' in shown
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'line'),
+    [
+        (['trian', '--task', 'FetchPush'], "no command 'trian'; did you mean 'train'?"),
+        (['x'], "no command 'x'; allowed: demo, "),
+        (['episodes', 'chek'], "no command 'chek'; did you mean 'check'?"),
+        (['--verbose'], 'required: command'),
+    ],
+)
+def test_an_unknown_command_is_one_line(arguments, line, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith('fetch_hand_sim') and line in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    ('words', 'expected'),
+    [
+        ([], []),
+        (['task:=FetchPush', 'seed:=1'], ['--ros-args', '-p', 'task:=FetchPush', '-p', 'seed:=1']),
+        (['--ros-args', '-p', 'seed:=1'], ['--ros-args', '-p', 'seed:=1']),
+        (['--help'], ['--help']),
+    ],
+)
+def test_parameters_of_a_node_need_no_ros_args(words, expected):
+    assert ros_arguments(words) == expected
+
+
+def test_a_node_takes_short_parameters(tmp_path):
+    command = [sys.executable, '-m', 'fetch_hand_sim', 'sim', 'task:=NoSuchTask']
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 2
+    assert 'NoSuchTask' in result.stderr and result.stderr.count('\n') == 1
+
+
+def test_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit):
+        main(['--version'])
+    assert capsys.readouterr().out == f'fetch_hand_sim {version("fetch_hand_sim")}\n'
+
+
+@pytest.mark.parametrize('shell', ['bash', 'zsh', 'tcsh'])
+def test_completion_knows_the_commands(shell, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(['--print-completion', shell])
+    assert caught.value.code == 0
+    script = capsys.readouterr().out
+    assert 'benchmark' in script and 'recover' in script

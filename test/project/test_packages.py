@@ -1,0 +1,107 @@
+"""What is published: wheel, sdist and package.xml are whole and say the same."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tarfile
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+import yaml
+from catkin_pkg.package import parse_package
+from test_colcon_install import PYTHON_PACKAGES, tracked_files
+
+from support import ROOT
+
+# Generated or of use in a checkout alone.
+NOT_IN_SDIST = ('.ci/', '.github/', '.gitignore', '.pre-commit-config.yaml', '.dockerignore')
+
+
+@pytest.fixture(scope='module')
+def built(tmp_path_factory) -> Path:
+    """A folder with wheel and sdist, built from what git tracks."""
+    source, target = tmp_path_factory.mktemp('source'), tmp_path_factory.mktemp('dist')
+    for name in tracked_files():
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        (source / name).write_bytes((ROOT / name).read_bytes())
+    build = 'from setuptools.build_meta import *; build_sdist({0!r}); build_wheel({0!r})'
+    command = [sys.executable, '-c', build.format(str(target))]
+    result = subprocess.run(command, cwd=source, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    return target
+
+
+@pytest.fixture(scope='module')
+def wheel(built: Path) -> zipfile.ZipFile:
+    (path,) = built.glob('*.whl')
+    assert path.name.endswith('-py3-none-any.whl')
+    return zipfile.ZipFile(path)
+
+
+@pytest.fixture(scope='module')
+def metadata(wheel: zipfile.ZipFile):
+    (name,) = (name for name in wheel.namelist() if name.endswith('.dist-info/METADATA'))
+    return Parser().parsestr(wheel.read(name).decode())
+
+
+def test_the_wheel_holds_the_packages_and_nothing_else(wheel: zipfile.ZipFile) -> None:
+    names = {
+        name for name in wheel.namelist() if '.dist-info/' not in name and '.data/' not in name
+    }
+    wanted = {
+        name
+        for name in tracked_files()
+        if name.split('/')[0] in PYTHON_PACKAGES and not name.endswith('.training.safetensors')
+    }
+    assert names == wanted
+
+
+def test_the_sdist_holds_all_that_is_tracked(built: Path) -> None:
+    (path,) = built.glob('*.tar.gz')
+    with tarfile.open(path) as archive:
+        names = {name.partition('/')[2] for name in archive.getnames()}
+    missing = set(tracked_files()) - names
+    assert {name for name in missing if not name.startswith(NOT_IN_SDIST)} == {
+        name for name in missing if name.endswith('.training.safetensors')
+    }
+
+
+def test_the_metadata_are_whole(metadata) -> None:
+    assert metadata['Requires-Python'] == '>=3.11'
+    assert metadata['Description-Content-Type'] == 'text/markdown'
+    assert metadata.get_payload().startswith('# fetch_hand_sim')
+    assert metadata.get_all('Project-URL') and len(metadata.get_all('Classifier')) > 5
+
+
+def test_the_base_installation_is_small(metadata) -> None:
+    base = [each for each in metadata.get_all('Requires-Dist') if 'extra ==' not in each]
+    heavy = ('torch', 'pyarrow', 'tensorboard', 'matplotlib', 'ray', 'ros-jazzy', 'onnx', 'stable')
+    assert base and not [each for each in base if each.startswith(heavy)]
+
+
+def test_all_versions_are_one(metadata) -> None:
+    citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
+    versions = {metadata['Version'], parse_package(ROOT / 'package.xml').version}
+    assert versions == {citation['version']}
+
+
+def test_package_xml_is_valid() -> None:
+    warnings: list[str] = []
+    package = parse_package(ROOT / 'package.xml', warnings=warnings)
+    package.validate(warnings=warnings)
+    assert warnings == []
+    assert package.package_format == 3 and package.urls
+    assert [license_.file for license_ in package.licenses] == ['LICENSE']
+
+
+def test_an_old_python_is_refused_by_name(tmp_path: Path) -> None:
+    code = 'import sys, setuptools\nsys.version_info, sys.version = (3, 10, 13), "3.10.13 (main)"\n'
+    setup = (ROOT / 'setup.py').read_text()
+    result = subprocess.run(
+        [sys.executable, '-c', code + setup], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert result.returncode == 1
+    assert result.stderr == 'fetch_hand_sim needs Python 3.11 or newer; this is 3.10.13\n'

@@ -1,0 +1,55 @@
+#!/bin/sh
+# Builds sdist and wheel, checks them, installs the wheel where no source is, and uses it.
+# PYTHON=... chooses the interpreter, PIP_OPTIONS=... adds options to `pip install`.
+set -eu
+cd "$(dirname "$0")/.."
+root=$PWD
+python=${PYTHON:-$root/.venv/bin/python}
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+unset PYTHONPATH
+
+say() { echo "test-release: $*"; }
+
+pip_install() {
+    environment=$1
+    shift
+    # shellcheck disable=SC2086
+    "$work/$environment/bin/python" -m pip install --disable-pip-version-check --quiet \
+        ${PIP_OPTIONS:-} --constraint "$root/constraints.txt" "$@"
+}
+
+say 'building what git tracks'
+mkdir "$work/source"
+git ls-files -z | xargs -0 tar -cf - | tar -xf - -C "$work/source"
+"$python" -m venv "$work/tools"
+pip_install tools build check-wheel-contents twine
+(cd "$work/source" && "$work/tools/bin/python" -m build --outdir "$work/dist" >"$work/build.log" 2>&1) ||
+    { cat "$work/build.log"; exit 1; }
+"$work/tools/bin/python" -m twine check --strict "$work"/dist/*
+"$work/tools/bin/check-wheel-contents" --config "$root/pyproject.toml" "$work"/dist/*.whl
+wheel=$(echo "$work"/dist/*.whl)
+
+say 'base installation: small, and enough for the environments'
+"$python" -m venv "$work/base"
+empty=$(du -sm "$work/base" | cut -f1)
+pip_install base "$wheel"
+size=$(($(du -sm "$work/base" | cut -f1) - empty))
+say "the base installation adds $size MB (at most 350)"
+[ "$size" -le 350 ]
+mkdir "$work/elsewhere"
+cd "$work/elsewhere"
+"$work/base/bin/fetch_hand_sim" --version
+"$work/base/bin/python" "$root/tools/try_environment.py"
+for command in sim policy replay train evaluate benchmark; do
+    if "$work/base/bin/fetch_hand_sim" $command >"$work/out" 2>&1; then exit 1; fi
+    grep -q "pip install 'fetch_hand_sim\[" "$work/out" && [ "$(wc -l <"$work/out")" -eq 1 ] ||
+        { cat "$work/out"; exit 1; }
+done
+
+say 'with ROS and actors: the demo'
+pip_install base "$wheel[ros,actors]"
+"$work/base/bin/fetch_hand_sim" demo --episodes 2
+"$work/base/bin/fetch_hand_sim" episodes check episodes
+"$work/base/bin/fetch_hand_sim" evaluate --actor FetchReach --episodes 20
+say 'done'
