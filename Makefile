@@ -17,7 +17,7 @@ STAMP := $(VENV)/.complete
 # not leak in.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo test lint format twin bench-sim bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
+.PHONY: help env demo pictures test lint format twin bench-sim bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -25,6 +25,7 @@ help:
 	@echo 'make test       lint, types and all tests'
 	@echo 'make lint       ruff and mypy only'
 	@echo 'make format     let ruff rewrite the code'
+	@echo 'make pictures   the film of the README and a picture of every task, from logged episodes'
 	@echo 'make twin       the long comparison with Gymnasium-Robotics, 20 seeds per task'
 	@echo 'make bench-sim  simulation speed against its peers'
 	@echo 'make bench-her  training speed against Stable-Baselines3'
@@ -66,6 +67,9 @@ format: env
 
 twin: env
 	$(BIN)/python -m pytest --twin-seeds 20 --timeout 0 test/fetch_hand_sim/simulation/test_twin.py
+
+pictures: env
+	$(BIN)/python tools/make_pictures.py
 
 bench-sim: env
 	$(BIN)/python bench/bench_sim.py

@@ -25,6 +25,8 @@ EXTRAS = {
     'sb3': [*ACTORS, 'stable-baselines3>=2.4'],
     # To write ONNX actors; onnxruntime alone runs them.
     'onnx': ['onnx>=1.17', 'onnxruntime>=1.20', 'onnxscript>=0.3'],
+    # `render_episode` to .mp4.
+    'film': ['imageio-ffmpeg>=0.5'],
     # `benchmark --ray`.
     'cluster': [*ACTORS, 'matplotlib>=3.8', 'ray>=2.10'],
 }
@@ -113,6 +115,7 @@ setup(
             'train_her = policy_node.training.commands:train_her',
             'evaluate_policy = policy_node.training.commands:evaluate_policy',
             'view = fetch_hand_sim.view:main',
+            'render_episode = fetch_hand_sim.commands.render_episode:main',
             'replay_node = fetch_hand_sim.replay_node:main',
             'list_episodes = fetch_hand_sim.commands.list_episodes:main',
             'check_episode = fetch_hand_sim.commands.check_episode:main',

@@ -28,6 +28,7 @@ EXTRAS = {
     'data': ('pyarrow', 'minari'),
     'sb3': ('stable_baselines3',),
     'onnx': ('onnx', 'onnxruntime', 'onnxscript'),
+    'film': ('imageio_ffmpeg',),
     'cluster': ('ray',),
 }
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeReadError
+from fetch_hand_sim.films.recording import Recording, load_recording
 from fetch_hand_sim.simulation.scene import tracked_position
 from fetch_hand_sim.view.curves import Curves
 from fetch_hand_sim.view.messages import (
@@ -25,7 +26,6 @@ from fetch_hand_sim.view.messages import (
     StepOnce,
     Timeline,
 )
-from fetch_hand_sim.view.recording import Recording, load_recording
 
 Array = NDArray[np.float64]
 

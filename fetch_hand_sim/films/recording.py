@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode
 from fetch_hand_sim.episode_log.messages import read_messages
+from fetch_hand_sim.episode_log.summary import expand_episodes
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
 from msgs_spec.cdr import TopicCodec
@@ -91,3 +92,19 @@ def _vectors(path: Path, spec: TaskSpec, name: str, ticks: int) -> Array:
         return TopicCodec(topic(spec, name)).decode_many(rows)[1]
     except (ValueError, KeyError) as error:
         raise EpisodeReadError(f'{file.path}: no readable {name}: {error}') from error
+
+
+def load_recordings(path: Path, count: int) -> list[Recording]:
+    """Reads the first episodes of a path.
+
+    Args:
+        path: An episode, or a folder of episodes.
+        count: How many at most.
+
+    Raises:
+        EpisodeReadError: If there is none, or one cannot be read.
+    """
+    paths = expand_episodes(path)[:count]
+    if not paths:
+        raise EpisodeReadError(f'{path}: no episodes')
+    return [load_recording(each) for each in paths]

@@ -1,0 +1,108 @@
+"""`render_episode FILE --out film.mp4`: a film or picture of a logged episode, or of many at once.
+
+Needs no display. Exit code 0: written; 1: something failed; 2: bad usage, or an episode that cannot
+be read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_spec.command_line import EXIT_SUCCESS, CommandError, UsageError, progress, run_command
+
+_NAME = 'render_episode'
+_SPEEDS = (0.01, 100.0)
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition('x')
+    return int(width), int(height)
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    parser.add_argument('path', type=Path, help='an episode; with --grid a folder of episodes')
+    parser.add_argument(
+        '--out', type=Path, required=True, help='film.mp4, .gif or .webp; picture.png or .jpg'
+    )
+    parser.add_argument(
+        '--size', type=_size, default=(640, 480), metavar='WxH', help='pixels; default: 640x480'
+    )
+    parser.add_argument('--camera', help='a camera of the model; default: a good view')
+    parser.add_argument(
+        '--grid', type=_size, metavar='CxR', help='columns x rows of episodes, such as 4x4'
+    )
+    parser.add_argument('--frame', type=int, default=-1, help='of a picture; default: the last')
+    parser.add_argument('--speed', type=float, default=1.0, help='simulated seconds per second')
+    options = parser.parse_args(arguments)
+    if not _SPEEDS[0] <= options.speed <= _SPEEDS[1]:
+        parser.error(f'--speed {options.speed:g}; allowed: {_SPEEDS[0]:g} ... {_SPEEDS[1]:g}')
+    if options.grid and not all(1 <= side <= 20 for side in options.grid):
+        parser.error('--grid: allowed: 1x1 ... 20x20')
+    return options
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    options = _parse(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    from fetch_hand_sim.episode_log import EpisodeReadError
+    from fetch_hand_sim.films.film import check_kind
+
+    check_kind(options.out)
+    try:
+        _render(options)
+    except EpisodeReadError as error:
+        raise UsageError(str(error)) from None
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    except RuntimeError as error:
+        raise CommandError(str(error)) from None
+    print(f'{options.out}: {options.out.stat().st_size / 1024:.0f} KiB')
+    return EXIT_SUCCESS
+
+
+def _render(options: argparse.Namespace) -> None:
+    from fetch_hand_sim.films.film import STILL, write_film, write_picture
+    from fetch_hand_sim.films.pictures import Picture, Studio, grid, tile
+    from fetch_hand_sim.films.recording import Recording, load_recordings
+
+    columns, rows = options.grid or (1, 1)
+    recordings: list[Recording] = load_recordings(options.path, columns * rows)
+    width, height = options.size
+    studio = Studio(width, height, options.camera)
+    try:
+        if options.out.suffix.lower() in STILL:
+            stills = [studio.picture(recording, options.frame) for recording in recordings]
+            write_picture(options.out, tile(stills, columns))
+            return
+        hz = float(recordings[0].arrays.metadata['control_hz'])
+        pictures: Iterator[Picture] = (
+            grid(studio, recordings, columns) if options.grid else studio.pictures(recordings[0])
+        )
+        count = max(len(recording.frames) for recording in recordings)
+        with progress('pictures', count) as advance:
+            write_film(options.out, _counted(pictures, advance), hz * options.speed)
+    finally:
+        studio.close()
+
+
+def _counted(
+    pictures: Iterator[NDArray[np.uint8]], advance: Callable[[int], None]
+) -> Iterator[NDArray[np.uint8]]:
+    for picture in pictures:
+        yield picture
+        advance(1)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,141 @@
+"""Writes films and pictures; the ending of the file says what kind."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_spec.command_line import CommandError, UsageError
+
+Picture = NDArray[np.uint8]
+
+MOVING = ('.mp4', '.gif', '.webp')
+STILL = ('.png', '.jpg')
+# Of GIF and WebP: every colour kept would make files several times as large.
+_QUALITY = 72
+_COLORS = 128
+_SAMPLES = 8
+
+
+def check_kind(path: Path) -> None:
+    """Checks that a file can be written, before anything is drawn.
+
+    Raises:
+        UsageError: If its ending is not known, its folder not there, or what it needs missing.
+    """
+    kind = path.suffix.lower()
+    if kind not in (*MOVING, *STILL):
+        raise UsageError(f'--out {path}; allowed: {", ".join((*MOVING, *STILL))}')
+    if not path.absolute().parent.is_dir():
+        raise UsageError(f'--out {path}: {path.absolute().parent} is no directory')
+    if kind == '.mp4':
+        _ffmpeg()
+
+
+def write_film(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+    """Writes pictures (height, width, 3) of one size; the file appears when it is complete.
+
+    Args:
+        path: Ending in .mp4, .gif or .webp.
+        pictures: Drawn as they are written.
+        fps: Pictures per second.
+
+    Raises:
+        UsageError: If there is no ffmpeg.
+        CommandError: If it fails.
+    """
+    with _appearing(path) as hidden:
+        if path.suffix.lower() == '.mp4':
+            _write_mp4(hidden, pictures, fps)
+        else:
+            _write_animation(hidden, pictures, fps)
+
+
+def write_picture(path: Path, picture: Picture) -> None:
+    """Writes one picture (height, width, 3) as .png or .jpg."""
+    from PIL import Image
+
+    with _appearing(path) as hidden:
+        Image.fromarray(picture).save(hidden, quality=85, optimize=True)
+
+
+def _write_animation(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+    from PIL import Image
+
+    images = [Image.fromarray(picture) for picture in pictures]
+    first, *rest = images
+    milliseconds = round(1000.0 / fps)
+    if path.suffix == '.webp':
+        first.save(
+            path,
+            save_all=True,
+            append_images=rest,
+            duration=milliseconds,
+            loop=0,
+            quality=_QUALITY,
+            method=4,
+        )
+        return
+    # One palette for all, or colours flicker; made of some, because goals change their colour.
+    some = images[:: max(1, len(images) // _SAMPLES)]
+    samples = Image.fromarray(np.concatenate([np.asarray(image) for image in some]))
+    palette = samples.quantize(_COLORS)
+    frames = [image.quantize(palette=palette) for image in images]
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, optimize=True
+    )
+
+
+def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+    iterator = iter(pictures)
+    first = next(iterator)
+    height, width = first.shape[:2]
+    command = [_ffmpeg(), '-y', '-loglevel', 'error', '-f', 'rawvideo', '-pix_fmt', 'rgb24']
+    command += ['-s', f'{width}x{height}', '-r', f'{fps:g}', '-i', '-', '-an']
+    # H.264 in 4:2:0, which every player shows, needs even sides.
+    command += ['-vf', 'pad=ceil(iw/2)*2:ceil(ih/2)*2', '-c:v', 'libx264', '-crf', '20']
+    command += ['-pix_fmt', 'yuv420p', '-movflags', '+faststart', '-f', 'mp4', str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stderr is not None
+        try:
+            for picture in chain([first], iterator):
+                process.stdin.write(np.ascontiguousarray(picture).tobytes())
+            process.stdin.close()
+        except BrokenPipeError:
+            pass
+        complaint = process.stderr.read().decode(errors='replace')
+    if process.returncode:
+        raise CommandError(f'ffmpeg: {complaint or process.returncode}')
+
+
+def _ffmpeg() -> str:
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        return str(get_ffmpeg_exe())
+    except (ImportError, RuntimeError):
+        found = shutil.which('ffmpeg')
+    if found is None:
+        raise UsageError("mp4 needs ffmpeg: pip install 'fetch_hand_sim[film]'; or write a .gif")
+    return found
+
+
+@contextmanager
+def _appearing(path: Path) -> Iterator[Path]:
+    """A hidden file beside the path that takes its name when all is written."""
+    hidden = path.with_name(f'.{path.stem}.active{path.suffix.lower()}')
+    try:
+        yield hidden
+        os.replace(hidden, path)
+    except OSError as error:
+        raise CommandError(f'{path}: {error.strerror or error}') from error
+    finally:
+        hidden.unlink(missing_ok=True)

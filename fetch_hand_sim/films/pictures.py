@@ -1,0 +1,106 @@
+"""From recordings to pictures: one after the other, or many side by side."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.films.recording import Recording
+from fetch_hand_sim.simulation.rendering import SceneRenderer
+from fetch_hand_sim.simulation.scene import Scene, tracked_position
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+_TRAIL_TICKS = 40
+_GAP = 2
+# Around a tile whose episode has reached its goal.
+_REACHED = np.array([40, 170, 70], dtype=np.uint8)
+_FRAME = 3
+
+
+class Studio:
+    """Draws recordings of any tasks in one size; each model is compiled once."""
+
+    def __init__(self, width: int, height: int, camera: str | None = None) -> None:
+        """Takes the size in pixels, and a camera of the models by name or None for the usual."""
+        self.width, self.height = width, height
+        self._camera = camera
+        self._renderers: dict[str, SceneRenderer] = {}
+
+    def pictures(self, recording: Recording) -> Iterator[Picture]:
+        """Yields the picture (height, width, 3) of every frame.
+
+        Raises:
+            ValueError: If the model has no such camera.
+            RuntimeError: If there is no OpenGL.
+        """
+        renderer = self._renderer(recording.spec.name)
+        trail: deque[Array] = deque(maxlen=_TRAIL_TICKS)
+        for frame in recording.frames:
+            trail.append(tracked_position(frame))
+            yield renderer.render(frame, trail)
+
+    def picture(self, recording: Recording, index: int) -> Picture:
+        """Returns the picture of one frame; negative indices count from the end."""
+        frames = recording.frames
+        index = index % len(frames)
+        trail = [tracked_position(f) for f in frames[max(0, index - _TRAIL_TICKS) : index + 1]]
+        return self._renderer(recording.spec.name).render(frames[index], trail)
+
+    def close(self) -> None:
+        """Frees OpenGL."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+
+    def _renderer(self, task: str) -> SceneRenderer:
+        if task not in self._renderers:
+            self._renderers[task] = SceneRenderer(
+                Scene(task), self.width, self.height, self._camera
+            )
+        return self._renderers[task]
+
+
+def tile(pictures: Sequence[Picture], columns: int) -> Picture:
+    """Puts pictures of one size side by side, row by row; what is missing stays white."""
+    height, width = pictures[0].shape[:2]
+    rows = -(-len(pictures) // columns)
+    sheet = np.full(
+        (rows * (height + _GAP) - _GAP, columns * (width + _GAP) - _GAP, 3), 255, dtype=np.uint8
+    )
+    for number, picture in enumerate(pictures):
+        top, left = (number // columns) * (height + _GAP), (number % columns) * (width + _GAP)
+        sheet[top : top + height, left : left + width] = picture
+    return sheet
+
+
+def grid(studio: Studio, recordings: Sequence[Recording], columns: int) -> Iterator[Picture]:
+    """Yields all recordings side by side; the shorter ones wait at their last frame.
+
+    A green frame says which of them are at their goal.
+    """
+    last: list[Picture] = []
+    for pictures in zip_longest(*(_framed(studio, recording) for recording in recordings)):
+        last = [
+            before if picture is None else picture
+            for picture, before in zip(pictures, last or pictures, strict=True)
+        ]
+        yield tile(last, columns)
+
+
+def _framed(studio: Studio, recording: Recording) -> Iterator[Picture]:
+    for picture, frame in zip(studio.pictures(recording), recording.frames, strict=True):
+        yield with_frame(picture) if frame.is_success else picture
+
+
+def with_frame(picture: Picture) -> Picture:
+    """Returns a picture with a green frame."""
+    framed = picture.copy()
+    for edge in (np.s_[:_FRAME], np.s_[-_FRAME:], np.s_[:, :_FRAME], np.s_[:, -_FRAME:]):
+        framed[edge] = _REACHED
+    return framed

@@ -1,0 +1,151 @@
+"""Films: real pictures of real episodes, in every kind of file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from fetch_hand_sim.commands.render_episode import main as render_episode
+from fetch_hand_sim.episode_log import EpisodeDirectory
+from fetch_hand_sim.films.film import check_kind, write_film, write_picture
+from fetch_hand_sim.films.pictures import Studio, grid, tile, with_frame
+from fetch_hand_sim.films.recording import load_recordings
+from fetch_hand_sim.simulation.opengl import prepare_opengl
+from msgs_spec.command_line import CommandError, UsageError
+from support.episode_recorder import Recorder
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    directory = tmp_path_factory.mktemp('episodes')
+    recorder = Recorder('FetchReach')
+    for _ in range(3):
+        recorder.record(EpisodeDirectory(directory))
+    return directory
+
+
+@pytest.fixture(scope='module')
+def opengl():
+    try:
+        return prepare_opengl()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+
+
+PICTURES = [np.full((5, 7, 3), 40 * number, dtype=np.uint8) for number in range(5)]
+
+
+@pytest.mark.parametrize('kind', ['.gif', '.webp'])
+def test_animations_hold_every_picture(kind, tmp_path):
+    path = tmp_path / f'film{kind}'
+    write_film(path, iter(PICTURES), fps=25.0)
+    with Image.open(path) as image:
+        assert image.n_frames == len(PICTURES) and image.size == (7, 5)
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
+def test_mp4_holds_every_picture(tmp_path):
+    pytest.importorskip('imageio_ffmpeg')
+    import imageio.v3 as imageio
+
+    path = tmp_path / 'film.mp4'
+    big = [np.kron(picture, np.ones((20, 20, 1), dtype=np.uint8)) for picture in PICTURES]
+    write_film(path, iter(big), fps=25.0)
+    frames = imageio.imread(path)
+    assert frames.shape == (5, 100, 140, 3)
+    assert np.abs(frames.mean(axis=(1, 2, 3)) - 40.0 * np.arange(5)).max() < 6.0
+
+
+def test_a_film_that_fails_leaves_nothing(tmp_path):
+    def pictures():
+        yield PICTURES[0]
+        raise RuntimeError('no more')
+
+    with pytest.raises(RuntimeError):
+        write_film(tmp_path / 'film.gif', pictures(), fps=25.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_line():
+    with pytest.raises(CommandError):
+        write_picture(check_path('/proc/picture.png'), PICTURES[0])
+
+
+def check_path(text):
+    from pathlib import Path
+
+    return Path(text)
+
+
+@pytest.mark.parametrize('out', ['film.avi', 'film', 'nosuch/film.gif'])
+def test_what_cannot_be_written_is_said_before_drawing(out, tmp_path):
+    with pytest.raises(UsageError):
+        check_kind(tmp_path / out)
+
+
+def test_tiles_lie_in_rows():
+    sheet = tile(PICTURES[:3], columns=2)
+    assert sheet.shape == (12, 16, 3)
+    assert sheet[0, 9, 0] == 40 and sheet[7, 0, 0] == 80 and (sheet[7:, 9:] == 255).all()
+
+
+def test_a_frame_changes_only_the_edge():
+    picture = np.zeros((20, 30, 3), dtype=np.uint8)
+    framed = with_frame(picture)
+    assert framed[0].any() and framed[:, 0].any() and not framed[3:-3, 3:-3].any()
+    assert not picture.any()
+
+
+@pytest.mark.usefixtures('opengl')
+def test_pictures_show_what_was_logged(folder):
+    (recording, *others) = load_recordings(folder, 3)
+    studio = Studio(64, 48)
+    first, last = studio.picture(recording, 0), studio.picture(recording, -1)
+    assert first.shape == (48, 64, 3) and first.std() > 10
+    assert (first != last).any()
+    np.testing.assert_array_equal(studio.picture(recording, 0), first)
+    sheets = grid(studio, [recording, *others], columns=2)
+    assert next(sheets).shape == (98, 130, 3)
+    studio.close()
+
+
+@pytest.mark.usefixtures('opengl')
+def test_command_writes_a_film_and_a_picture(folder, tmp_path, capsys):
+    for out, more in (('grid.png', ['--grid', '2x2']), ('one.jpg', ['--camera', 'lidar'])):
+        path = tmp_path / out
+        assert render_episode([str(folder), '--out', str(path), '--size', '64x48', *more]) == 0
+        assert path.name in capsys.readouterr().out
+        with Image.open(path) as image:
+            assert image.size == ((130, 98) if more[0] == '--grid' else (64, 48))
+
+
+@pytest.mark.usefixtures('opengl')
+@pytest.mark.parametrize('more', [['--camera', 'nosuch'], ['--size', '0x7'], ['--size', '9999x7']])
+def test_bad_usage_is_one_line(folder, tmp_path, more, capsys):
+    code = render_episode([str(folder), '--out', str(tmp_path / 'x.png'), *more])
+    error = capsys.readouterr().err
+    assert code == 2 and error.count('\n') == 1 and 'allowed' in error
+
+
+def test_without_opengl_it_says_what_to_install(folder, tmp_path):
+    code = (
+        'import ctypes, sys\n'
+        'def gone(name): raise OSError(name)\n'
+        'import fetch_hand_sim.simulation.opengl as opengl\n'
+        'opengl._is_installed = lambda library: False\n'
+        'from fetch_hand_sim.commands.render_episode import main\n'
+        f'sys.exit(main([{str(folder)!r}, "--out", {str(tmp_path / "x.png")!r}]))'
+    )
+    environment = {'PATH': '/usr/bin:/bin', 'PYTHONPATH': ':'.join(sys.path)}
+    result = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, env=environment
+    )
+    assert result.returncode == 1
+    assert result.stderr == (
+        'render_episode: rendering needs OpenGL: apt install libegl1 libgl1-mesa-dri, or apt '
+        'install libosmesa6\n'
+    )
