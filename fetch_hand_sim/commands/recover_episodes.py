@@ -23,6 +23,7 @@ from msgs_spec.command_line import (
     EXIT_SUCCESS,
     UsageError,
     complain,
+    printable,
     progress,
     run_command,
 )
@@ -49,29 +50,36 @@ def _run(options: argparse.Namespace) -> int:
     failures = 0
     with progress('unfinished episodes', len(leftovers)) as advance:
         for leftover in leftovers:
-            print(leftover, flush=True)
+            _say(str(leftover))
             if not options.dry_run:
                 failures += not _recover(leftover.path)
             advance(1)
     if not leftovers:
-        print(f'{options.directory}: no unfinished episode')
+        _say(f'{options.directory}: no unfinished episode')
     return EXIT_FAILURE if failures else EXIT_SUCCESS
 
 
 def _recover(leftover: Path) -> bool:
     """Recovers one episode and says what came out; whether it worked."""
     try:
-        episode = read_summary(recover_episode(leftover))
+        path = recover_episode(leftover)
+        if path is None:
+            _say(f'cleared away {leftover}: it was killed before its first messages were written')
+            return True
+        episode = read_summary(path)
     except (EpisodeLogError, EpisodeReadError) as error:
         complain(_NAME, error)
         return False
     state = 'complete' if episode.is_complete else 'marked as interrupted'
-    print(
+    _say(
         f'recovered {episode.path.parent}: {episode.message_count} messages, '
-        f'{episode.duration_s:.2f} s, {state}',
-        flush=True,
+        f'{episode.duration_s:.2f} s, {state}'
     )
     return True
+
+
+def _say(text: str) -> None:
+    print(printable(text), flush=True)
 
 
 if __name__ == '__main__':

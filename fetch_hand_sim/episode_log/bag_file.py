@@ -13,6 +13,13 @@ from typing import BinaryIO, Literal
 from mcap.writer import CompressionType, IndexType, Writer
 
 from fetch_hand_sim.episode_log.bag_metadata import BagInfo, ChannelInfo
+from fetch_hand_sim.episode_log.limits import (
+    MAX_CHUNKS,
+    MAX_MESSAGE_BYTES,
+    MAX_MESSAGES,
+    MAX_TOPICS,
+    MAX_UNPACKED_BYTES,
+)
 
 Compression = Literal['none', 'lz4', 'zstd']
 COMPRESSIONS = {
@@ -21,6 +28,9 @@ COMPRESSIONS = {
     'zstd': CompressionType.ZSTD,
 }
 _ALL_BUT_ATTACHMENTS = IndexType.ALL & ~IndexType.ATTACHMENT
+# Bytes in a chunk beside the data of a message, and at most for the first message of a topic.
+_MESSAGE_BYTES = 1 + 8 + 2 + 4 + 8 + 8
+_TOPIC_BYTES = 2**16
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +50,12 @@ class ChannelSpec:
     schema_text: str
     qos_yaml: str
     type_hash: str
+
+
+def _topic_bytes(spec: ChannelSpec) -> int:
+    """Bytes of the schema and the channel of a topic, with some to spare."""
+    texts = (spec.topic, spec.type_name, spec.schema_text, spec.qos_yaml, spec.type_hash)
+    return 4 * 64 + sum(len(text.encode()) for text in texts)
 
 
 @dataclass(slots=True)
@@ -80,6 +96,9 @@ class BagFile:
         self._channels: dict[str, _Channel] = {}
         self._start_ns = 0
         self._end_ns = -1
+        self._chunk_size = chunk_size
+        self._messages = self._bytes = self._chunks = self._chunk_bytes = 0
+        self._has_unflushed = False
         self._writer.start(profile='ros2')
 
     def write(self, spec: ChannelSpec, data: bytes, log_time_ns: int) -> None:
@@ -89,12 +108,18 @@ class BagFile:
         none is missing.
 
         Raises:
-            ValueError: If the time is not later than that of the message before.
+            ValueError: If the time is not later than that of the message before, or readers would
+                refuse the file; nothing is written then.
         """
         if log_time_ns <= self._end_ns:
             raise ValueError(
                 f'log time {log_time_ns} ns of {spec.topic} is not later than the one before it, '
                 f'{self._end_ns} ns'
+            )
+        if not self.takes(len(data)):
+            raise ValueError(
+                f'{spec.topic}: no reader takes {self._messages + 1} messages of '
+                f'{self._bytes + len(data)} bytes in {self._chunks} chunks'
             )
         channel = self._channels.get(spec.topic) or self._add_channel(spec)
         self._writer.add_message(
@@ -108,8 +133,42 @@ class BagFile:
             self._start_ns = log_time_ns
         self._end_ns = log_time_ns
         channel.count += 1
+        self._messages += 1
+        self._has_unflushed = True
+        self._count_bytes(_MESSAGE_BYTES + len(data))
+
+    @property
+    def chunks(self) -> int:
+        """Chunks so far, the one in progress counted."""
+        return self._chunks + (self._chunk_bytes > 0)
+
+    @property
+    def has_unflushed(self) -> bool:
+        """Whether there are messages that the operating system does not have yet."""
+        return self._has_unflushed
+
+    def takes(self, size: int) -> bool:
+        """Whether readers take the file with one more message of `size` bytes."""
+        return (
+            size <= MAX_MESSAGE_BYTES
+            and self._messages < MAX_MESSAGES
+            and self._bytes + _TOPIC_BYTES + _MESSAGE_BYTES + size <= MAX_UNPACKED_BYTES
+            and self.chunks < MAX_CHUNKS
+        )
+
+    def _count_bytes(self, size: int) -> None:
+        self._bytes += size
+        self._chunk_bytes += size
+        if self._chunk_bytes > self._chunk_size:
+            self._end_chunk()
+
+    def _end_chunk(self) -> None:
+        self._chunks += self._chunk_bytes > 0
+        self._chunk_bytes = 0
 
     def _add_channel(self, spec: ChannelSpec) -> _Channel:
+        if len(self._channels) >= MAX_TOPICS or _topic_bytes(spec) > _TOPIC_BYTES:
+            raise ValueError(f'{spec.topic}: no reader takes more topics, or one of many words')
         if spec.type_name not in self._schemas:
             self._schemas[spec.type_name] = self._writer.register_schema(
                 name=spec.type_name, encoding='ros2msg', data=spec.schema_text.encode()
@@ -124,6 +183,7 @@ class BagFile:
             },
         )
         self._channels[spec.topic] = channel = _Channel(spec, channel_id)
+        self._count_bytes(_topic_bytes(spec))
         return channel
 
     def add_record(self, name: str, content: dict[str, str]) -> None:
@@ -138,6 +198,8 @@ class BagFile:
 
     def flush(self) -> None:
         """Ends the chunk in progress and hands everything to the operating system."""
+        self._end_chunk()
+        self._has_unflushed = False
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def finish(self) -> None:

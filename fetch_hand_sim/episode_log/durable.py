@@ -5,10 +5,11 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import stat
 from contextlib import suppress
 from io import BufferedWriter
 from pathlib import Path
-from typing import IO
+from typing import IO, BinaryIO
 
 from fetch_hand_sim.episode_log.errors import EpisodeExistsError
 
@@ -33,6 +34,16 @@ def bag_file(directory: Path, name: str) -> Path:
     return directory / f'{name}_0.mcap'
 
 
+def rewritten_file(file: Path) -> Path:
+    """Returns where recovery writes the MCAP file anew before it takes its place."""
+    return file.with_suffix('.recovered')
+
+
+def metadata_file(directory: Path) -> Path:
+    """Returns rosbag2's description of the bag in a directory."""
+    return directory / 'metadata.yaml'
+
+
 def claim(directory: Path, name: str) -> BufferedWriter:
     """Creates the hidden directory of an episode; of several processes one succeeds.
 
@@ -54,10 +65,15 @@ def claim(directory: Path, name: str) -> BufferedWriter:
         if (directory / name).exists():
             raise EpisodeExistsError(f'{directory / name} exists; episodes are never overwritten')
         stream = bag_file(active, name).open('xb')
+    except FileNotFoundError:
+        raise EpisodeExistsError(f'{active} was cleared away as the rest of a kill') from None
     except (OSError, EpisodeExistsError):
         active.rmdir()
         raise
     lock(stream)
+    if os.fstat(stream.fileno()).st_nlink == 0:
+        stream.close()
+        raise EpisodeExistsError(f'{active} was cleared away as the rest of a kill')
     return stream
 
 
@@ -90,9 +106,27 @@ def try_lock(stream: IO[bytes], shared: bool = False) -> bool:
     return True
 
 
+def open_regular(path: Path) -> BinaryIO:
+    """Opens a regular file for reading; no symbolic link is followed, no pipe waited for.
+
+    Raises:
+        OSError: If it is anything else; the reason says so.
+    """
+    if not stat.S_ISREG(path.lstat().st_mode):
+        raise OSError(errno.EINVAL, 'is no regular file', str(path))
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    return os.fdopen(os.open(path, flags), 'rb')
+
+
+def create(path: Path) -> BinaryIO:
+    """Opens a file of its own for writing: what had the name before, a link too, is removed."""
+    path.unlink(missing_ok=True)
+    return path.open('xb')
+
+
 def is_locked(path: Path) -> bool:
-    """Whether a process is writing the file."""
-    with path.open('rb') as stream:
+    """Whether a process is writing the regular file."""
+    with open_regular(path) as stream:
         return not try_lock(stream, shared=True)
 
 
@@ -112,8 +146,8 @@ def sync_directory(path: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a text file to the disk."""
-    with path.open('wb') as stream:
+    """Writes a text file to the disk; see `create`."""
+    with create(path) as stream:
         stream.write(text.encode())
         sync(stream)
 

@@ -38,19 +38,25 @@ def begin_bag(
     return bag
 
 
-def complete_bag(
-    bag: BagFile,
-    stream: BinaryIO,
-    directory: Path,
-    metadata: dict[str, str],
-    result: dict[str, str],
-) -> None:
-    """Writes how the episode ended, the summary and `metadata.yaml`, down to the disk."""
+def end_bag(
+    bag: BagFile, stream: BinaryIO, metadata: dict[str, str], result: dict[str, str]
+) -> str:
+    """Writes how the episode ended and the summary, as far as the operating system.
+
+    Returns:
+        The text of `metadata.yaml`.
+    """
     custom_data = {**metadata, **result}
     bag.flush()
     info = bag.info
     bag.add_record(EPISODE_RESULT, result)
     bag.add_record(ROSBAG2, metadata_record(info, custom_data))
     bag.finish()
+    stream.flush()
+    return metadata_yaml(info, custom_data)
+
+
+def store_bag(stream: BinaryIO, directory: Path, description: str) -> None:
+    """Brings an ended bag and its `metadata.yaml` to the disk."""
     durable.sync(stream)
-    durable.write_text(directory / 'metadata.yaml', metadata_yaml(info, custom_data))
+    durable.write_text(durable.metadata_file(directory), description)

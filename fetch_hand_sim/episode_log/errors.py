@@ -1,10 +1,22 @@
-"""What can go wrong with an episode file."""
+"""What can go wrong with an episode file. Every message is one line that no terminal obeys."""
 
 from __future__ import annotations
+
+from msgs_spec.command_line import printable
+
+_LONGEST_REASON = 200
+
+
+def one_line(error: BaseException) -> str:
+    """Returns what an error says in one line of bounded length."""
+    return printable(' '.join(str(error).split()) or type(error).__name__)[:_LONGEST_REASON]
 
 
 class EpisodeLogError(RuntimeError):
     """An episode cannot be written; the message is one line with path and reason."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
 
 
 class EpisodeExistsError(EpisodeLogError):
@@ -13,3 +25,6 @@ class EpisodeExistsError(EpisodeLogError):
 
 class EpisodeReadError(ValueError):
     """A file is not a complete, undamaged episode; the message is one line with path and reason."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import mmap
 import struct
-import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,16 +17,15 @@ from mcap.records import Channel, Chunk, Metadata
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
-from fetch_hand_sim.episode_log.limits import MAX_UNPACKED_BYTES
+from fetch_hand_sim.episode_log.limits import MAX_MESSAGES, MAX_RECORDS, MAX_UNPACKED_BYTES
 from fetch_hand_sim.episode_log.reader import mcap_file, one_line_errors
-from fetch_hand_sim.episode_log.untrusted import unpack
+from fetch_hand_sim.episode_log.untrusted import RECORD, require_size, unpack
 
 _MAGIC = bytes([137, 77, 67, 65, 80, 48, 13, 10])
-_RECORD = struct.Struct('<BQ')
 # Opcode, length and, of a message, its channel.
 _MESSAGE = struct.Struct('<BQH')
 # Opcode and length; then channel, sequence, log time and publish time.
-_PREFIX = _RECORD.size
+_PREFIX = RECORD.size
 _HEADER = 2 + 4 + 8 + 8
 _LOG_TIME = slice(_PREFIX + 6, _PREFIX + 14)
 
@@ -96,6 +94,7 @@ def read_messages(path: Path) -> MessageFile:
     """
     file = MessageFile(mcap_file(path))
     with one_line_errors(file.path), file.path.open('rb') as stream:
+        require_size(stream)
         with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as buffer:
             _Scan(file).take(buffer)
     return file
@@ -106,6 +105,7 @@ class _Scan:
         self._file = file
         self._chunks: list[bytes] = []
         self._size = 0
+        self._messages = 0
         self._topics: dict[int, str] = {}
         self._offsets: dict[int, list[int]] = defaultdict(list)
         self._sizes: dict[int, list[int]] = defaultdict(list)
@@ -126,8 +126,6 @@ class _Scan:
         if self._size + chunk.uncompressed_size > MAX_UNPACKED_BYTES:
             raise ValueError(f'more than {MAX_UNPACKED_BYTES} bytes of messages')
         data = unpack(chunk)
-        if zlib.crc32(data) != chunk.uncompressed_crc:
-            raise ValueError('crc validation failed in Chunk')
         self._find_messages(data)
         self._chunks.append(data)
         self._size += len(data)
@@ -143,6 +141,9 @@ class _Scan:
             if opcode == Opcode.MESSAGE:
                 offsets[channel].append(base + position)
                 sizes[channel].append(size)
+                self._messages += 1
+                if self._messages > MAX_MESSAGES:
+                    raise ValueError(f'more than {MAX_MESSAGES} messages')
             elif opcode == Opcode.CHANNEL:
                 content = BytesIO(data[position + _PREFIX : following])
                 record = Channel.read(ReadDataStream(content))
@@ -155,8 +156,10 @@ def _data_section(buffer: mmap.mmap) -> Iterator[tuple[int, bytes]]:
     if buffer[: len(_MAGIC)] != _MAGIC or buffer[-len(_MAGIC) :] != _MAGIC:
         raise ValueError('it does not begin and end as an MCAP file')
     position, end = len(_MAGIC), len(buffer) - len(_MAGIC)
-    while position < end:
-        opcode, size = _RECORD.unpack_from(buffer, position)
+    for _ in range(MAX_RECORDS):
+        if position >= end:
+            break
+        opcode, size = RECORD.unpack_from(buffer, position)
         start, position = position + _PREFIX, position + _PREFIX + size
         if position > end:
             raise ValueError('a record is longer than the file')

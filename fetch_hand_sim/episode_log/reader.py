@@ -15,14 +15,12 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metadata, Schema
 
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
-from fetch_hand_sim.episode_log.errors import EpisodeReadError
-from fetch_hand_sim.episode_log.untrusted import read_records
-from msgs_spec.command_line import printable
+from fetch_hand_sim.episode_log.errors import EpisodeReadError, one_line
+from fetch_hand_sim.episode_log.limits import MAX_SUMMARY_BYTES
+from fetch_hand_sim.episode_log.untrusted import read_records, require_size
 
 # CRC of the summary and magic, bytes.
 FILE_END = 4 + 8
-
-_LONGEST_REASON = 200
 
 # What the mcap package and its decompressors raise on damaged bytes.
 DAMAGED = (
@@ -95,7 +93,7 @@ class Episode:
         return self.result.get('complete') == 'true'
 
 
-def read_episode(path: Path) -> Episode:
+def read_episode(path: Path | str) -> Episode:
     """Reads an episode with all checks.
 
     Args:
@@ -104,7 +102,7 @@ def read_episode(path: Path) -> Episode:
     Raises:
         EpisodeReadError: If there is no such file, or it is truncated, damaged or no episode.
     """
-    file = mcap_file(path)
+    file = mcap_file(Path(path))
     contents = _Contents()
     with one_line_errors(file), file.open('rb') as stream:
         for record in read_records(stream):
@@ -158,6 +156,8 @@ class _Contents:
 
 def check_summary(stream: BinaryIO, start: int, expected_crc: int) -> None:
     """Checks the one CRC that `StreamReader` leaves out; it covers all but itself and the magic."""
+    if require_size(stream) - start > MAX_SUMMARY_BYTES:
+        raise ValueError(f'summary larger than {MAX_SUMMARY_BYTES} bytes')
     stream.seek(start)
     if expected_crc not in (0, zlib.crc32(stream.read()[:-FILE_END])):
         raise ValueError('crc validation failed in Summary')
@@ -167,23 +167,21 @@ def mcap_file(path: Path) -> Path:
     """Returns the MCAP file of a bag directory, or the path itself if it is no directory.
 
     Raises:
-        EpisodeReadError: If the directory does not hold exactly one.
+        EpisodeReadError: If the directory does not hold exactly one, or cannot be read.
     """
-    if not path.is_dir():
-        if path.exists() and not path.is_file():
-            raise EpisodeReadError(f'{path} is no regular file')  # A pipe would never end.
-        return path
-    files = sorted(file for file in path.glob('*.mcap') if file.is_file())
+    try:
+        if not path.is_dir():
+            if path.exists() and not path.is_file():
+                raise EpisodeReadError(f'{path} is no regular file')  # A pipe would never end.
+            return path
+        files = sorted(file for file in path.glob('*.mcap') if file.is_file())
+    except OSError as error:
+        raise EpisodeReadError(f'{path}: {error.strerror}') from error
     if len(files) != 1:
         raise EpisodeReadError(
             f'{path} holds {len(files)} MCAP files; an episode is a directory of one'
         )
     return files[0]
-
-
-def one_line(error: Exception) -> str:
-    """Returns what an error says in one line of bounded length."""
-    return printable(' '.join(str(error).split()) or type(error).__name__)[:_LONGEST_REASON]
 
 
 @contextmanager

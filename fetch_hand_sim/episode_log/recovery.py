@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import yaml
 from mcap import records
+from mcap.exceptions import EndOfFile
+from mcap.writer import MCAP0_MAGIC
 
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.bag_file import ChannelSpec
-from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT, begin_bag, complete_bag
-from fetch_hand_sim.episode_log.errors import EpisodeLogError
-from fetch_hand_sim.episode_log.reader import DAMAGED, one_line, read_episode
+from fetch_hand_sim.episode_log.episode_bag import (
+    EPISODE,
+    EPISODE_RESULT,
+    begin_bag,
+    end_bag,
+    store_bag,
+)
+from fetch_hand_sim.episode_log.errors import EpisodeLogError, one_line
+from fetch_hand_sim.episode_log.leftovers import inspect_leftover
+from fetch_hand_sim.episode_log.limits import ReceivedAllowance
+from fetch_hand_sim.episode_log.reader import DAMAGED, read_episode
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
-from fetch_hand_sim.episode_log.untrusted import read_records
+from fetch_hand_sim.episode_log.untrusted import RECOVERY_LIMITS, read_records
 from msgs_spec.schemas import deserialize
+from msgs_spec.tasks import TASKS
+from msgs_spec.topics import topics
+
+_RECEIVED = frozenset(
+    spec.name for task in TASKS.values() for spec in topics(task) if spec.direction == 'subscribed'
+)
 
 
 @dataclass(slots=True)
@@ -29,7 +44,31 @@ class _Remains:
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     channels: dict[int, records.Channel] = field(default_factory=dict)
     messages: list[records.Message] = field(default_factory=list)
+    is_torn: bool = False
     is_whole: bool = False
+    has_chunk: bool = False
+
+    def take(self, record: records.McapRecord) -> None:
+        match record:
+            case records.Message():
+                self.messages.append(record)
+            case records.Chunk():
+                self.has_chunk = True
+            case records.Channel():
+                self.channels[record.id] = record
+            case records.Schema():
+                self.schemas[record.id] = record
+            case records.Attachment():
+                self.attachments.append(Attachment(record.name, record.media_type, record.data))
+            case records.Metadata():
+                self.metadata[record.name] = dict(record.metadata)
+            case records.Footer():
+                self.is_whole = True
+
+    @property
+    def was_killed_at_the_start(self) -> bool:
+        """Whether the file ends before its first whole chunk, and is not damaged so far."""
+        return self.is_torn and not self.has_chunk
 
     @property
     def result(self) -> dict[str, str]:
@@ -65,86 +104,106 @@ class _Remains:
             return []
 
 
-def recover_episode(leftover: Path) -> Path:
+def recover_episode(leftover: Path) -> Path | None:
     """Completes an episode that a crash cut off.
 
-    All whole chunks become a bag under the name of the episode; at most the last quarter second of
-    simulated time is missing. The torn file is replaced when the new one has been read back.
+    All whole chunks become a bag under the name of the episode; at most the last quarter of a
+    second is missing. The torn file is replaced when the new one has been read back. A process that
+    was killed before it had written a first chunk leaves nothing to keep: that is cleared away.
 
     Args:
         leftover: Hidden directory of the episode, see `find_leftovers`.
 
     Returns:
-        The bag directory.
+        The bag directory; None if there was nothing to keep.
 
     Raises:
-        EpisodeLogError: If it is being written, holds nothing, or the disk refuses.
+        EpisodeLogError: If it is being written, is not what a robot leaves, or the disk refuses.
     """
     name = durable.active_name(leftover)
     if name is None:
         raise EpisodeLogError(f'{leftover} is no unfinished episode')
-    file = durable.bag_file(leftover, name)
-    final = leftover.parent / name
+    found = inspect_leftover(leftover, now_s=0.0)
+    if found is None:
+        raise EpisodeLogError(f'{leftover} is being written')
+    if found.problem:
+        raise EpisodeLogError(f'cannot recover episode {leftover}: {found.problem}')
     try:
-        if final.exists():
-            raise EpisodeLogError(f'{final} exists; episodes are never overwritten')
-        with file.open('rb') as torn:
-            if not durable.try_lock(torn):
-                raise EpisodeLogError(f'{leftover} is being written')
-            _replace(file, _read(torn))
-            durable.publish(leftover, final)
+        return _recover(leftover, name)
     except EpisodeLogError:
         raise
     except OSError as error:
         reason = error.strerror or error
         raise EpisodeLogError(f'cannot recover episode {leftover}: {reason}') from error
-    except (*DAMAGED, yaml.YAMLError) as error:
+    except DAMAGED as error:
         raise EpisodeLogError(f'cannot recover episode {leftover}: {one_line(error)}') from error
+
+
+def _recover(leftover: Path, name: str) -> Path | None:
+    file, final = durable.bag_file(leftover, name), leftover.parent / name
+    if not file.exists():
+        _clear_away(leftover)
+        return None
+    with durable.open_regular(file) as torn:
+        if not durable.try_lock(torn):
+            raise EpisodeLogError(f'{leftover} is being written')
+        remains = _read(torn)
+        if remains.was_killed_at_the_start:
+            _clear_away(leftover)
+            return None
+        if final.exists():
+            raise EpisodeLogError(f'{final} exists; episodes are never overwritten')
+        _replace(file, remains)
+        durable.publish(leftover, final)
     return final
+
+
+def _clear_away(leftover: Path) -> None:
+    for entry in leftover.iterdir():
+        entry.unlink()
+    leftover.rmdir()
 
 
 def _read(stream: BinaryIO) -> _Remains:
     remains = _Remains()
-    with suppress(*DAMAGED):
-        for record in read_records(stream):
-            match record:
-                case records.Message():
-                    remains.messages.append(record)
-                case records.Channel():
-                    remains.channels[record.id] = record
-                case records.Schema():
-                    remains.schemas[record.id] = record
-                case records.Attachment():
-                    remains.attachments.append(
-                        Attachment(record.name, record.media_type, record.data)
-                    )
-                case records.Metadata():
-                    remains.metadata[record.name] = dict(record.metadata)
-                case records.Footer():
-                    remains.is_whole = True
+    try:
+        for record in read_records(stream, RECOVERY_LIMITS):
+            remains.take(record)
+    except EndOfFile:
+        # Of a file that ends as it should, a length was damaged.
+        stream.seek(max(0, stream.seek(0, os.SEEK_END) - len(MCAP0_MAGIC)))
+        remains.is_torn = stream.read() != MCAP0_MAGIC
+    except DAMAGED:
+        pass
     return remains
 
 
 def _replace(file: Path, remains: _Remains) -> None:
     if not remains.messages or EPISODE not in remains.metadata:
-        raise EpisodeLogError(f'{file} holds no whole chunk of messages: nothing to recover')
-    rewritten = file.with_suffix('.recovered')
+        raise EpisodeLogError(f'{file} is damaged before its first message: nothing to recover')
+    rewritten = durable.rewritten_file(file)
     try:
-        with rewritten.open('wb') as stream:
-            _write(stream, file, remains)
+        with durable.create(rewritten) as stream:
+            description = _write(stream, file, remains)
+            store_bag(stream, file.parent, description)
         read_episode(rewritten)
         rewritten.replace(file)
     finally:
         rewritten.unlink(missing_ok=True)
 
 
-def _write(stream: BinaryIO, file: Path, remains: _Remains) -> None:
+def _write(stream: BinaryIO, file: Path, remains: _Remains) -> str:
+    """Writes the file anew, as far as a writer would have gone; returns its description."""
     metadata = remains.metadata[EPISODE]
     bag = begin_bag(stream, file.name, LogSettings(), metadata, remains.attachments)
     specs = {id: _channel_spec(remains, channel) for id, channel in remains.channels.items()}
+    received = ReceivedAllowance()
     for message in remains.messages:
-        bag.write(specs[message.channel_id], message.data, message.log_time)
-    complete_bag(bag, stream, file.parent, metadata, remains.result)
+        spec = specs[message.channel_id]
+        name = spec.topic.rpartition('/')[2]
+        if name not in _RECEIVED or received.takes(name, len(message.data)):
+            bag.write(spec, message.data, message.log_time)
+    return end_bag(bag, stream, metadata, remains.result)
 
 
 def _channel_spec(remains: _Remains, channel: records.Channel) -> ChannelSpec:

@@ -9,20 +9,21 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.records import Footer, McapRecord, Metadata, MetadataIndex, Statistics
-from mcap.stream_reader import StreamReader, read_magic
+from mcap.stream_reader import read_magic
 
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.reader import check_summary, mcap_file, one_line_errors
-from fetch_hand_sim.episode_log.untrusted import BoundedStream
+from fetch_hand_sim.episode_log.untrusted import BoundedStream, Records
 
 _MAGIC_BYTES = 8
 # Opcode, length, two offsets and a CRC.
 _FOOTER_BYTES = 1 + 8 + 8 + 8 + 4
-_MAX_SUMMARY_BYTES = 2**20
 _MAX_METADATA_RECORDS = 16
+_AT_THE_END = frozenset({Opcode.FOOTER, Opcode.STATISTICS, Opcode.METADATA_INDEX})
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class EpisodeSummary:
         return self.result.get('complete') == 'true'
 
 
-def read_summary(path: Path) -> EpisodeSummary:
+def read_summary(path: Path | str) -> EpisodeSummary:
     """Reads what the end of a file says of it, about 1 ms whatever its size.
 
     The CRC of the summary is checked, that of the messages is not: `read_episode` does that.
@@ -62,10 +63,12 @@ def read_summary(path: Path) -> EpisodeSummary:
     Raises:
         EpisodeReadError: If there is no such file, or it is truncated, damaged or no episode.
     """
-    file = mcap_file(path)
+    file = mcap_file(Path(path))
     with one_line_errors(file), file.open('rb') as stream:
         records = list(_summary_records(stream))
-        statistics = next(r for r in records if isinstance(r, Statistics))
+        statistics = next((r for r in records if isinstance(r, Statistics)), None)
+        if statistics is None:
+            raise ValueError('no statistics')
         indexes = [r for r in records if isinstance(r, MetadataIndex)][:_MAX_METADATA_RECORDS]
         found = {index.name: _metadata_at(stream, index) for index in indexes}
         size = file.stat().st_size
@@ -87,33 +90,26 @@ def _summary_records(stream: BinaryIO) -> Iterator[McapRecord]:
     end = stream.seek(0, 2)
     footer_start = end - _MAGIC_BYTES - _FOOTER_BYTES
     stream.seek(max(0, footer_start))
-    footer = next(StreamReader(BytesIO(stream.read()), skip_magic=True).records)
+    footer = next(Records(BytesIO(stream.read()), _AT_THE_END).records)
     if not isinstance(footer, Footer):
         raise ValueError('no footer')
     if not 0 < footer.summary_start <= footer_start:
         raise ValueError('no summary')
-    if footer_start - footer.summary_start > _MAX_SUMMARY_BYTES:
-        raise ValueError(f'summary larger than {_MAX_SUMMARY_BYTES} bytes')
     check_summary(stream, footer.summary_start, footer.summary_crc)
     stream.seek(footer.summary_start)
-    yield from StreamReader(BytesIO(stream.read()), skip_magic=True).records
+    yield from Records(BytesIO(stream.read()), _AT_THE_END).records
 
 
 def _metadata_at(stream: BinaryIO, index: MetadataIndex) -> dict[str, str]:
     stream.seek(index.offset)
-    reader = StreamReader(
-        BoundedStream(stream),  # type: ignore[arg-type]
-        skip_magic=True,
-        record_size_limit=_MAX_SUMMARY_BYTES,
-    )
-    record = next(reader.records)
+    record = next(Records(BoundedStream(stream), frozenset({Opcode.METADATA})).records)
     if not isinstance(record, Metadata) or record.name != index.name:
         raise ValueError(f'no metadata record {index.name!r} where the summary says')
     return dict(record.metadata)
 
 
 def find_episodes(directory: Path) -> list[Path]:
-    """Returns what claims to be an episode in a directory, by name; nothing is opened.
+    """Returns what may be an episode in a directory, by name; nothing is opened.
 
     These are bag directories and MCAP files, but not the hidden directories of episodes that are
     being written or were cut off, see `find_leftovers`.
@@ -134,14 +130,20 @@ def expand_episodes(path: Path) -> list[Path]:
     Raises:
         EpisodeReadError: If it does not exist, or is a directory that cannot be read.
     """
-    if not path.exists():
-        raise EpisodeReadError(f'{path}: No such file or directory')
-    if not path.is_dir() or (path / 'metadata.yaml').exists():
-        return [path]
+    try:
+        if not path.exists():
+            raise EpisodeReadError(f'{path}: No such file or directory')
+        if not path.is_dir() or durable.metadata_file(path).exists():
+            return [path]
+    except OSError as error:
+        raise EpisodeReadError(f'{path}: {error.strerror}') from error
     return find_episodes(path)
 
 
 def _is_bag(path: Path) -> bool:
-    if path.is_dir():
-        return (path / 'metadata.yaml').exists() or any(path.glob('*.mcap'))
+    try:
+        if path.is_dir():
+            return durable.metadata_file(path).exists() or any(path.glob('*.mcap'))
+    except OSError:
+        return True  # Whoever reads it will hear why it cannot be read.
     return path.suffix == '.mcap'

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fetch_hand_sim.episode_log.errors import EpisodeReadError
-from fetch_hand_sim.episode_log.reader import Episode, one_line
+from fetch_hand_sim.episode_log.errors import EpisodeReadError, one_line
+from fetch_hand_sim.episode_log.reader import Episode
 from msgs_spec.codecs import message_stamp
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TaskSpec, task_spec

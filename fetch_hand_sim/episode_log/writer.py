@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -9,8 +10,14 @@ from pathlib import Path
 
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.bag_file import ChannelSpec
-from fetch_hand_sim.episode_log.episode_bag import begin_bag, complete_bag
+from fetch_hand_sim.episode_log.episode_bag import begin_bag, end_bag, store_bag
 from fetch_hand_sim.episode_log.errors import EpisodeLogError
+from fetch_hand_sim.episode_log.limits import (
+    MAX_ATTACHMENT_BYTES,
+    MAX_CHUNKS,
+    MAX_METADATA_BYTES,
+    ReceivedAllowance,
+)
 from fetch_hand_sim.episode_log.log_times import log_time
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from msgs_spec.qos import rosbag2_yaml
@@ -23,6 +30,9 @@ def _strings(content: Mapping[str, str]) -> dict[str, str]:
     for key, value in content.items():
         if not isinstance(key, str) or not isinstance(value, str):
             raise ValueError(f'episode metadata are strings, not {key!r}: {value!r}')
+    size = sum(len(text.encode()) for item in content.items() for text in item)
+    if size > MAX_METADATA_BYTES:
+        raise ValueError(f'{size} bytes of episode metadata; allowed: {MAX_METADATA_BYTES}')
     return dict(content)
 
 
@@ -41,6 +51,9 @@ class EpisodeWriter:
     `write` does nothing and returns False, and `finish` returns None. Not thread-safe, and not for
     use in signal handlers.
 
+    Nothing is written that a reader refuses, see `limits`. What comes from outside has an
+    allowance; the rest of it is not logged, and the record `episode_result` counts it.
+
     Args:
         directory: Where episodes are collected; created if missing.
         name: Name of the episode, see `episode_name`.
@@ -54,7 +67,7 @@ class EpisodeWriter:
         EpisodeExistsError: If the name is taken; episodes are never overwritten.
         EpisodeLogError: If the disk is too full or the file cannot be written; nothing is left
             behind.
-        ValueError: If metadata are not strings.
+        ValueError: If metadata are not strings, or these or the attachments are too long.
     """
 
     def __init__(
@@ -67,6 +80,9 @@ class EpisodeWriter:
         namespace: str = '/',
     ) -> None:
         self._metadata = {'episode_id': name, **_strings(metadata)}
+        attached = sum(len(each.data) for each in attachments)
+        if attached > MAX_ATTACHMENT_BYTES:
+            raise ValueError(f'{attached} bytes attached; allowed: {MAX_ATTACHMENT_BYTES}')
         self._settings = settings or LogSettings()
         self._namespace = namespace.rstrip('/') + '/'
         self._final = directory / name
@@ -74,6 +90,8 @@ class EpisodeWriter:
         self._flushed_ns: int | None = None
         self._tick_ns: int | None = None
         self._rank = 0
+        self._received = ReceivedAllowance()
+        self._description: str | None = None
         self._completed: Path | None = None
         try:
             directory.mkdir(parents=True, exist_ok=True)
@@ -92,11 +110,6 @@ class EpisodeWriter:
             self._discard()
             raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
 
-    @property
-    def is_open(self) -> bool:
-        """Whether messages are taken: neither completed nor failed."""
-        return self._is_open
-
     def write(self, topic: TopicSpec, data: bytes, log_time_ns: int) -> bool:
         """Appends a message.
 
@@ -110,54 +123,55 @@ class EpisodeWriter:
 
         Raises:
             EpisodeLogError: At the first error of the disk.
-            ValueError: If the time does not grow, or the topic had another type before.
+            ValueError: If the time does not grow, the topic had another type before, or no reader
+                would take a message more or as long.
         """
-        if not self._is_open:
-            return False
-        try:
-            if self.flush_is_due(log_time_ns):
-                self._flush(log_time_ns)
-            self._bag.write(self._channel(topic), data, log_time_ns)
-        except OSError as error:
-            raise self._fail(error) from error
-        return True
+        if self._is_open and self._is_flush_due(log_time_ns):
+            self._flush(log_time_ns)
+        return self._append(topic, data, log_time_ns)
 
     def write_tick(self, stamp_ns: int, messages: Iterable[tuple[TopicSpec, bytes]]) -> bool:
-        """Appends all messages of the tick stamped `stamp_ns`, in their order; see `write`."""
+        """Appends all messages of the tick stamped `stamp_ns`, in their order; see `write`.
+
+        When it is due, they are handed to the operating system with it.
+        """
         self._tick_ns, self._rank = stamp_ns, 0
         for topic, data in messages:
-            self._write_next(topic, data)
+            self._append_next(topic, data)
+        if self._is_open and self._is_flush_due(stamp_ns):
+            self._flush(stamp_ns)
         return self._is_open
 
     def write_received(self, topic: TopicSpec, data: bytes) -> bool:
-        """Appends a command received since the last tick: it follows the messages of that tick.
+        """Appends a message received since the last tick: it follows the messages of that tick.
+
+        Returns:
+            False if it is not taken: the allowance of its topic is used up, or see `write`.
 
         Raises:
             ValueError: If there was no tick yet: earlier commands are not part of the episode.
         """
-        return self._write_next(topic, data)
+        if not self._is_open:
+            return False
+        # While a robot is paused, what it receives is flushed without end.
+        has_room = self._bag.takes(len(data)) and self._bag.chunks <= MAX_CHUNKS // 2
+        if not self._received.takes(topic.name, len(data), has_room):
+            return False
+        return self._append_next(topic, data)
 
-    def flush_is_due(self, log_time_ns: int) -> bool:
-        """Whether a message of this time is written only after a flush."""
-        if self._flushed_ns is None:
-            self._flushed_ns = log_time_ns
-        return self._is_open and log_time_ns - self._flushed_ns >= self._settings.flush_period_ns
-
-    def flush(self, log_time_ns: int) -> None:
-        """Hands what was written to the operating system ahead of a message of this time.
-
-        `write` does the same by itself when it is due. It takes a third of a millisecond, so who is
-        in a hurry lets another thread do it and writes nothing meanwhile; the file is the same.
+    def flush(self) -> None:
+        """Hands what was written to the operating system, also if that is not due.
 
         Raises:
             EpisodeLogError: At the first error of the disk.
         """
-        if not self._is_open:
-            return
-        try:
-            self._flush(log_time_ns)
-        except OSError as error:
-            raise self._fail(error) from error
+        if self._is_open and self._tick_ns is not None:
+            self._flush(log_time(self._tick_ns, self._rank))
+
+    @property
+    def has_unflushed(self) -> bool:
+        """Whether something was written that the operating system does not have yet."""
+        return self._is_open and self._bag.has_unflushed
 
     def finish(self, result: Mapping[str, str]) -> Path | None:
         """Completes the bag of an episode that ran to its end.
@@ -173,11 +187,47 @@ class EpisodeWriter:
             EpisodeLogError: If the bag cannot be completed; the hidden directory stays.
             ValueError: If the result is not made of strings.
         """
-        return self._complete({**result, 'complete': 'true'})
+        self.end(result)
+        return self.store()
 
     def abort(self, reason: str, result: Mapping[str, str] | None = None) -> Path | None:
         """Completes the bag of an episode that was cut short, marked as such; see `finish`."""
-        return self._complete({**(result or {}), 'complete': 'false', 'reason': reason})
+        self.end(result or {}, reason)
+        return self.store()
+
+    def end(self, result: Mapping[str, str], reason: str | None = None) -> bool:
+        """Does the first half of `finish`, or with a reason of `abort`: writes all there is.
+
+        What a process that is killed now leaves behind is recovered whole.
+
+        Returns:
+            Whether there is something to `store`.
+
+        Raises:
+            EpisodeLogError, ValueError: As `finish` does.
+        """
+        outcome = {'complete': 'true'}
+        if reason is not None:
+            outcome = {'complete': 'false', 'reason': reason}
+        return self._end({**result, **outcome})
+
+    def store(self) -> Path | None:
+        """Does the second half: waits for the disk several times, then shows the episode.
+
+        Raises:
+            EpisodeLogError: If the bag cannot be completed; the hidden directory stays.
+        """
+        if self._description is None:
+            return self._completed
+        try:
+            store_bag(self._stream, self._active, self._description)
+            durable.publish(self._active, self._final)
+        except OSError as error:
+            raise self._fail(error) from error
+        self._description = None
+        self._stop()
+        self._completed = self._final
+        return self._completed
 
     def _channel(self, topic: TopicSpec) -> ChannelSpec:
         channel = self._channels.get(topic.name)
@@ -195,34 +245,52 @@ class EpisodeWriter:
             )
         return channel
 
-    def _flush(self, log_time_ns: int) -> None:
-        self._bag.flush()
-        self._flushed_ns = log_time_ns
+    def _append(self, topic: TopicSpec, data: bytes, log_time_ns: int) -> bool:
+        if not self._is_open:
+            return False
+        try:
+            self._bag.write(self._channel(topic), data, log_time_ns)
+        except OSError as error:
+            raise self._fail(error) from error
+        return True
 
-    def _write_next(self, topic: TopicSpec, data: bytes) -> bool:
+    def _append_next(self, topic: TopicSpec, data: bytes) -> bool:
         if self._tick_ns is None:
             raise ValueError(f'{topic.name} was written before the first tick of the episode')
         time_ns = log_time(self._tick_ns, self._rank)
         self._rank += 1
-        return self.write(topic, data, time_ns)
+        return self._append(topic, data, time_ns)
 
-    def _complete(self, result: Mapping[str, str]) -> Path | None:
+    def _flush(self, log_time_ns: int) -> None:
+        try:
+            self._bag.flush()
+        except OSError as error:
+            raise self._fail(error) from error
+        self._flushed_ns = log_time_ns
+
+    def _is_flush_due(self, log_time_ns: int) -> bool:
+        if self._flushed_ns is None:
+            self._flushed_ns = log_time_ns
+        return log_time_ns - self._flushed_ns >= self._settings.flush_period_ns
+
+    def _end(self, result: dict[str, str]) -> bool:
+        if self._received.omitted:
+            result['received_not_logged'] = json.dumps(self._received.omitted)
         record = _strings(result)
         if not self._is_open:
-            return self._completed
+            return False
         try:
             if self._bag.info.message_count == 0:
                 self._discard()
-                return None
-            complete_bag(self._bag, self._stream, self._active, self._metadata, record)
-            durable.publish(self._active, self._final)
+                return False
+            self._is_open = False
+            self._description = end_bag(self._bag, self._stream, self._metadata, record)
         except OSError as error:
             raise self._fail(error) from error
-        self._stop()
-        self._completed = self._final
-        return self._completed
+        return True
 
     def _fail(self, error: OSError) -> EpisodeLogError:
+        self._description = None
         self._stop()
         return EpisodeLogError(f'episode log stopped, {self._stream.name}: {_reason(error)}')
 

@@ -13,8 +13,9 @@ import numpy as np
 
 from fetch_hand_sim.episode_log import Episode, EpisodeReadError, episode_metadata, read_episode
 from fetch_hand_sim.episode_log.episode_metadata import interface_version
+from fetch_hand_sim.episode_log.errors import one_line
 from fetch_hand_sim.episode_log.model import model_sha256
-from fetch_hand_sim.episode_log.reader import DAMAGED, one_line
+from fetch_hand_sim.episode_log.reader import DAMAGED
 from fetch_hand_sim.episode_log.ticks import LoggedTick, TickMessage, episode_task, split_ticks
 from fetch_hand_sim.episodes.context import source_revision
 from fetch_hand_sim.episodes.goals import accept_goal

@@ -32,6 +32,8 @@ class RecordingContext:
         """
         self._simulation = simulation
         self._model_sha256 = model_sha256(simulation.model)
+        # Asked for now: it starts a process, which can hold up a robot that runs.
+        self._source_revision = source_revision()
         self.attachments: list[Attachment] = [mjcf_attachment(simulation.asset)]
         if with_compiled_model:
             self.attachments.append(compiled_attachment(simulation.model))
@@ -47,7 +49,7 @@ class RecordingContext:
             success_rule=status.success_rule,
             control_hz=status.control_hz,
             model_sha256=self._model_sha256,
-            source_revision=source_revision(),
+            source_revision=self._source_revision,
             checkpoint_sha256=self.checkpoint_sha256,
             started=datetime.now(UTC).isoformat(timespec='milliseconds'),
         )

@@ -1,33 +1,37 @@
 """Logs the ticks of a running robot, episode by episode, without holding the robot up.
 
-The messages of a tick are written as they come, microseconds each. Beginning a file takes
-milliseconds, compressing a quarter of a second a third of one, and completing a file waits for the
-disk: a worker thread does these. A disk that fails stops logging, never the robot.
+A tick puts its messages into a queue; one thread writes them, and another waits for the disk where
+a finished file has to. A killed robot loses what the operating system had not got yet. That is a
+quarter of a second of wall time at most, however fast the robot runs: one that is faster than its
+disk waits. A disk that fails stops logging, never the robot.
 """
 
 from __future__ import annotations
 
-from collections import deque
+import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Semaphore
-from typing import Any
+from threading import Semaphore, Thread
 
 from fetch_hand_sim.episode_log import Attachment, EpisodeDirectory, EpisodeLogError, EpisodeWriter
-from fetch_hand_sim.episode_log.log_times import log_time
+from fetch_hand_sim.episodes.backlog import Backlog, StalledError
 from msgs_spec.tick import EpisodeStatus, Tick
 from msgs_spec.topics import TopicSpec
 
 Messages = Sequence[tuple[TopicSpec, bytes]]
 
-# Writes of a backlog at a time: those of a tick and as many again.
-_MOST_AT_ONCE = 4
-# Files that may wait for the disk, minutes of a robot in real time.
-_MAX_UNFINISHED = 64
-# Seconds after which a disk with so many files waiting counts as dead.
-_LONGEST_STALL = 1.0
+# Seconds after which the oldest message is handed to the operating system, where simulated time
+# does not lead to that: a robot that is paused, waits for commands or is slow.
+_FLUSH_AFTER = 0.18
+# Files that may wait for the disk to have them for good; the operating system has them.
+_MAX_UNSTORED = 16
+# Seconds of waiting that are worth a line, and seconds between two lines.
+_SLOW = 0.1
+_SLOW_PERIOD = 10.0
+# Seconds that a disk which has failed may still hold up the end.
+_LAST_CHANCE = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,49 +49,51 @@ class LoggedEpisode:
     is_complete: bool
 
 
-class _EpisodeInProgress:
-    """An episode whose file is written here, except while the worker opens or flushes it."""
+@dataclass(frozen=True, slots=True)
+class _Begin:
+    status: EpisodeStatus
 
-    def __init__(self, worker: Executor, begin: Callable[[], EpisodeWriter]) -> None:
-        self.status: EpisodeStatus | None = None
-        self._worker = worker
-        self._opening = worker.submit(begin)
-        self._busy: Future[Any] = self._opening
-        self._waiting: deque[Callable[[EpisodeWriter], object]] = deque()
 
-    def write_tick(self, stamp_ns: int, messages: Messages) -> None:
-        """Writes a tick; see `write`."""
-        if self._busy.done() and not self._waiting:
-            self._busy.result()
-            writer, first_ns = self._opening.result(), log_time(stamp_ns, 0)
-            if writer.flush_is_due(first_ns):
-                self._busy = self._worker.submit(writer.flush, first_ns)
-        self.write(lambda writer: writer.write_tick(stamp_ns, messages))
+@dataclass(frozen=True, slots=True)
+class _TickMessages:
+    stamp_ns: int
+    messages: Messages
 
-    def write(self, write: Callable[[EpisodeWriter], object]) -> None:
-        """Writes now if the file is free, else later; a backlog is worked off over some ticks.
 
-        Raises:
-            EpisodeLogError: If it could not be opened, or at the first error of the disk.
-        """
-        self._waiting.append(write)
-        if self._busy.done():
-            self._write_waiting(_MOST_AT_ONCE)
+@dataclass(frozen=True, slots=True)
+class _Received:
+    topic: TopicSpec
+    data: bytes
 
-    def caught_up(self) -> EpisodeWriter:
-        """Waits for the file, writes what waited for it and returns it; likewise."""
-        self._write_waiting(len(self._waiting))
-        return self._opening.result()
 
-    def _write_waiting(self, count: int) -> None:
-        self._busy.result()
-        writer = self._opening.result()
-        for _ in range(min(count, len(self._waiting))):
-            self._waiting.popleft()(writer)
+@dataclass(frozen=True, slots=True)
+class _End:
+    """The end of an episode; a reason if it was cut short."""
+
+    status: EpisodeStatus
+    reason: str | None
+
+
+_Entry = _Begin | _TickMessages | _Received | _End
 
 
 class EpisodeRecorder:
-    """Writes each episode of a robot to a bag of its own."""
+    """Writes each episode of a robot to a bag of its own.
+
+    Args:
+        directory: Where episodes are collected.
+        namespace: ROS namespace of relative topic names.
+        attachments: Files stored with every episode.
+        metadata: Makes the metadata of an episode from the status of its first tick; called by the
+            writing thread.
+        on_error: Called once, with one line, when the disk fails, by any thread.
+        on_logged: Called for every completed file, by a thread of its own.
+        on_slow: Called with one line when the robot has to wait for the disk, now and then.
+
+    Attributes:
+        has_failed: Whether the disk failed, so that nothing more is logged.
+        waited_s: Seconds the robot has waited for the disk.
+    """
 
     def __init__(
         self,
@@ -98,108 +104,177 @@ class EpisodeRecorder:
         metadata: Callable[[EpisodeStatus], Mapping[str, str]],
         on_error: Callable[[str], None],
         on_logged: Callable[[LoggedEpisode], None],
+        on_slow: Callable[[str], None] = lambda line: None,
     ) -> None:
-        """Prepares logging; the first episode begins with the first reset tick.
-
-        Args:
-            directory: Where episodes are collected.
-            namespace: ROS namespace of relative topic names.
-            attachments: Files stored with every episode.
-            metadata: Makes the metadata of an episode from the status of its first tick; called by
-                the worker.
-            on_error: Called once, with one line, when the disk fails; may be called by the worker.
-            on_logged: Called by the worker for every completed file.
-        """
-        self._episodes = EpisodeDirectory(directory, namespace=namespace)
-        self._attachments = attachments
-        self._metadata = metadata
-        self._on_error = on_error
-        self._on_logged = on_logged
-        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix='episode_log')
-        self._room = Semaphore(_MAX_UNFINISHED)
-        self._current: _EpisodeInProgress | None = None
         self.has_failed = False
+        self.waited_s = 0.0
+        self._on_error = on_error
+        self._on_slow = on_slow
+        self._waited_said_s = self._say_after = 0.0
+        self._status: EpisodeStatus | None = None
+        self._backlog: Backlog[_Entry] = Backlog()
+        self._files = _EpisodeFiles(
+            EpisodeDirectory(directory, namespace=namespace),
+            attachments,
+            metadata,
+            self._fail,
+            on_logged,
+        )
+        self._thread = Thread(target=self._write, name='episode_log', daemon=True)
+        self._thread.start()
 
     def record(self, tick: Tick, messages: Messages) -> None:
-        """Writes a tick: a reset begins a file, a finished episode completes it."""
+        """Logs a tick: a reset begins a file, a finished episode completes it."""
         if tick.status.phase == 'reset':
             self.interrupt('reset before the end')
-            self._begin(tick.status)
-        if self._current is not None:
-            self._current.status = tick.status
-        self._write(lambda episode: episode.write_tick(tick.stamp_ns, messages))
+            if not self.has_failed:
+                self._put(_Begin(tick.status))
+                self._status = tick.status
+        if self._status is None:
+            return
+        self._put(_TickMessages(tick.stamp_ns, messages))
+        self._status = tick.status
         if tick.status.phase == 'finished':
-            self._complete(lambda writer, result: writer.finish(result), is_complete=True)
+            self._end(None)
 
     def record_received(self, topic: TopicSpec, data: bytes) -> None:
-        """Writes a message received since the last tick; between episodes there is no file."""
-        self._write(
-            lambda episode: episode.write(lambda writer: writer.write_received(topic, data))
-        )
+        """Logs a message received since the last tick; between episodes there is no file."""
+        if self._status is not None:
+            self._put(_Received(topic, data))
 
     def interrupt(self, reason: str) -> None:
         """Completes the running episode, if there is one, marked as cut short."""
-        self._complete(lambda writer, result: writer.abort(reason, result), is_complete=False)
+        self._end(reason)
 
     def close(self, reason: str) -> None:
         """Completes everything, also what is still being completed."""
         self.interrupt(reason)
-        self._worker.shutdown(wait=True)
+        self._backlog.close()
+        self._thread.join(_LAST_CHANCE if self.has_failed else None)
+        self._files.close()
 
-    def _begin(self, status: EpisodeStatus) -> None:
-        """Lets the worker open the file of an episode.
+    def _end(self, reason: str | None) -> None:
+        status, self._status = self._status, None
+        if status is not None:
+            self._put(_End(status, reason))
 
-        A robot that runs as fast as possible can outrun a disk, and goes as fast as the disk then.
-        """
+    def _put(self, entry: _Entry) -> None:
+        """Queues an entry; a robot that is faster than its disk waits here."""
         if self.has_failed:
             return
-        if not self._room.acquire(timeout=_LONGEST_STALL):
-            self._fail(EpisodeLogError(f'episode log stopped: {_MAX_UNFINISHED} files wait'))
-            return
-        self._current = _EpisodeInProgress(
-            self._worker,
-            lambda: self._episodes.begin(
-                status.task, status.seed, self._metadata(status), self._attachments
-            ),
-        )
-
-    def _write(self, write: Callable[[_EpisodeInProgress], None]) -> None:
-        if self._current is None:
-            return
         try:
-            write(self._current)
-        except EpisodeLogError as error:
-            self._fail(error)
-
-    def _complete(
-        self,
-        complete: Callable[[EpisodeWriter, Mapping[str, str]], Path | None],
-        *,
-        is_complete: bool,
-    ) -> None:
-        episode, self._current = self._current, None
-        if episode is None or episode.status is None:
+            waited = self._backlog.put(entry)
+        except StalledError as error:
+            self._fail(f'episode log stopped: {error}')
             return
-        status = episode.status
+        if waited > 0.0:
+            self.waited_s += waited
+            self._say_slow(time.monotonic())
 
-        def work() -> None:
-            try:
-                path = complete(episode.caught_up(), episode_result(status))
-            except EpisodeLogError as error:
-                self._fail(error)
-            else:
-                if path is not None:
-                    self._on_logged(LoggedEpisode(status, path, is_complete))
-            finally:
-                self._room.release()
+    def _say_slow(self, now: float) -> None:
+        if self.waited_s - self._waited_said_s > _SLOW and now >= self._say_after:
+            self._waited_said_s = self.waited_s
+            self._say_after = now + _SLOW_PERIOD
+            self._on_slow(
+                f'the disk is slower than the robot, which waits for it: {self.waited_s:.1f} s '
+                'so far'
+            )
 
-        self._worker.submit(work)
-
-    def _fail(self, error: EpisodeLogError) -> None:
-        self._current = None
+    def _fail(self, line: str) -> None:
+        self._status = None
+        self._backlog.clear()
         if not self.has_failed:
             self.has_failed = True
+            self._on_error(line)
+
+    def _write(self) -> None:
+        """Writes what is queued until the recorder is closed; runs in a thread of its own."""
+        try:
+            while not self._backlog.is_done:
+                entry = self._backlog.take(_FLUSH_AFTER)
+                if not self.has_failed:
+                    self._write_entry(entry)
+                if not self._files.has_unflushed:
+                    self._backlog.note_saved()
+        except BaseException:
+            self._fail('episode log stopped: an error in the program')
+            raise
+
+    def _write_entry(self, entry: _Entry | None) -> None:
+        try:
+            if entry is None:
+                self._files.flush()
+            else:
+                self._files.write(entry)
+        except EpisodeLogError as error:
+            self._fail(str(error))
+
+
+class _EpisodeFiles:
+    """The file in progress, and those that wait for the disk; used by one thread."""
+
+    def __init__(
+        self,
+        episodes: EpisodeDirectory,
+        attachments: Sequence[Attachment],
+        metadata: Callable[[EpisodeStatus], Mapping[str, str]],
+        on_error: Callable[[str], None],
+        on_logged: Callable[[LoggedEpisode], None],
+    ) -> None:
+        self._episodes = episodes
+        self._attachments = attachments
+        self._metadata = metadata
+        self._on_error = on_error
+        self._on_logged = on_logged
+        self._writer: EpisodeWriter | None = None
+        self._storing = ThreadPoolExecutor(max_workers=1, thread_name_prefix='episode_store')
+        self._room = Semaphore(_MAX_UNSTORED)
+
+    @property
+    def has_unflushed(self) -> bool:
+        """Whether something was written that the operating system does not have yet."""
+        return self._writer is not None and self._writer.has_unflushed
+
+    def flush(self) -> None:
+        """Hands what was written to the operating system."""
+        if self._writer is not None:
+            self._writer.flush()
+
+    def write(self, entry: _Entry) -> None:
+        """Does what an entry says.
+
+        Raises:
+            EpisodeLogError: At the first error of the disk.
+        """
+        match entry:
+            case _Begin(status):
+                self._room.acquire()
+                self._writer = self._episodes.begin(
+                    status.task, status.seed, self._metadata(status), self._attachments
+                )
+            case _TickMessages(stamp_ns, messages) if self._writer is not None:
+                self._writer.write_tick(stamp_ns, messages)
+            case _Received(topic, data) if self._writer is not None:
+                self._writer.write_received(topic, data)
+            case _End(status, reason) if self._writer is not None:
+                writer, self._writer = self._writer, None
+                writer.end(episode_result(status), reason)
+                self._storing.submit(self._store, writer, status, reason is None)
+
+    def close(self) -> None:
+        """Waits until all files are on the disk."""
+        self._storing.shutdown(wait=True)
+
+    def _store(self, writer: EpisodeWriter, status: EpisodeStatus, is_complete: bool) -> None:
+        try:
+            path = writer.store()
+        except EpisodeLogError as error:
             self._on_error(str(error))
+        else:
+            if path is not None:
+                self._on_logged(LoggedEpisode(status, path, is_complete))
+        finally:
+            self._room.release()
 
 
 def episode_result(status: EpisodeStatus) -> dict[str, str]:

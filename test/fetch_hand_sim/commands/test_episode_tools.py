@@ -425,13 +425,21 @@ def test_recover_makes_bags_of_leftovers_and_says_which_it_cannot(reach, tmp_pat
     size = (sources[0] / f'{sources[0].name}_0.mcap').stat().st_size
     cut_off(sources[0], tmp_path, size // 2)
     cut_off(sources[1], tmp_path, 2000)
+    damaged = cut_off(sources[2], tmp_path, size) / f'{sources[2].name}_0.mcap'
+    damaged.write_bytes(bytes(100) + damaged.read_bytes()[100:])
     assert recover_episodes.main([str(tmp_path), '--dry-run']) == 0
     assert list_episodes.main([str(tmp_path)]) == 0
-    assert capsys.readouterr().out.count('recover_episodes makes a bag of it') == 2
+    assert capsys.readouterr().out.count('recover_episodes makes a bag of it') == 3
     assert recover_episodes.main([str(tmp_path)]) == 1
     output = capsys.readouterr()
     assert 'marked as interrupted' in output.out
-    assert 'nothing to recover' in output.err and sources[1].name in output.err
+    (line,) = [line for line in output.out.splitlines() if 'cleared away' in line]
+    assert sources[1].name in line and 'killed before its first messages' in line
+    assert 'nothing to recover' in output.err and sources[2].name in output.err
+    assert [entry.name for entry in sorted(tmp_path.iterdir())] == [
+        damaged.parent.name,
+        sources[0].name,
+    ]
     result = EpisodeChecker().check(tmp_path / sources[0].name)
     assert result.difference is None and 10 < result.ticks < 51
     (arrays,) = load_episodes(tmp_path / sources[0].name)

@@ -12,25 +12,21 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from fetch_hand_sim.episode_log import (
-    EpisodeLogError,
-    LogSettings,
-    find_episodes,
-    find_leftovers,
-    read_episode,
-    recover_episode,
-)
+from fetch_hand_sim.commands import recover_episodes
+from fetch_hand_sim.episode_log import find_episodes, find_leftovers, read_episode
 from msgs_spec.tasks import task_spec
 from support import SUPPORT, script_environment
 from support.graph import SIM_NODE, TIMEOUT, client, ros_args
 
 # `make torture` turns this up.
 KILLS = int(os.environ.get('EPISODE_KILLS', '20'))
-SCRIPT = SUPPORT / 'killed_writer.py'
-TICK_NS = 40_000_000
-FLUSH_PERIOD_NS = LogSettings().flush_period_ns
+LONGEST_LIFE = float(os.environ.get('EPISODE_LIFE', '0.6'))
+SCRIPT = SUPPORT / 'killed_recorder.py'
+# Of finished files, how many may wait for the disk when a robot is killed.
+MOST_UNSTORED = 16
 REACH = task_spec('FetchReach')
 MIB = 1024 * 1024
 
@@ -40,49 +36,50 @@ def finish(process, timeout=TIMEOUT):
     return process.returncode, output + errors
 
 
-@pytest.mark.timeout(60 + 5 * KILLS)
-def test_killed_at_random_moments(tmp_path):
-    environment = script_environment()
+@pytest.mark.timeout(60 + 10 * KILLS)
+def test_killed_at_random_moments_a_robot_loses_a_quarter_of_a_second(tmp_path):
+    """At factors 1 to 50 of real time, and nothing is left that recovery could not clear away."""
     run = subprocess.run(
-        [sys.executable, SCRIPT, tmp_path, str(KILLS), '5'],
+        [sys.executable, SCRIPT, tmp_path, str(KILLS), str(LONGEST_LIFE), '5'],
         capture_output=True,
         text=True,
-        env=environment,
+        env=script_environment(),
         check=False,
     )
     assert run.returncode == 0, run.stderr
-    outcomes = [check_killed(**json.loads(line)) for line in run.stdout.splitlines()]
-    assert len(outcomes) == KILLS
-    # The moments are random, and yet a third of them or more hit an episode being written.
-    assert outcomes.count('recovered') >= KILLS // 4, outcomes
+    losses = [lost_seconds(**json.loads(line)) for line in run.stdout.splitlines()]
+    print(f'{len(losses)} kills, lost at most {max(losses):.3f} s: {np.round(losses, 3).tolist()}')
+    assert len(losses) == KILLS
+    assert max(losses) <= 0.25
+    # The moments are random, and yet most of them hit an episode being written.
+    assert np.count_nonzero(losses) >= KILLS // 2
 
 
-def check_killed(directory, first, last):
-    """Checks what one killed process left; returns what became of its last episode."""
+def lost_seconds(directory, factor, ticks):
+    """Recovers what a killed robot left; returns the wall time it had lived and nobody knows of.
+
+    That is the time from the first lost tick to the last, and no more than so many ticks take: on a
+    busy machine the robot itself may have been asleep between them.
+    """
     path = Path(directory)
-    if not path.exists():
-        return 'nothing'
-    for finished in find_episodes(path):
-        assert read_episode(finished).is_complete
-    leftovers = find_leftovers(path)
-    assert len(leftovers) <= 1
-    if not leftovers:
-        return 'between'
-    try:
-        recovered = recover_episode(leftovers[0].path)
-    except EpisodeLogError as error:
-        # Less than one flush had been written of it, or nothing but the file had been made.
-        assert 'nothing to recover' in str(error) or 'No such file' in str(error)
-        assert last - first <= FLUSH_PERIOD_NS + TICK_NS or last - first >= 50 * TICK_NS
-        return 'too short'
-    episode = read_episode(recovered)
-    times = [m.log_time_ns for t in episode.topics.values() for m in t.messages]
-    assert min(times) == first
-    assert max(times) >= last - FLUSH_PERIOD_NS - TICK_NS
-    assert find_leftovers(path) == []
-    if not episode.is_complete:
-        assert episode.result['reason'] == 'cut off, recovered later'
-    return 'recovered'
+    if path.exists():
+        for finished in find_episodes(path):
+            assert read_episode(finished).is_complete
+        assert len(find_leftovers(path)) <= 1 + MOST_UNSTORED
+        assert recover_episodes.main([directory]) == 0
+        assert find_leftovers(path) == []
+    known = {
+        (int(name.name.split('_')[1]), message.log_time_ns)
+        for name in (find_episodes(path) if path.exists() else [])
+        for message in read_episode(name).topics['/clock'].messages
+    }
+    made = [((episode, stamp), wall) for episode, stamp, wall in ticks]
+    lost = [wall for tick, wall in made if tick not in known]
+    # All that is lost is at the end.
+    assert [wall for _, wall in made[len(made) - len(lost) :]] == lost
+    if not lost:
+        return 0.0
+    return min(lost[-1] - lost[0] + 0.04 / factor, len(lost) * 0.04 / factor)
 
 
 @pytest.fixture

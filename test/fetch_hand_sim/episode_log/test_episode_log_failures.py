@@ -27,6 +27,7 @@ from fetch_hand_sim.episode_log import (
     EpisodeReadError,
     EpisodeWriter,
     LogSettings,
+    durable,
     find_leftovers,
     read_episode,
     recover_episode,
@@ -213,22 +214,68 @@ def test_recovery_refuses_what_it_cannot_recover(finished, recorder, ticks, tmp_
     recorder.write(writer, ticks)
     with pytest.raises(EpisodeLogError, match='is being written'):
         recover_episode(tmp_path / '.running.active')
-    (tmp_path / '.hollow.active').mkdir()
-    with pytest.raises(EpisodeLogError, match='No such file'):
-        recover_episode(tmp_path / '.hollow.active')
+    damaged = tmp_path / '.damaged.active' / 'damaged_0.mcap'
+    damaged.parent.mkdir()
+    damaged.write_bytes(b'x' + next(finished.glob('*.mcap')).read_bytes()[1:])
+    before = damaged.read_bytes()
+    with pytest.raises(EpisodeLogError, match='nothing to recover'):
+        recover_episode(damaged.parent)
+    assert [file.read_bytes() for file in damaged.parent.iterdir()] == [before]
     torn = tmp_path / '.torn.active' / 'torn_0.mcap'
     torn.parent.mkdir()
-    torn.write_bytes(next(finished.glob('*.mcap')).read_bytes()[:4000])
-    before = torn.read_bytes()
-    with pytest.raises(EpisodeLogError, match='nothing to recover'):
-        recover_episode(torn.parent)
-    assert [file.read_bytes() for file in torn.parent.iterdir()] == [before]
+    whole = next(finished.glob('*.mcap')).read_bytes()
+    torn.write_bytes(whole[: len(whole) // 2])
     (tmp_path / 'torn').mkdir()
     with pytest.raises(EpisodeLogError, match='never overwritten'):
         recover_episode(torn.parent)
     with pytest.raises(EpisodeLogError, match='no unfinished episode'):
         recover_episode(finished)
     writer.abort('test')
+
+
+@pytest.mark.parametrize('size', [None, 0, 5, 400, 3000])
+def test_what_was_killed_before_its_first_chunk_is_cleared_away(finished, tmp_path, size):
+    """An empty directory, an empty file, half a header, half a record: nothing to keep."""
+    leftover = tmp_path / '.episode.active'
+    leftover.mkdir()
+    if size is not None:
+        whole = (finished / f'{finished.name}_0.mcap').read_bytes()
+        (leftover / 'episode_0.mcap').write_bytes(whole[:size])
+    assert recover_episode(leftover) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_length_is_not_taken_for_a_kill(finished, tmp_path):
+    """Cleared away is only what ends too early; here all of the file is there."""
+    leftover = tmp_path / '.episode.active'
+    leftover.mkdir()
+    damaged = bytearray((finished / f'{finished.name}_0.mcap').read_bytes())
+    # The length of the second record, after the header.
+    second = 8 + 9 + int.from_bytes(damaged[9:17], 'little')
+    damaged[second + 7] ^= 1
+    (leftover / 'episode_0.mcap').write_bytes(damaged)
+    with pytest.raises(EpisodeLogError, match='nothing to recover'):
+        recover_episode(leftover)
+    assert (leftover / 'episode_0.mcap').read_bytes() == damaged
+
+
+def test_an_episode_whose_directory_is_cleared_away_while_it_begins_takes_the_next_number(
+    tmp_path, monkeypatch, recorder
+):
+    """Recovery may meet a directory in the instant before its file is locked."""
+    locks = []
+    lock = durable.lock
+
+    def clear_away_once(stream):
+        if not locks:
+            assert recover_episode(Path(stream.name).parent) is None
+        locks.append(stream.name)
+        lock(stream)
+
+    monkeypatch.setattr(durable, 'lock', clear_away_once)
+    path = recorder.record(EpisodeDirectory(tmp_path))
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+    assert path.name.startswith('FetchReach_000001_')
 
 
 def test_a_recovery_that_fails_changes_nothing(killed, tmp_path):
@@ -254,7 +301,6 @@ def test_an_error_of_the_disk_is_raised_once_and_stops_the_log(tmp_path, recorde
         assert '.episode.active/episode_0.mcap: File too large' in str(error)
         assert taken > 10
     # There is room again, but the episode has a hole: it stays closed.
-    assert writer.is_open is False
     topic, data = ticks[-1].messages[0]
     assert writer.write(topic, data, 10**12) is False
     assert writer.write_tick(10**12, ticks[-1].messages) is False

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.exceptions import EndOfFile
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
 
-from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeLogError, EpisodeWriter
-from fetch_hand_sim.episodes.recorder import EpisodeRecorder, episode_result
+from fetch_hand_sim.episode_log import (
+    EpisodeDirectory,
+    EpisodeLogError,
+    EpisodeWriter,
+    read_episode,
+)
+from fetch_hand_sim.episodes import recorder as recorder_module
+from fetch_hand_sim.episodes.backlog import Backlog
+from fetch_hand_sim.episodes.recorder import EpisodeRecorder, Messages, episode_result
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.cdr import TopicCodec
@@ -37,7 +50,12 @@ def ticks() -> Ticks:
     return recorded
 
 
-def record(directory: Path, ticks: Ticks, pause: float = 0.0) -> tuple[list[str], float]:
+def record(
+    directory: Path,
+    ticks: Ticks,
+    pause: float = 0.0,
+    on_slow: Callable[[str], None] = lambda line: None,
+) -> tuple[list[str], float]:
     """Logs an episode as a robot does; returns what it complained of and its longest tick."""
     errors: list[str] = []
     recorder = EpisodeRecorder(
@@ -45,6 +63,7 @@ def record(directory: Path, ticks: Ticks, pause: float = 0.0) -> tuple[list[str]
         metadata=lambda status: METADATA,
         on_error=errors.append,
         on_logged=lambda episode: None,
+        on_slow=on_slow,
     )
     longest = 0.0
     for tick, messages in ticks:
@@ -73,16 +92,6 @@ def files(directory: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in directory.glob('*/*')}
 
 
-def slowed(
-    flush: Callable[[EpisodeWriter, int], None], seconds: float
-) -> Callable[[EpisodeWriter, int], None]:
-    def wait(writer: EpisodeWriter, log_time_ns: int) -> None:
-        time.sleep(seconds)
-        flush(writer, log_time_ns)
-
-    return wait
-
-
 @pytest.mark.parametrize('pause', [0.0, 0.002])
 def test_the_file_is_the_one_a_writer_alone_makes(
     tmp_path: Path, ticks: Ticks, pause: float
@@ -96,20 +105,96 @@ def test_the_file_is_the_one_a_writer_alone_makes(
 def test_a_slow_disk_delays_no_tick(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write(tmp_path / 'writer', ticks)
-    monkeypatch.setattr(EpisodeWriter, 'flush', slowed(EpisodeWriter.flush, 0.2))
-    errors, longest = record(tmp_path / 'recorder', ticks, pause=0.01)
+    """What waits for the disk is the end of a file, and nothing waits for that."""
+    store = EpisodeWriter.store
+
+    def wait(writer: EpisodeWriter) -> Path | None:
+        time.sleep(0.5)
+        return store(writer)
+
+    monkeypatch.setattr(EpisodeWriter, 'store', wait)
+    errors, longest = record(tmp_path / 'recorder', [*ticks, *ticks], pause=0.002)
     assert errors == [] and longest < 0.15
-    assert files(tmp_path / 'recorder') == files(tmp_path / 'writer')
+    assert len(list((tmp_path / 'recorder').iterdir())) == 2
+
+
+def test_a_robot_that_is_faster_than_its_disk_waits_and_says_so(
+    tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_tick, slow = EpisodeWriter.write_tick, []
+
+    def wait(writer: EpisodeWriter, stamp_ns: int, messages: Messages) -> bool:
+        time.sleep(0.02)
+        return write_tick(writer, stamp_ns, messages)
+
+    monkeypatch.setattr(EpisodeWriter, 'write_tick', wait)
+    began = time.monotonic()
+    errors, longest = record(tmp_path / 'recorder', ticks, pause=0.005, on_slow=slow.append)
+    assert errors == [] and time.monotonic() - began > 51 * 0.02
+    assert longest > 0.01, 'no tick waited'
+    (line,) = slow
+    assert 'the disk is slower than the robot, which waits for it' in line
+    monkeypatch.undo()
+    write(tmp_path / 'writer', ticks)
+    assert read(tmp_path / 'recorder') == read(tmp_path / 'writer')
+
+
+def read(directory: Path) -> dict[str, object]:
+    (path,) = directory.iterdir()
+    return dict(read_episode(path).topics)
+
+
+def test_a_disk_that_takes_nothing_any_more_stops_the_log(
+    tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stuck = threading.Event()
+    monkeypatch.setattr(EpisodeWriter, 'write_tick', lambda *_: stuck.wait(20.0))
+    monkeypatch.setattr(recorder_module, 'Backlog', partial(Backlog, stall=0.3))
+    monkeypatch.setattr(recorder_module, '_LAST_CHANCE', 0.1)
+    errors, longest = record(tmp_path / 'recorder', ticks, pause=0.01)
+    stuck.set()
+    assert errors == ['episode log stopped: the disk took nothing for 0.3 s']
+    assert longest < 2.0
 
 
 def test_a_disk_that_fails_behind_the_robots_back_is_said_once(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(writer: EpisodeWriter, log_time_ns: int) -> None:
+    def fail(writer: EpisodeWriter, stamp_ns: int, messages: Messages) -> bool:
         raise EpisodeLogError('episode log stopped: disk gone')
 
-    monkeypatch.setattr(EpisodeWriter, 'flush', fail)
+    monkeypatch.setattr(EpisodeWriter, 'write_tick', fail)
     errors, _ = record(tmp_path / 'recorder', ticks, pause=0.01)
     assert errors == ['episode log stopped: disk gone']
     assert not [path for path in (tmp_path / 'recorder').iterdir() if path.name[0] != '.']
+
+
+def test_what_a_paused_robot_receives_reaches_the_system_without_another_tick(
+    tmp_path: Path, ticks: Ticks
+) -> None:
+    recorder = EpisodeRecorder(
+        tmp_path,
+        metadata=lambda status: METADATA,
+        on_error=pytest.fail,
+        on_logged=lambda episode: None,
+    )
+    recorder.record(*ticks[0])
+    for _ in range(3):
+        recorder.record_received(COMMANDS, COMMAND)
+    deadline = time.monotonic() + 10.0
+    while not [chunk for path in tmp_path.glob('.*/*.mcap') for chunk in chunks(path)]:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    recorder.close('end')
+    (path,) = tmp_path.iterdir()
+    assert len(read_episode(path).topics['/commands'].messages) == 3
+
+
+def chunks(path: Path) -> list[Chunk]:
+    """The whole chunks of a file in progress."""
+    found: list[Chunk] = []
+    with path.open('rb') as stream, suppress(EndOfFile):
+        found.extend(
+            r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)
+        )
+    return found
