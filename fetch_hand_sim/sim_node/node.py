@@ -139,6 +139,7 @@ class SimNode(Node):
             metadata=context.metadata,
             on_error=lambda line: self.get_logger().error(line),
             on_logged=self._on_logged,
+            on_slow=lambda line: self.get_logger().warning(line),
         )
 
     # Running

@@ -255,7 +255,8 @@ def _recover(path: Path) -> object:
     leftover.mkdir()
     shutil.copy(path, leftover / 'episode_0.mcap')
     try:
-        return read_episode(recover_episode(leftover))
+        recovered = recover_episode(leftover)
+        return recovered and read_episode(recovered)
     finally:
         shutil.rmtree(leftover, ignore_errors=True)
         shutil.rmtree(path.parent / 'episode', ignore_errors=True)
@@ -279,6 +280,8 @@ def outcome(read: object, path: Path) -> str:
         text = str(error)
         assert '\n' not in text and len(text) < 600 and text.isprintable(), repr(text)
         return 'error'
+    if result is None:
+        return 'cleared away'
     if isinstance(result, list):
         assert all(isinstance(each, EpisodeArrays) for each in result)
         assert all(np.isfinite(each.observations['observation']).all() for each in result)

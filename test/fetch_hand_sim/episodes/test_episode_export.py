@@ -87,9 +87,9 @@ def test_a_missing_extra_is_one_line(episodes, tmp_path, format_, module):
     )
     arguments = [episodes, '--to', format_, '--output', tmp_path / 'x']
     run = subprocess.run([sys.executable, '-c', code, *arguments], capture_output=True, text=True)
-    assert run.returncode == 1
+    assert run.returncode == 2
     (line,) = run.stderr.splitlines()
-    assert line.startswith(f'export_episodes: {module} is missing; install it with pip install')
+    assert line.startswith(f'export_episodes: {module} missing: pip install')
 
 
 def test_usage_errors(tmp_path, capsys):

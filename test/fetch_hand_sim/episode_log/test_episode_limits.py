@@ -1,0 +1,228 @@
+"""One set of limits: nothing a robot can be sent makes a file that its readers refuse."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from mcap.writer import CompressionType, Writer
+
+from fetch_hand_sim.episode_log import (
+    Attachment,
+    EpisodeReadError,
+    EpisodeWriter,
+    LogSettings,
+    limits,
+    load_episodes,
+    read_episode,
+    read_summary,
+    recover_episode,
+)
+from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.replay_node.schedule import ReplaySchedule
+from msgs_spec.qos import rosbag2_yaml
+from msgs_spec.schemas import schema_text, type_hash
+from msgs_spec.topics import topic, topics
+from support.episode_recorder import Recorder
+
+MIB = 2**20
+# What a robot may be sent while it is paused at its third tick, as sizes of messages on a topic.
+FLOODS = {
+    'one of 17.6 MB': [('commands', 17_610_916)],
+    'eight of 10 MB': [('commands', 10_000_000)] * 8,
+    'many of the longest': [('commands', limits.MAX_MESSAGE_BYTES)] * 1000,
+    'very many empty': [('commands', 4)] * (limits.MAX_MESSAGES + 10),
+    'all topics': [
+        (name, size)
+        for size in (4, 1000, limits.MAX_MESSAGE_BYTES + 1)
+        for name in ('commands', 'set_goal', 'policy_status')
+        for _ in range(limits.MAX_RECEIVED_MESSAGES)
+    ],
+}
+
+
+@pytest.fixture(scope='module')
+def recorder():
+    recorder = Recorder('FetchReach')
+    # Of the first episode, which is the one that all tests write.
+    metadata = recorder.metadata()
+    recorder.metadata = lambda: metadata
+    return recorder
+
+
+@pytest.fixture(scope='module')
+def ticks(recorder):
+    return recorder.ticks()
+
+
+def write(directory, recorder, ticks, flood, settings=None):
+    """Logs an episode whose robot is flooded at its third tick."""
+    writer = EpisodeWriter(directory, 'episode', recorder.metadata(), settings=settings)
+    for number, tick in enumerate(ticks):
+        assert writer.write_tick(tick.stamp_ns, tick.messages)
+        if number == 3:
+            for name, size in flood:
+                writer.write_received(topic(recorder.spec, name), bytes(size))
+        elif tick.command is not None:
+            writer.write_received(recorder.commands, tick.command)
+    return writer.finish({})
+
+
+@pytest.mark.parametrize('flood', FLOODS.values(), ids=FLOODS)
+def test_no_flood_makes_a_file_that_a_reader_refuses(tmp_path, recorder, ticks, flood):
+    path = write(tmp_path, recorder, ticks, flood)
+    episode = read_episode(path)
+    published = [m for tick in ticks for m in tick.messages]
+    counts = {name: len(logged.messages) for name, logged in episode.topics.items()}
+    commands = counts.pop('/commands')
+    assert sum(counts.values()) >= len(published)
+    assert all(counts[f'/{spec.name.lstrip("/")}'] for spec, _ in published)
+    # Whatever was refused is counted, beside the result.
+    refused = json.loads(episode.result['received_not_logged'])
+    assert commands + refused['commands'] >= len([1 for name, _ in flood if name == 'commands'])
+    assert read_summary(path).message_count == commands + sum(counts.values())
+    (arrays,) = load_episodes(path)
+    assert len(arrays) == 50
+    for messages in (logged.messages for logged in episode.topics.values()):
+        assert [m.sequence for m in messages] == list(range(len(messages)))
+
+
+def test_a_flooded_episode_checks_and_replays(tmp_path, recorder, ticks):
+    path = write(tmp_path, recorder, ticks, [('commands', 10_000_000)] * 8)
+    result = EpisodeChecker().check(path)
+    assert result.difference is None and result.ticks == 51
+    assert len(ReplaySchedule(path).messages) == sum(len(tick.messages) for tick in ticks)
+
+
+def test_a_flood_of_commands_takes_nothing_from_goals(tmp_path, recorder, ticks):
+    flood = [('commands', 24)] * (2 * limits.MAX_RECEIVED_MESSAGES) + [('set_goal', 100)]
+    episode = read_episode(write(tmp_path, recorder, ticks, flood))
+    assert len(episode.topics['/set_goal'].messages) == 1
+    assert json.loads(episode.result['received_not_logged']).keys() == {'commands'}
+
+
+def test_chunks_are_bounded_too(tmp_path, recorder, ticks):
+    """A paused robot flushes what it receives again and again."""
+    writer = EpisodeWriter(tmp_path, 'episode', recorder.metadata())
+    writer.write_tick(ticks[0].stamp_ns, ticks[0].messages)
+    taken = 0
+    for name in ('commands', 'set_goal', 'policy_status'):
+        for _ in range(limits.MAX_RECEIVED_MESSAGES - 1):
+            taken += writer.write_received(topic(recorder.spec, name), bytes(4))
+            writer.flush()
+    for tick in ticks[1:]:
+        assert writer.write_tick(tick.stamp_ns, tick.messages)
+    path = writer.finish({})
+    assert read_summary(path).message_count == taken + sum(len(tick.messages) for tick in ticks)
+    assert limits.MAX_CHUNKS // 2 - 1 <= taken <= limits.MAX_CHUNKS
+
+
+def test_the_smallest_chunks_read_too(tmp_path, recorder, ticks):
+    eager = LogSettings(chunk_size=1, flush_period_ns=1)
+    assert load_episodes(write(tmp_path, recorder, ticks, FLOODS['all topics'], eager))
+
+
+def test_what_a_program_gives_is_refused_at_once(tmp_path, recorder, ticks):
+    long = {'note': 'x' * (limits.MAX_METADATA_BYTES + 1)}
+    with pytest.raises(ValueError, match='bytes of episode metadata; allowed: 65536'):
+        EpisodeWriter(tmp_path, 'episode', long)
+    attachment = Attachment('a', 'b', bytes(limits.MAX_ATTACHMENT_BYTES + 1))
+    with pytest.raises(ValueError, match='bytes attached; allowed'):
+        EpisodeWriter(tmp_path, 'episode', {}, [attachment])
+    with pytest.raises(ValueError, match='chunk_size'):
+        LogSettings(chunk_size=limits.MAX_CHUNK_BYTES)
+    writer = EpisodeWriter(tmp_path, 'episode', {})
+    with pytest.raises(ValueError, match='no reader takes'):
+        writer.write(ticks[0].messages[0][0], bytes(limits.MAX_MESSAGE_BYTES + 1), 1)
+    with pytest.raises(ValueError, match='bytes of episode metadata'):
+        writer.finish(long)
+
+
+def test_metadata_as_long_as_allowed_read_back(tmp_path, ticks):
+    # Characters that YAML writes ten bytes long.
+    metadata = {'task': 'FetchReach', 'note': '\x07' * (limits.MAX_METADATA_BYTES - 100)}
+    writer = EpisodeWriter(tmp_path, 'episode', metadata)
+    writer.write_tick(ticks[0].stamp_ns, ticks[0].messages)
+    path = writer.finish({})
+    assert read_summary(path).metadata['note'] == metadata['note']
+    assert read_episode(path).metadata['note'] == metadata['note']
+
+
+# What earlier versions wrote
+
+
+def write_as_before(stream, recorder, ticks, flood):
+    """What version 0.1 wrote of a flood: everything, in chunks of 128 KiB and a message."""
+    writer = Writer(stream, chunk_size=128 * 1024, compression=CompressionType.LZ4)
+    writer.start(profile='ros2')
+    writer.add_metadata('episode', {'episode_id': 'episode', **recorder.metadata()})
+    channels = {}
+    for spec in topics(recorder.spec):
+        schema = writer.register_schema(
+            spec.type_name, 'ros2msg', schema_text(spec.type_name).encode()
+        )
+        metadata = {
+            'offered_qos_profiles': rosbag2_yaml(spec.qos),
+            'topic_type_hash': type_hash(spec.type_name),
+        }
+        name = '/' + spec.name.lstrip('/')
+        channels[spec.name] = writer.register_channel(name, 'cdr', schema, metadata)
+    for number, tick in enumerate(ticks):
+        messages = [(spec.name, data) for spec, data in tick.messages]
+        if number == 3:
+            messages += [(name, bytes(size)) for name, size in flood]
+        for rank, (name, data) in enumerate(messages):
+            time_ns = tick.stamp_ns + rank
+            writer.add_message(channels[name], time_ns, data, time_ns)
+    writer.flush()
+
+
+@pytest.mark.parametrize('name', ['one of 17.6 MB', 'eight of 10 MB', 'very many empty'])
+def test_an_episode_cut_off_by_a_flood_is_recovered_but_for_the_flood(
+    tmp_path, recorder, ticks, name
+):
+    """Earlier versions logged all of it, and then no reader took the file."""
+    leftover = tmp_path / '.episode.active'
+    leftover.mkdir()
+    with (leftover / 'episode_0.mcap').open('wb') as stream:
+        write_as_before(stream, recorder, ticks, FLOODS[name])
+    path = recover_episode(leftover)
+    episode = read_episode(path)
+    if name != 'very many empty':
+        steps = [len(logged.messages) for logged in episode.topics.values()]
+        assert sum(steps) == sum(len(tick.messages) for tick in ticks)
+        assert episode.result['steps'] == '50'
+    assert len(episode.topics['/clock'].messages) >= 4
+    assert EpisodeChecker().check(path).difference is None
+
+
+def bag_of(path, messages, size=0):
+    """A valid MCAP file of an episode with equal messages."""
+    with path.open('wb') as stream:
+        writer = Writer(stream, chunk_size=8 * MIB)
+        writer.start(profile='ros2')
+        for name in ('episode', 'episode_result'):
+            writer.add_metadata(name, {'task': 'FetchReach', 'control_hz': '25.0'})
+        schema = writer.register_schema('std_msgs/msg/Float64', 'ros2msg', b'float64 data')
+        channel = writer.register_channel('/reward', 'cdr', schema)
+        for number in range(messages):
+            writer.add_message(channel, number, bytes(size), number)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize('read', [read_episode, load_episodes, ReplaySchedule])
+def test_small_files_of_very_many_messages_cost_little(tmp_path, read, monkeypatch):
+    """72 KB of two million empty messages took 10 s and 390 MB."""
+    path = bag_of(tmp_path / 'x.mcap', limits.MAX_MESSAGES + 1)
+    assert path.stat().st_size < 2 * MIB
+    with pytest.raises(EpisodeReadError, match='more than 50000 messages'):
+        read(path)
+
+
+def test_limits_hold_together():
+    """What one topic may take leaves room for the others and for the ticks."""
+    assert 4 * limits.MAX_RECEIVED_MESSAGES < limits.MAX_MESSAGES
+    assert 4 * limits.MAX_RECEIVED_BYTES < limits.MAX_UNPACKED_BYTES
+    assert limits.MAX_MESSAGE_BYTES < limits.MAX_RECEIVED_BYTES
+    assert limits.MAX_UNPACKED_BYTES + limits.MAX_ATTACHMENT_BYTES < limits.MAX_FILE_BYTES
