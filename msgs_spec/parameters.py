@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS, substeps_per_tick
 
 Value = str | int | float | bool
@@ -122,6 +123,12 @@ SIM_NODE = (
         lower=0.0,
         upper=3600.0,
         read_only=False,
+    ),
+    ParameterSpec(
+        'joint_prefix',
+        'string',
+        JOINT_PREFIX,
+        'What the names of joints begin with in joint_states and joint_commands, such as rh_.',
     ),
     ParameterSpec(
         'wait_for_commands',

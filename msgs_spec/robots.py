@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 # Metres a gripper action of 1 moves the mocap target per tick (Plappert et al. 2018, section 1.1;
 # Gymnasium-Robotics `fetch_env.py`).
 GRIPPER_STEP = 0.05
+# What the names of joints begin with in the MJCF, and on the network unless another is asked for.
+JOINT_PREFIX = 'robot0:'
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +34,7 @@ class RobotSpec:
 
     Attributes:
         name: `fetch` or `shadow_hand`.
-        joints: Scalar joints in the order of `joint_states` (MJCF names).
+        joints: Scalar joints in the order of `joint_states`, by their names there.
         joint_units: 'm' or 'rad' for each joint.
         command: The parts of the command vector, in order. The normalised action has the same
             length and order.
@@ -50,6 +52,17 @@ class RobotSpec:
     def action_size(self) -> int:
         """Length of the action and of the command vector: 4 or 20."""
         return len(self.command)
+
+    def with_joint_prefix(self, prefix: str) -> RobotSpec:
+        """Returns the robot with joints whose names begin with another prefix, such as `rh_`."""
+
+        def renamed(name: str) -> str:
+            is_joint = name.startswith(JOINT_PREFIX)
+            return prefix + name.removeprefix(JOINT_PREFIX) if is_joint else name
+
+        joints = tuple(map(renamed, self.joints))
+        command = tuple(replace(part, name=renamed(part.name)) for part in self.command)
+        return replace(self, joints=joints, command=command)
 
 
 _FETCH_JOINTS = (

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
-from msgs_spec.robots import FETCH, FINGERTIPS, SHADOW_HAND, RobotSpec
+from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, RobotSpec
 
 # One physics substep, seconds, and the paper's 20 substeps per action (25 Hz).
 PHYSICS_TIMESTEP = 0.002
@@ -202,16 +202,23 @@ TASKS: dict[str, TaskSpec] = {
 }
 
 
-def task_spec(name: str) -> TaskSpec:
+def task_spec(name: str, joint_prefix: str = JOINT_PREFIX) -> TaskSpec:
     """Returns the task called `name`.
+
+    Args:
+        name: One of `TASKS`.
+        joint_prefix: What the names of its joints begin with on the network.
 
     Raises:
         ValueError: If there is none; the message lists all of them.
     """
     try:
-        return TASKS[name]
+        task = TASKS[name]
     except (KeyError, TypeError):
         raise ValueError(f'unknown task {name!r}; allowed: {", ".join(TASKS)}') from None
+    if joint_prefix == JOINT_PREFIX:
+        return task
+    return replace(task, robot=task.robot.with_joint_prefix(joint_prefix))
 
 
 def substeps_per_tick(control_hz: float, timestep: float = PHYSICS_TIMESTEP) -> int:

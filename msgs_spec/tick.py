@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_status
 from msgs_spec.observations import Readings
+from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import TopicSpec, topics
@@ -43,6 +44,7 @@ class EpisodeStatus:
         success_rule: `gymnasium` or `paper`.
         episode_return: Sum of rewards so far.
         is_success: Whether the goal is reached now.
+        joint_prefix: What the names of joints begin with; told where it is not the usual one.
     """
 
     task: str
@@ -55,10 +57,14 @@ class EpisodeStatus:
     success_rule: str
     episode_return: float
     is_success: bool
+    joint_prefix: str = JOINT_PREFIX
 
     def to_values(self) -> dict[str, str]:
         """Returns the key/value pairs of the message."""
-        return {key: str(value) for key, value in dataclasses.asdict(self).items()}
+        values = {key: str(value) for key, value in dataclasses.asdict(self).items()}
+        if self.joint_prefix == JOINT_PREFIX:
+            del values['joint_prefix']
+        return values
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> EpisodeStatus:
@@ -67,6 +73,7 @@ class EpisodeStatus:
         Raises:
             ValueError: If a pair is missing or cannot be read.
         """
+        values = {'joint_prefix': JOINT_PREFIX, **values}
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
         if missing:
             raise ValueError(f'episode_status without {", ".join(missing)}')
@@ -84,6 +91,7 @@ class EpisodeStatus:
                 success_rule=values['success_rule'],
                 episode_return=float(values['episode_return']),
                 is_success=flags[values['is_success']],
+                joint_prefix=values['joint_prefix'],
             )
         except (KeyError, ValueError) as error:
             raise ValueError(f'episode_status with unreadable value: {error}') from None

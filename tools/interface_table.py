@@ -13,13 +13,12 @@ from pathlib import Path
 
 from msgs_spec.parameters import NODES, ParameterSpec
 from msgs_spec.qos import QosSpec
-from msgs_spec.robots import FETCH, FINGERTIPS, SHADOW_HAND, CommandPart
+from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, CommandPart
 from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS, GoalKind, TaskSpec, VectorPart
 from msgs_spec.tick import PHASES, EpisodeStatus
 from msgs_spec.topics import MONITORING, TopicSpec, topics
 
-_PREFIX = 'robot0:'
 START, END = '<!-- interface table -->', '<!-- /interface table -->'
 
 _PUBLISHING = (
@@ -133,6 +132,10 @@ def _orders() -> str:
     keys = [field.name for field in dataclasses.fields(EpisodeStatus)]
     lines = (
         ('Quaternions', 'xyzw in messages, wxyz in observations and goals.'),
+        (
+            'Joints',
+            f'their names begin with `{JOINT_PREFIX}`, or with the parameter `joint_prefix`.',
+        ),
         ('`joint_states`, Fetch', _names(FETCH.joints)),
         ('`joint_states`, hand', _names(SHADOW_HAND.joints)),
         ('`commands`, `applied_command`, Fetch', _command(FETCH.command)),
@@ -145,19 +148,21 @@ def _orders() -> str:
 
 
 def _names(names: Sequence[str]) -> str:
-    prefix = _PREFIX if all(name.startswith(_PREFIX) for name in names) else ''
+    prefix = JOINT_PREFIX if all(name.startswith(JOINT_PREFIX) for name in names) else ''
     text = ', '.join(_code(name.removeprefix(prefix)) for name in names)
     return f'`{prefix}` + {text}' if prefix else text
 
 
 def _command(parts: Sequence[CommandPart]) -> str:
     """Parts with their ranges; units once per run of equal ones."""
-    names = [part.name.removeprefix(_PREFIX) for part in parts]
+    names = [part.name.removeprefix(JOINT_PREFIX) for part in parts]
     texts = [f'`{n}` {p.lower:g} ... {p.upper:g}' for n, p in zip(names, parts, strict=True)]
     for index, (part, following) in enumerate(zip(parts, [*parts[1:], None], strict=True)):
         if following is None or following.unit != part.unit:
             texts[index] += f' ({part.unit})'
-    return (f'`{_PREFIX}` + ' if parts[0].name.startswith(_PREFIX) else '') + ', '.join(texts)
+    return (f'`{JOINT_PREFIX}` + ' if parts[0].name.startswith(JOINT_PREFIX) else '') + ', '.join(
+        texts
+    )
 
 
 def _observation_table() -> str:

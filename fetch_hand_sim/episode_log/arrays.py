@@ -17,6 +17,7 @@ from fetch_hand_sim.episode_log.summary import expand_episodes
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.commands import action_from_command
 from msgs_spec.observations import ObservationAssembler
+from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.topics import topic
 
@@ -128,7 +129,7 @@ class _Decoder:
     def __init__(self, file: MessageFile) -> None:
         metadata = file.metadata[EPISODE]
         self._file = file
-        self._task = task_spec(metadata['task'])
+        self._task = task_spec(metadata['task'], metadata.get('joint_prefix', JOINT_PREFIX))
         self._assembler = _assembler(self._task, float(metadata['control_hz']))
         self._resolved = {name.rpartition('/')[2]: name for name in file.offsets}
 
@@ -147,7 +148,7 @@ class _Decoder:
             raise ValueError(f'it says {result["steps"]} steps and holds {steps}')
         return EpisodeArrays(
             path=self._file.path,
-            spec=self._task,
+            spec=task_spec(self._task.name),
             observations=self._assembler.assemble(vectors),
             actions=action_from_command(self._task.robot, commands),
             commands=commands,

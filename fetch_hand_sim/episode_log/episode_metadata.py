@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 
+from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import PHYSICS_TIMESTEP, TaskSpec
 
 # What the messages of an episode mean. 1, which wrote no number: a robot ignored frame and stamp of
@@ -33,6 +34,7 @@ def episode_metadata(
     reward_type: str,
     success_rule: str,
     control_hz: float,
+    joint_prefix: str = JOINT_PREFIX,
     model_sha256: str,
     source_revision: str | None = None,
     checkpoint_sha256: str | None = None,
@@ -48,6 +50,7 @@ def episode_metadata(
         reward_type: 'sparse' or 'dense'.
         success_rule: 'gymnasium' or 'paper'.
         control_hz: Ticks per simulated second.
+        joint_prefix: What the names of joints begin with; recorded where it is not the usual one.
         model_sha256: Fingerprint of the compiled model, see `model_sha256`.
         source_revision: Revision of this project, if known.
         checkpoint_sha256: Fingerprint of the actor that gives the commands, if known.
@@ -66,6 +69,7 @@ def episode_metadata(
         'episode_ticks': str(task.episode_ticks),
         'robot': task.robot.name,
         'joint_order': json.dumps(task.robot.joints),
+        'joint_prefix': joint_prefix if joint_prefix != JOINT_PREFIX else None,
         'command_order': json.dumps([part.name for part in task.robot.command]),
         'model_sha256': model_sha256,
         'source_revision': source_revision,

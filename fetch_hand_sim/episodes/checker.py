@@ -25,6 +25,7 @@ from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
 from msgs_spec.codecs import decode
 from msgs_spec.command_line import printable
+from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.schemas import deserialize
 from msgs_spec.tick import EpisodeStatus, TickEncoder
 from msgs_spec.topics import TopicSpec
@@ -121,6 +122,7 @@ class EpisodeChecker:
             first_seed=seed - index,
             first_episode=index,
             first_stamp_ns=ticks[0].stamp_ns,
+            joint_prefix=metadata.get('joint_prefix', JOINT_PREFIX),
         )
 
     def _simulation_of(self, episode: Episode) -> Simulation:

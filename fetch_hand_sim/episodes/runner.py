@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.observations import achieved_goal
+from msgs_spec.robots import JOINT_PREFIX
+from msgs_spec.tasks import task_spec
 from msgs_spec.tick import EpisodeStatus, Phase, Tick
 
 Array = NDArray[np.float64]
@@ -35,6 +37,7 @@ class EpisodeRunner:
         episodes: int = 0,
         first_episode: int = 0,
         first_stamp_ns: int = FIRST_STAMP_NS,
+        joint_prefix: str = JOINT_PREFIX,
     ) -> None:
         """Prepares the first episode.
 
@@ -45,6 +48,7 @@ class EpisodeRunner:
             first_episode: Index of the first episode, which has the seed `first_seed` plus it; to
                 run an episode from the middle of a series again.
             first_stamp_ns: Simulated time of the first tick, likewise.
+            joint_prefix: What the names of joints begin with on the network.
 
         Raises:
             ValueError: If the simulation holds more than one robot.
@@ -52,7 +56,8 @@ class EpisodeRunner:
         if simulation.num_envs != 1:
             raise ValueError(f'one robot is run at a time, not {simulation.num_envs}')
         self.simulation = simulation
-        self.spec = simulation.spec
+        self.spec = task_spec(simulation.spec.name, joint_prefix)
+        self._joint_prefix = joint_prefix
         self._first_seed = first_seed
         self._episodes = episodes
         self._period_ns = round(simulation.tick_duration * 1e9)
@@ -186,4 +191,5 @@ class EpisodeRunner:
             success_rule=metric.success_rule,
             episode_return=self._return,
             is_success=is_success,
+            joint_prefix=self._joint_prefix,
         )

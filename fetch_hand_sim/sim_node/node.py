@@ -98,7 +98,12 @@ class SimNode(Node):
             )
         except ValueError as error:
             raise UsageError(str(error)) from None
-        runner = EpisodeRunner(simulation, first_seed=values['seed'], episodes=values['episodes'])
+        runner = EpisodeRunner(
+            simulation,
+            first_seed=values['seed'],
+            episodes=values['episodes'],
+            joint_prefix=values['joint_prefix'],
+        )
         pacer = RealTimePacer(
             simulation.tick_duration, values['real_time_factor'], time.monotonic()
         )

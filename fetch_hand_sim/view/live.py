@@ -119,7 +119,7 @@ class LiveRobot:
         except ValueError:
             return
         if self._status is None or self._status.task != status.task:
-            self._watch(task_spec(status.task))
+            self._watch(task_spec(status.task, status.joint_prefix))
         before, self._status = self._status, status
         if self._curves is None or before is None or before.success_rule != status.success_rule:
             self._start_curves(status)

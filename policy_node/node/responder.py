@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.diagnostics import Durations
 from msgs_spec.observations import ObservationAssembler
+from msgs_spec.tasks import task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
 from policy_node.node.stamp_join import StampJoin
@@ -45,10 +46,11 @@ class Responder:
             clock: A steady clock, seconds.
         """
         self._commander = commander
-        self._assembler = ObservationAssembler(commander.spec, status.control_hz)
+        spec = task_spec(status.task, status.joint_prefix)
+        self._assembler = ObservationAssembler(spec, status.control_hz)
         self._send = send
         self._clock = clock
-        self._commands = TopicCodec(topic(commander.spec, 'commands'))
+        self._commands = TopicCodec(topic(spec, 'commands'))
         self._sources = {source.name: TopicCodec(source) for source in self._assembler.topics}
         self._unsent: bytes | None = None
         self.topics = self._assembler.topics
