@@ -62,9 +62,11 @@ SIM_NODE = (
         'seed',
         'integer',
         0,
-        'Seed of the first episode; each further episode takes the next one.',
+        'Seed of the first episode, and when set later of the next one; each further episode takes '
+        'the next seed.',
         lower=0,
         upper=_LARGEST_SEED,
+        read_only=False,
     ),
     ParameterSpec(
         'episodes',

@@ -25,8 +25,8 @@ class EpisodeRunner:
     """Runs episodes one after the other on a `Simulation` of one robot.
 
     Each reset takes a tick of its own: `advance` starts an episode when `is_between_episodes`, and
-    steps it otherwise. Episode i has the seed `first_seed + i`. Stamps grow by one period per tick
-    and never go back.
+    steps it otherwise. Episode i has the seed `first_seed + i` until `set_next_seed` is called.
+    Stamps grow by one period per tick and never go back.
     """
 
     def __init__(
@@ -63,6 +63,7 @@ class EpisodeRunner:
         self._period_ns = round(simulation.tick_duration * 1e9)
         self._first_stamp_ns = self._next_stamp_ns = self._reset_stamp_ns = first_stamp_ns
         self._episode = first_episode
+        self._new_first_seed: int | None = None
         self._tick = 0
         self._return = 0.0
         self.is_between_episodes = True
@@ -81,6 +82,8 @@ class EpisodeRunner:
     @property
     def seed(self) -> int:
         """Seed of the running or next episode."""
+        if self.is_between_episodes and self._new_first_seed is not None:
+            return self._new_first_seed + self._episode
         return self._first_seed + self._episode
 
     @property
@@ -112,6 +115,11 @@ class EpisodeRunner:
         (command,) = self.simulation.resting_commands()
         return np.asarray(command)
 
+    def set_next_seed(self, seed: int) -> None:
+        """Gives the next episode to start a seed, and those after it the seeds that follow."""
+        following = self._episode if self.is_between_episodes else self._episode + 1
+        self._new_first_seed = seed - following
+
     def set_goal(self, goal: Array) -> None:
         """Replaces the goal (goal size,) of the running episode from the next tick on.
 
@@ -140,6 +148,8 @@ class EpisodeRunner:
         self._reset_stamp_ns = self._next_stamp_ns
         self._return = 0.0
         self.has_diverged = False
+        if self._new_first_seed is not None:
+            self._first_seed, self._new_first_seed = self._new_first_seed, None
         self.is_between_episodes = False
         self.simulation.reset(seed=self.seed)
         return self._make_tick('reset', None)

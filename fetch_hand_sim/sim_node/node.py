@@ -303,5 +303,7 @@ class SimNode(Node):
             self._settings[change.name] = change.value
             if change.name == 'real_time_factor':
                 self._robot.set_real_time_factor(float(change.value))
+            elif change.name == 'seed':
+                self._robot.runner.set_next_seed(int(change.value))
             elif change.name == 'command_timeout':
                 self._robot.buffer.timeout = float(change.value)

@@ -1,0 +1,54 @@
+"""Seeds of episodes: one after the other, from wherever somebody said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.simulation import Simulation
+
+
+@pytest.fixture(scope='module')
+def simulation():
+    return Simulation('FetchReach', num_threads=1)
+
+
+def run_episode(runner):
+    """Runs the next episode; returns its ticks."""
+    ticks = [runner.advance(runner.resting_command())]
+    while not runner.is_between_episodes:
+        ticks.append(runner.advance(runner.resting_command()))
+    return ticks
+
+
+def test_a_seed_holds_from_the_next_episode_on(simulation):
+    runner = EpisodeRunner(simulation, first_seed=3)
+    seen = [run_episode(runner)[0].status.seed for _ in range(2)]
+    runner.set_next_seed(100)
+    assert runner.seed == 100
+    seen += [run_episode(runner)[0].status.seed for _ in range(2)]
+    assert seen == [3, 4, 100, 101]
+
+
+def test_the_running_episode_keeps_its_own(simulation):
+    runner = EpisodeRunner(simulation, first_seed=3)
+    runner.advance(runner.resting_command())
+    runner.set_next_seed(7)
+    runner.set_next_seed(50)
+    assert runner.seed == 3
+    assert runner.advance(runner.resting_command()).status.seed == 3
+    runner.end_episode()
+    assert runner.seed == 50
+    assert {tick.status.seed for tick in run_episode(runner)} == {50}
+    assert run_episode(runner)[-1].status.seed == 51
+
+
+def test_the_same_seed_gives_the_same_goal(simulation):
+    first = EpisodeRunner(simulation, first_seed=9)
+    goal = first.advance(first.resting_command()).desired_goal
+    second = EpisodeRunner(simulation, first_seed=0)
+    run_episode(second)
+    second.set_next_seed(9)
+    again = second.advance(second.resting_command()).desired_goal
+    np.testing.assert_array_equal(again, goal)
