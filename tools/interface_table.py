@@ -1,6 +1,6 @@
-"""The interface section of the README, generated from `msgs_spec`.
+"""The tables of docs/interface.md, generated from `msgs_spec`.
 
-`python tools/interface_table.py` prints it, `--write README.md` puts it between its markers.
+`python tools/interface_table.py` prints them, `--write docs/interface.md` puts them in the page.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def interface_markdown() -> str:
 
 
 def replace_section(text: str) -> str:
-    """Returns a README with what is between its markers replaced.
+    """Returns a page with what is between its markers replaced.
 
     Raises:
         ValueError: If the two markers are not there, once each and in order.
@@ -222,7 +222,7 @@ def _service_table() -> str:
 def main(args: list[str] | None = None) -> int:
     """Prints or writes the section; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--write', type=Path, metavar='README.md', help='file to update')
+    parser.add_argument('--write', type=Path, metavar='PAGE', help='file to update')
     path: Path | None = parser.parse_args(args).write
     if path is None:
         print(interface_markdown())

@@ -1,8 +1,8 @@
-"""The README's tables of results.
+"""The tables of results in README.md and docs/simulation.md.
 
 Shipped actors come from the evaluation files beside them, speed from the last `make bench-sim`.
 
-python tools/readme_tables.py --write README.md
+python tools/readme_tables.py --write README.md docs/simulation.md
 """
 
 from __future__ import annotations
@@ -108,35 +108,41 @@ def _without_comments(text: str) -> Iterable[str]:
 TABLES = {'results': actors_table, 'speed': speed_table}
 
 
-def with_tables(readme: str) -> str:
-    """Returns the README with the present tables between their markers.
+def with_tables(page: str) -> str:
+    """Returns a page with the present tables between its markers.
 
     Raises:
-        ValueError: If markers are missing.
+        ValueError: If there are no markers, or one without the other.
     """
+    found = False
     for name, table in TABLES.items():
         first, last = f'<!-- {name} -->', f'<!-- /{name} -->'
-        before, begin, rest = readme.partition(first)
+        before, begin, rest = page.partition(first)
         _, end, after = rest.partition(last)
-        if not begin or not end:
+        if bool(begin) != bool(end):
             raise ValueError(f'no {first} ... {last}')
-        readme = f'{before}{first}\n\n{table()}\n\n{last}{after}'
-    return readme
+        if begin:
+            found = True
+            page = f'{before}{first}\n\n{table()}\n\n{last}{after}'
+    if not found:
+        raise ValueError(f'no markers; allowed: {", ".join(f"<!-- {name} -->" for name in TABLES)}')
+    return page
 
 
 def main() -> int:
     """Prints or writes the tables; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--write', type=Path, metavar='README.md', help='file to update')
-    path: Path | None = parser.parse_args().write
-    if path is None:
+    parser.add_argument('--write', type=Path, nargs='+', metavar='PAGE', help='pages to update')
+    paths: list[Path] | None = parser.parse_args().write
+    if paths is None:
         print('\n\n'.join(table() for table in TABLES.values()))
         return 0
-    try:
-        path.write_text(with_tables(path.read_text(encoding='utf-8')), encoding='utf-8')
-    except (OSError, ValueError) as error:
-        print(f'readme_tables: {path}: {error}', file=sys.stderr)
-        return 1
+    for path in paths:
+        try:
+            path.write_text(with_tables(path.read_text(encoding='utf-8')), encoding='utf-8')
+        except (OSError, ValueError) as error:
+            print(f'readme_tables: {path}: {error}', file=sys.stderr)
+            return 1
     return 0
 
 

@@ -56,10 +56,11 @@ COMMANDS = {
     'benchmark': Command("the paper's comparison, four arms", 'benchmark'),
     'export': Command('write an actor as ONNX', 'export_actor'),
     'episodes': Command(
-        'logged episodes: list, check, recover, export, generate',
+        'logged episodes: list, check, film, recover, export, generate',
         commands={
             'list': Command('what is in a directory', 'list_episodes'),
             'check': Command('run episodes again and compare every bit', 'check_episode'),
+            'film': Command('a film or a picture, without a display', 'render_episode'),
             'recover': Command('make bags of what a crash cut off', 'recover_episodes'),
             'export': Command('as Parquet or Minari datasets', 'export_episodes'),
             'generate': Command('log an actor in the batched simulation', 'generate_episodes'),

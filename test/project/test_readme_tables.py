@@ -15,16 +15,22 @@ ACTORS = ROOT / 'policy_node' / 'actors'
 TOOL = runpy.run_path(str(ROOT / 'tools' / 'readme_tables.py'))
 
 
-def test_readme_has_the_present_tables() -> None:
-    readme = (ROOT / 'README.md').read_text(encoding='utf-8')
-    assert TOOL['with_tables'](readme) == readme, (
-        'run: python tools/readme_tables.py --write README.md'
+@pytest.mark.parametrize('page', ['README.md', 'docs/simulation.md'])
+def test_pages_have_the_present_tables(page: str) -> None:
+    text = (ROOT / page).read_text(encoding='utf-8')
+    assert TOOL['with_tables'](text) == text, (
+        'run: python tools/readme_tables.py --write README.md docs/simulation.md'
     )
 
 
-def test_readme_without_markers_is_refused() -> None:
-    with pytest.raises(ValueError, match='no <!-- results -->'):
-        TOOL['with_tables']('# nothing')
+@pytest.mark.parametrize('text', ['# nothing', '<!-- results -->', '<!-- /speed -->'])
+def test_a_page_without_markers_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r'no (markers|<!--)'):
+        TOOL['with_tables'](text)
+
+
+def test_the_readme_is_short() -> None:
+    assert (ROOT / 'README.md').read_text().count('\n') <= 130
 
 
 @pytest.mark.parametrize('path', sorted(ACTORS.glob('*.safetensors')), ids=lambda path: path.stem)
