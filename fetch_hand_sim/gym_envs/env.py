@@ -3,35 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures
+from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Image, Pictures, check_render_mode
 from fetch_hand_sim.gym_envs.shared_physics import SharedPhysics
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
+from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
 from fetch_hand_sim.simulation import Observation, Simulation
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
 from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8] | NDArray[np.float32]
 
 
-class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32]]):
     """One task with dictionary observations, for hindsight experience replay.
 
     Episodes never terminate; `gymnasium.make` truncates them after the task's number of steps. Give
     it the keyword arguments of this class. `pickle` and `copy.deepcopy` keep the state: both go on
     to the same bits.
-
-    Attributes:
-        spec_of_task: The task as data.
-        simulation: The simulation behind it.
     """
 
     metadata = {  # noqa: RUF012 - as in gymnasium.Env
@@ -70,10 +65,7 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: If an argument is not allowed; the message says what is.
         """
-        modes = self.metadata['render_modes']
-        if render_mode not in (None, *modes):
-            allowed = ', '.join(('None', *modes))
-            raise ValueError(f'render_mode {render_mode!r} is not known; allowed: {allowed}')
+        check_render_mode(render_mode)
         self.simulation = Simulation(
             task,
             num_envs=1,
@@ -91,10 +83,7 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.width, self.height = width, height
         self._pictures = Pictures(self.simulation, width, height, default_camera_config)
         self._physics = SharedPhysics(self.simulation)
-        if distance_threshold is not None:
-            self.distance_threshold = distance_threshold
-        if rotation_threshold is not None:
-            self.rotation_threshold = rotation_threshold
+        self.set_thresholds(distance_threshold, rotation_threshold)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -145,24 +134,6 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         info = {'is_success': float(result.success[0]), 'diverged': diverged}
         return _first(result.observation), float(result.reward[0]), False, diverged, info
 
-    def compute_reward(
-        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
-    ) -> Any:
-        """Reward of goals of any batch shape (..., goal size)."""
-        return self.simulation.compute_reward(achieved_goal, desired_goal, info)
-
-    def compute_terminated(
-        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
-    ) -> bool:
-        """Never: a reached goal is to be kept."""
-        return False
-
-    def compute_truncated(
-        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
-    ) -> bool:
-        """Whether MuJoCo lost the simulation at the step that gave `info`."""
-        return bool(info and info.get('diverged', False))
-
     @property
     def model(self) -> Any:
         """The compiled `mujoco.MjModel`; what is written into it counts from the next call on."""
@@ -174,11 +145,6 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._physics.data
 
     @property
-    def dt(self) -> float:
-        """Simulated seconds per step."""
-        return self.simulation.tick_duration
-
-    @property
     def goal(self) -> Array:
         """The desired goal of the episode, (goal size,), live."""
         return np.asarray(self.simulation.goals[0])
@@ -186,35 +152,6 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     @goal.setter
     def goal(self, goal: ArrayLike) -> None:
         self.simulation.goals[0] = goal
-
-    @property
-    def reward_type(self) -> str:
-        """`sparse` or `dense`."""
-        return self.simulation.metric.reward_type
-
-    @reward_type.setter
-    def reward_type(self, reward_type: RewardType) -> None:
-        self.simulation.metric = replace(self.simulation.metric, reward_type=reward_type)
-
-    @property
-    def distance_threshold(self) -> float:
-        """Success within this distance, metres."""
-        return self.simulation.metric.spec.distance_threshold
-
-    @distance_threshold.setter
-    def distance_threshold(self, threshold: float) -> None:
-        self._set_threshold('distance_threshold', threshold)
-
-    @property
-    def rotation_threshold(self) -> float | None:
-        """Success within this rotation, radians; None where rotations do not count."""
-        return self.simulation.metric.spec.rotation_threshold
-
-    @rotation_threshold.setter
-    def rotation_threshold(self, threshold: float) -> None:
-        if self.rotation_threshold is None:
-            raise ValueError(f'{self.spec_of_task.name} has no rotation_threshold')
-        self._set_threshold('rotation_threshold', threshold)
 
     def render(self) -> Image | None:
         """Returns a picture of the robot and its goal.
@@ -243,30 +180,6 @@ class FetchHandEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _show(self) -> None:
         if self.render_mode == 'human':
             self.render()
-
-    def _set_threshold(self, name: str, value: float) -> None:
-        if not (np.isfinite(value) and value >= 0.0):
-            raise ValueError(f'{name} must be a number of at least 0, not {value!r}')
-        metric = self.simulation.metric
-        changed: dict[str, Any] = {name: float(value)}
-        self.simulation.metric = replace(metric, spec=replace(metric.spec, **changed))
-
-
-def check_reset_options(options: Any, allowed: tuple[str, ...]) -> None:
-    """Refuses options of `reset` that are not there, before anything has moved.
-
-    Raises:
-        TypeError: If options is neither a dictionary nor None.
-        ValueError: If an option is not allowed.
-    """
-    if options is None:
-        return
-    if not isinstance(options, dict):
-        raise TypeError(f'options of reset are a dictionary or None, not {options!r}')
-    for name in options:
-        if name not in allowed:
-            known = ', '.join(allowed) or 'none'
-            raise ValueError(f'reset option {name!r} is not known; allowed: {known}')
 
 
 def _first(observation: Observation) -> Observation:

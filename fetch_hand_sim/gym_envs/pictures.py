@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -20,6 +20,8 @@ from fetch_hand_sim.simulation.rendering import (
     simulation_frame,
 )
 from fetch_hand_sim.simulation.scene import Frame, Scene
+
+Image = NDArray[np.uint8] | NDArray[np.float32]
 
 # `rgb_array_list` and other lists are made of these by `gymnasium.make`.
 RENDER_MODES = ['human', 'rgb_array', 'depth_array']
@@ -63,7 +65,7 @@ class Pictures:
         self._renderer: SceneRenderer | None = None
         self._window: Any = None
 
-    def render(self, mode: str, index: int = 0) -> NDArray[np.uint8] | NDArray[np.float32] | None:
+    def render(self, mode: str, index: int = 0) -> Image | None:
         """Draws one copy.
 
         Args:
@@ -138,3 +140,14 @@ def _open_window(scene: Scene, width: int, height: int) -> Any:
                 "render_mode 'human' needs a display; without one use render_mode='rgb_array'"
             )
     return WindowViewer(scene.model, scene.data, width, height)
+
+
+def check_render_mode(mode: str | None, known: Sequence[str] = RENDER_MODES) -> None:
+    """Refuses a render mode that is not there.
+
+    Raises:
+        ValueError: If there is none; the message says what is allowed.
+    """
+    if mode not in (None, *known):
+        allowed = ', '.join(('None', *known))
+        raise ValueError(f'render_mode {mode!r} is not known; allowed: {allowed}')

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import gymnasium
+from gymnasium.vector import VectorEnv
 
 from fetch_hand_sim.gym_envs.goal_env import import_goal_env
 from msgs_spec.tasks import TASKS
@@ -30,6 +33,49 @@ def register_environments() -> None:
             max_episode_steps=spec.episode_ticks,
             kwargs={'task': task},
         )
+
+
+def make_vec(
+    name: str,
+    num_envs: int = 1,
+    wrappers: Sequence[Callable[[Any], VectorEnv[Any, Any, Any]]] = (),
+    **arguments: Any,
+) -> VectorEnv[Any, Any, Any]:
+    """`gymnasium.make_vec` of a batch, with wrappers, which Gymnasium itself refuses for batches.
+
+    Args:
+        name: The id.
+        num_envs: Number of copies.
+        wrappers: What goes around the batch, the innermost first: wrappers of
+            `gymnasium.wrappers.vector`, or those of single environments that have one of the same
+            name there.
+        **arguments: As `FetchHandVectorEnv` has them.
+
+    Raises:
+        ValueError: If a wrapper is for single environments only, or an argument is not allowed.
+    """
+    chosen = [_wrapper_of_batches(wrapper) for wrapper in wrappers]
+    env = gymnasium.make_vec(
+        name, num_envs=num_envs, vectorization_mode='vector_entry_point', **arguments
+    )
+    for wrapper in chosen:
+        env = wrapper(env)
+    return env
+
+
+def _wrapper_of_batches(wrapper: Any) -> Any:
+    if isinstance(wrapper, functools.partial):
+        inner = _wrapper_of_batches(wrapper.func)
+        return functools.partial(inner, *wrapper.args, **wrapper.keywords)
+    if not (isinstance(wrapper, type) and issubclass(wrapper, gymnasium.Wrapper)):
+        return wrapper
+    counterpart = getattr(gymnasium.wrappers.vector, wrapper.__name__, None)
+    if counterpart is None or wrapper is not getattr(gymnasium.wrappers, wrapper.__name__, None):
+        raise ValueError(
+            f'{wrapper.__name__} wraps single environments only; for them use '
+            "gymnasium.make_vec(..., vectorization_mode='sync', wrappers=[...])"
+        )
+    return counterpart
 
 
 _REFERENCE_ENV = 'fetch_hand_sim.gym_envs.gymnasium_robotics_env:make_env'

@@ -2,35 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from fetch_hand_sim.gym_envs.env import check_reset_options
-from fetch_hand_sim.gym_envs.spaces import action_space, observation_space
+from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures, check_render_mode
+from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
+from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
 from fetch_hand_sim.simulation import Observation, Simulation
+from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
 from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+# A window shows one environment.
+_RENDER_MODES = [mode for mode in RENDER_MODES if mode != 'human']
 
-class FetchHandVectorEnv(VectorEnv[Observation, NDArray[np.float32], Any]):
+
+class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float32], Any]):
     """N copies of one task, stepped together on all processors.
 
-    An environment whose episode ended starts again at the next step, which ignores its action and
-    rewards it with 0 (Gymnasium's `AutoresetMode.NEXT_STEP`). It equals a `SyncVectorEnv` of N
-    single environments bit for bit.
+    It equals a `SyncVectorEnv` of N single environments bit for bit, in each of Gymnasium's modes
+    of starting again: at the next step, which ignores the action and rewards it with 0
+    (`NEXT_STEP`), in the step that ends an episode, whose last observation is `info['final_obs']`
+    (`SAME_STEP`), or by `reset_mask` only (`DISABLED`). `pickle` and `copy.deepcopy` keep the
+    state.
     """
 
     metadata = {  # noqa: RUF012 - as in gymnasium.vector.VectorEnv
         'autoreset_mode': AutoresetMode.NEXT_STEP,
-        'render_modes': [],
+        'render_modes': _RENDER_MODES,
+        'render_fps': int(DEFAULT_CONTROL_HZ),
     }
 
     def __init__(
@@ -42,23 +51,39 @@ class FetchHandVectorEnv(VectorEnv[Observation, NDArray[np.float32], Any]):
         reward_type: RewardType = 'sparse',
         success_rule: SuccessRule = 'gymnasium',
         control_hz: float = DEFAULT_CONTROL_HZ,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        width: int = WIDTH,
+        height: int = HEIGHT,
+        default_camera_config: Mapping[str, Any] | None = None,
+        distance_threshold: float | None = None,
+        rotation_threshold: float | None = None,
     ) -> None:
         """Compiles the model and prepares the copies.
 
         Args:
-            task: One of the thirteen tasks (`msgs_spec.tasks.TASKS`).
+            task: One of the tasks (`msgs_spec.tasks.TASKS`).
             num_envs: Number of copies N.
             max_episode_steps: Steps per episode; None for the task's own number.
             num_threads: Threads that step them; 0 for all processors.
             reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
             success_rule: `gymnasium` (released code) or `paper` (its text).
             control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
+            autoreset_mode: When an ended episode is followed by the next.
+            render_mode: `rgb_array`, `depth_array` or None.
+            width: Pixels of a picture.
+            height: Pixels of a picture.
+            default_camera_config: Attributes of `mujoco.MjvCamera`; None for the task's view.
+            distance_threshold: Success within this distance, metres; None for the task's own.
+            rotation_threshold: Success within this rotation, radians; None for the task's own.
 
         Raises:
             ValueError: If an argument is not allowed; the message says what is.
         """
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(f'max_episode_steps must be at least 1, not {max_episode_steps}')
+        check_render_mode(render_mode, _RENDER_MODES)
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.simulation = Simulation(
             task,
             num_envs=num_envs,
@@ -67,15 +92,23 @@ class FetchHandVectorEnv(VectorEnv[Observation, NDArray[np.float32], Any]):
             success_rule=success_rule,
             control_hz=control_hz,
         )
-        spec = self.simulation.spec
+        self.spec_of_task = self.simulation.spec
         self.num_envs = num_envs
-        self.single_observation_space = observation_space(spec)
-        self.single_action_space = action_space(spec)
+        self.render_mode = render_mode
+        self.metadata = {
+            **self.metadata,
+            'autoreset_mode': self.autoreset_mode,
+            'render_fps': round(control_hz),
+        }
+        self.single_observation_space = observation_space(self.spec_of_task)
+        self.single_action_space = action_space(self.spec_of_task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._episode_steps = max_episode_steps or spec.episode_ticks
+        self._episode_steps = max_episode_steps or self.spec_of_task.episode_ticks
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
+        self._pictures = Pictures(self.simulation, width, height, default_camera_config)
+        self.set_thresholds(distance_threshold, rotation_threshold)
 
     def reset(
         self,
@@ -119,18 +152,24 @@ class FetchHandVectorEnv(VectorEnv[Observation, NDArray[np.float32], Any]):
         """Advances every environment by one tick, or starts it again if its episode had ended.
 
         Args:
-            actions: (N, action size) in [-1, 1].
+            actions: (N, action size); what lies outside [-1, 1] is clipped.
 
         Returns:
             Observations, rewards, terminated (never), truncated (at the end of an episode, or when
             MuJoCo lost the simulation) and a dictionary with `is_success` and `diverged`, masked by
-            `_is_success` and `_diverged` where an episode only started.
+            `_is_success` and `_diverged` where an episode only started. In mode `SAME_STEP` also
+            `final_obs` (N,), a dictionary for each episode that ended, and `final_info`.
 
         Raises:
-            ValueError: If the actions have a wrong shape, are not finite or out of range.
+            ValueError: If the actions have a wrong shape or are not finite.
+            gymnasium.error.ResetNeeded: In mode `DISABLED`, if an episode has ended.
         """
         started = self._ended
-        result = self.simulation.step(actions)
+        if self.autoreset_mode is AutoresetMode.DISABLED and started.any():
+            raise gymnasium.error.ResetNeeded(
+                f'episodes {np.flatnonzero(started).tolist()} have ended; reset them first'
+            )
+        result = self.simulation.step(clip_actions(np.asarray(actions)))
         observation, reward = result.observation, result.reward
         success, diverged = result.success, result.diverged & ~started
         if started.any():
@@ -138,21 +177,90 @@ class FetchHandVectorEnv(VectorEnv[Observation, NDArray[np.float32], Any]):
             reward = np.where(started, 0.0, reward)
             success = success & ~started
         self._elapsed = np.where(started, 0, self._elapsed + 1)
-        self._ended = (self._elapsed >= self._episode_steps) | diverged
-        info = {
-            'is_success': success.astype(np.float64),
-            '_is_success': ~started,
-            'diverged': diverged,
-            '_diverged': ~started,
-        }
+        truncated = (self._elapsed >= self._episode_steps) | diverged
+        self._ended = truncated
+        info = _masked({'is_success': success.astype(np.float64), 'diverged': diverged}, ~started)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
+            observation, info = self._start_next(observation, info, truncated)
         terminated = np.zeros(self.num_envs, dtype=bool)
-        return observation, reward, terminated, self._ended.copy(), info
+        return observation, reward, terminated, truncated.copy(), info
 
-    def compute_reward(
-        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
-    ) -> Array:
-        """Reward of goals of any batch shape (..., goal size)."""
-        return self.simulation.compute_reward(achieved_goal, desired_goal, info)
+    def _start_next(
+        self, last: Observation, info: dict[str, Any], ended: Flags
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts the ended episodes again; says what their last observation was."""
+        final = np.full(self.num_envs, None, dtype=object)
+        for index in np.flatnonzero(ended).tolist():
+            final[index] = {name: rows[index] for name, rows in last.items()}
+        values = {name: rows for name, rows in info.items() if not name.startswith('_')}
+        observation = self.simulation.reset(ids=ended)
+        self._elapsed[ended] = 0
+        self._ended = np.zeros(self.num_envs, dtype=bool)
+        return observation, {
+            **_masked(values, ~ended),
+            **_masked({'final_obs': final, 'final_info': _masked(values, ended)}, ended),
+        }
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Returns a picture of every environment; None without a render mode.
+
+        Raises:
+            RuntimeError: If there is no OpenGL.
+        """
+        if self.render_mode is None:
+            return None
+        return tuple(self._pictures.render(self.render_mode, i) for i in range(self.num_envs))
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Calls a method, or gives an attribute, of every environment, as `SyncVectorEnv` does.
+
+        What the environments share, such as `compute_reward`, is called once.
+
+        Raises:
+            AttributeError: If an environment has no such attribute.
+        """
+        if name == 'render':
+            return self.render() or (None,) * self.num_envs
+        if name in _OF_EACH:
+            return tuple(_OF_EACH[name](self))
+        shared = getattr(self, _SHARED.get(name, name))
+        return (shared(*args, **kwargs) if callable(shared) else shared,) * self.num_envs
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute of every environment.
+
+        Raises:
+            AttributeError: If an environment has no such attribute.
+        """
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Sets an attribute of the environments: `goal` of each, or one they share.
+
+        Args:
+            name: `goal`, `reward_type`, `distance_threshold` or `rotation_threshold`.
+            values: One value for all, or a list or tuple with one for each.
+
+        Raises:
+            AttributeError: If there is no such attribute, or it cannot be set.
+            ValueError: If there are too many or too few, or a shared one would differ.
+        """
+        each = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
+        if len(each) != self.num_envs:
+            raise ValueError(f'{self.num_envs} environments take as many values, not {len(each)}')
+        if name == 'goal':
+            self.simulation.goals[:] = each
+        elif name not in _SETTABLE:
+            allowed = ', '.join(('goal', *_SETTABLE))
+            raise AttributeError(f'{name!r} of a batch cannot be set; allowed: {allowed}')
+        elif any(value != each[0] for value in each):
+            raise ValueError(f'the environments of a batch share {name}; given: {each}')
+        else:
+            setattr(self, name, each[0])
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Frees the renderer."""
+        self._pictures.close()
 
     def _reset_mask(self, options: Any) -> Flags:
         check_reset_options(options, allowed=('reset_mask',))
@@ -164,3 +272,26 @@ class FetchHandVectorEnv(VectorEnv[Observation, NDArray[np.float32], Any]):
         if mask.shape != (self.num_envs,):
             raise ValueError(f'reset_mask has shape ({self.num_envs},), not {mask.shape}')
         return mask
+
+
+_SETTABLE = ('reward_type', 'distance_threshold', 'rotation_threshold')
+# What each environment has for itself.
+_OF_EACH = {
+    'goal': lambda batch: list(batch.simulation.goals.copy()),
+    'data': lambda batch: [batch.simulation.data(i) for i in range(batch.num_envs)],
+}
+# Names of the single environment for what the batch calls otherwise.
+_SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_observation_space'}
+
+
+def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
+    """Info as Gymnasium batches it: values (N,) and for whom they count."""
+    return {**values, **{f'_{name}': mask.copy() for name in values}}
+
+
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        allowed = ', '.join(known.value for known in AutoresetMode)
+        raise ValueError(f'autoreset_mode {mode!r} is not known; allowed: {allowed}') from None

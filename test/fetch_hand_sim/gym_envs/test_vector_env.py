@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import pickle
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+import fetch_hand_sim
 from fetch_hand_sim.gym_envs.registration import environment_id
 from msgs_spec.tasks import TASKS
 
@@ -45,13 +49,14 @@ def test_the_batch_is_described_like_its_members(task):
     assert env.observation_space.contains(observation)
 
 
+@pytest.mark.parametrize('mode', [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 @pytest.mark.parametrize('task', ['FetchPush', 'HandReach', 'HandManipulateBlockRotateParallel'])
-def test_it_equals_gymnasiums_vectorisation_over_several_episodes(task):
-    env = make_vec(task, 3, max_episode_steps=4, reward_type='dense')
+def test_it_equals_gymnasiums_vectorisation_over_several_episodes(task, mode):
+    env = make_vec(task, 3, max_episode_steps=4, reward_type='dense', autoreset_mode=mode)
     members = [
         lambda: gymnasium.make(environment_id(task), max_episode_steps=4, reward_type='dense')
     ] * 3
-    reference = gymnasium.vector.SyncVectorEnv(members)
+    reference = gymnasium.vector.SyncVectorEnv(members, autoreset_mode=mode)
     assert_same(env.reset(seed=11)[0], reference.reset(seed=11)[0])
     env.action_space.seed(0)
     ends = 0
@@ -62,8 +67,85 @@ def test_it_equals_gymnasiums_vectorisation_over_several_episodes(task):
             assert_same(mine, other)
         assert_same(ours[4]['is_success'], theirs[4].get('is_success', np.zeros(3)))
         assert_same(ours[4]['_is_success'], theirs[4].get('_is_success', np.zeros(3, dtype=bool)))
+        assert ('final_obs' in ours[4]) == ('final_obs' in theirs[4])
+        if 'final_obs' in ours[4]:
+            assert_same(ours[4]['_final_obs'], theirs[4]['_final_obs'])
+            assert_same(ours[4]['final_info'], theirs[4]['final_info'])
+            for mine, other in zip(ours[4]['final_obs'], theirs[4]['final_obs'], strict=True):
+                assert_same(mine, other)
         ends += ours[3].all()
-    assert ends == 2
+    assert ends == (2 if mode is AutoresetMode.NEXT_STEP else 3)
+
+
+def test_without_autoreset_an_ended_episode_waits_for_its_reset():
+    env = make_vec('FetchReach', 2, max_episode_steps=2, autoreset_mode='Disabled')
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.reset(options={'reset_mask': np.array([False, True])})
+    assert env.step(env.action_space.sample())[3].tolist() == [True, False]
+    before = state_of(env)
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r'episodes \[0\] have ended'):
+        env.step(env.action_space.sample())
+    assert state_of(env) == before
+    env.reset(options={'reset_mask': np.array([True, False])})
+    assert env.step(env.action_space.sample())[3].tolist() == [False, True]
+
+
+def test_attributes_and_calls_are_those_of_the_members():
+    env = make_vec('HandReach', 3).unwrapped
+    members = [lambda: gymnasium.make(environment_id('HandReach'))] * 3
+    reference = gymnasium.vector.SyncVectorEnv(members)
+    observation, _ = env.reset(seed=2)
+    reference.reset(seed=2)
+    for vector in (env, reference):
+        vector.set_attr('distance_threshold', 0.2)
+        vector.set_attr('reward_type', ['dense'] * 3)
+        vector.set_attr('goal', [np.full(15, 0.1 * i) for i in range(3)])
+    for name in ('distance_threshold', 'reward_type', 'dt', 'render_mode', 'action_space'):
+        assert env.get_attr(name) == reference.get_attr(name)
+    assert_same(np.array(env.get_attr('goal')), np.array(reference.get_attr('goal')))
+    assert_same(env.step(np.zeros((3, 20)))[1], reference.step(np.zeros((3, 20)))[1])
+    goals = observation['achieved_goal'], observation['desired_goal']
+    for mine, other in zip(
+        env.call('compute_reward', *goals, {}),
+        reference.call('compute_reward', *goals, {}),
+        strict=True,
+    ):
+        assert_same(mine, other)
+    assert len(env.call('data')) == 3
+    with pytest.raises(AttributeError, match="'model' of a batch cannot be set; allowed: goal, "):
+        env.set_attr('model', None)
+    with pytest.raises(ValueError, match='share distance_threshold'):
+        env.set_attr('distance_threshold', [1.0, 1.0, 2.0])
+    with pytest.raises(ValueError, match='3 environments take as many values, not 1'):
+        env.set_attr('goal', [0.0])
+    with pytest.raises(AttributeError, match='no attribute'):
+        env.get_attr('colour')
+
+
+def test_a_copy_goes_on_to_the_same_bits():
+    env = make_vec('HandManipulateEggRotate', 3, max_episode_steps=4).unwrapped
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    twin = pickle.loads(pickle.dumps(env))
+    for _ in range(5):
+        actions = env.action_space.sample()
+        for mine, other in zip(env.step(actions)[:4], twin.step(actions)[:4], strict=True):
+            assert_same(mine, other)
+
+
+def test_pictures_show_each_environment(monkeypatch):
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    env = make_vec('FetchReach', 2, render_mode='rgb_array', width=96, height=64)
+    env.reset(seed=0)
+    try:
+        pictures = env.render()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    assert [picture.shape for picture in pictures] == [(64, 96, 3)] * 2
+    # The goals differ.
+    assert (pictures[0] != pictures[1]).any()
+    assert make_vec('FetchReach', 1).render() is None
 
 
 def test_a_masked_reset_starts_only_the_masked():
@@ -143,3 +225,51 @@ def test_bad_actions_move_nothing():
 def test_an_episode_has_at_least_one_step():
     with pytest.raises(ValueError, match='max_episode_steps must be at least 1, not 0'):
         make_vec('FetchReach', 2, max_episode_steps=0)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (
+            {'autoreset_mode': 'Never'},
+            "'Never' is not known; allowed: NextStep, SameStep, D",
+        ),
+        ({'render_mode': 'human'}, "'human' is not known; allowed: None, rgb_array, depth_array"),
+        ({'distance_threshold': -1}, 'distance_threshold must be a number of at least 0, not -1'),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make_vec('FetchReach', 2, **arguments)
+
+
+def test_wrappers_go_around_the_batch():
+    name = environment_id('FetchPush')
+    flat = fetch_hand_sim.make_vec(name, 3, wrappers=[gymnasium.wrappers.FlattenObservation])
+    assert flat.reset(seed=0)[0].shape == (3, 31)
+    scaled = functools.partial(gymnasium.wrappers.RescaleAction, min_action=0.0, max_action=1.0)
+    counted = gymnasium.wrappers.vector.RecordEpisodeStatistics
+    env = fetch_hand_sim.make_vec(name, 2, wrappers=[scaled, counted], max_episode_steps=2)
+    assert env.single_action_space.low.tolist() == [0.0] * 4
+    env.reset(seed=0)
+    env.step(np.full((2, 4), 0.5))
+    assert env.step(np.full((2, 4), 0.5))[4]['episode']['l'].tolist() == [2, 2]
+    with pytest.raises(ValueError, match='TimeLimit wraps single environments only'):
+        fetch_hand_sim.make_vec(name, 2, wrappers=[gymnasium.wrappers.TimeLimit])
+
+
+def test_gymnasium_records_a_film(tmp_path, monkeypatch):
+    pytest.importorskip('moviepy')
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    env = gymnasium.wrappers.vector.RecordVideo(
+        make_vec(
+            'FetchReach', 2, render_mode='rgb_array', max_episode_steps=3, width=96, height=64
+        ),
+        str(tmp_path),
+        episode_trigger=lambda episode: True,
+    )
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(env.action_space.sample())
+    env.close()
+    assert any(path.stat().st_size > 0 for path in tmp_path.glob('*.mp4'))

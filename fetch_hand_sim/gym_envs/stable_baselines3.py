@@ -1,0 +1,111 @@
+"""The batch as a `VecEnv` of Stable-Baselines3; needs `pip install 'fetch_hand_sim[sb3]'`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
+from fetch_hand_sim.simulation import Observation
+
+
+class FetchHandVecEnv(VecEnv):
+    """N copies of one task for Stable-Baselines3, stepped together on all processors.
+
+    As a `DummyVecEnv` of N single environments: an ended episode is followed by the next in the
+    same step, its last observation is `info['terminal_observation']`. Put a `VecMonitor` around it
+    for the episodes' returns.
+
+    Attributes:
+        batch: The environments.
+    """
+
+    def __init__(self, task: str, num_envs: int = 1, **arguments: Any) -> None:
+        """Compiles the model and prepares the copies.
+
+        Args:
+            task: One of the tasks (`msgs_spec.tasks.TASKS`).
+            num_envs: Number of copies N.
+            **arguments: As `FetchHandVectorEnv` has them, but `autoreset_mode`.
+
+        Raises:
+            ValueError: If an argument is not allowed; the message says what is.
+        """
+        self.batch = FetchHandVectorEnv(
+            task, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **arguments
+        )
+        super().__init__(
+            num_envs, self.batch.single_observation_space, self.batch.single_action_space
+        )
+        self._actions: NDArray[np.float32] | None = None
+
+    def reset(self) -> Observation:
+        """Starts all episodes, with the seeds that `seed` set."""
+        seeds = None if all(seed is None for seed in self._seeds) else self._seeds
+        observation, _ = self.batch.reset(seed=seeds)
+        self._reset_seeds()
+        self._reset_options()
+        return observation
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        """Takes the actions (N, action size) of the next step."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Steps all environments."""
+        assert self._actions is not None, 'step_async comes before step_wait'
+        observation, reward, _, truncated, info = self.batch.step(self._actions)
+        success, ended = info['is_success'].tolist(), truncated.tolist()
+        infos: list[dict[str, Any]] = [
+            {'is_success': reached, 'TimeLimit.truncated': end}
+            for reached, end in zip(success, ended, strict=True)
+        ]
+        for index in np.flatnonzero(truncated).tolist():
+            infos[index]['terminal_observation'] = info['final_obs'][index]
+        return observation, reward.astype(np.float32), truncated, infos
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        self.batch.close()
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Returns a picture of every environment."""
+        return self.batch.render() or [None] * self.num_envs
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """An attribute of the environments."""
+        values = self.batch.get_attr(attr_name)
+        return [values[i] for i in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Sets an attribute: `goal` of some environments, or one that all of them share.
+
+        Raises:
+            AttributeError: If there is no such attribute, or it cannot be set.
+            ValueError: If a shared one is set for some environments only.
+        """
+        values = list(self.batch.get_attr(attr_name))
+        for index in self._get_indices(indices):
+            values[index] = value
+        self.batch.set_attr(attr_name, values)
+
+    def env_method(
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
+    ) -> list[Any]:
+        """Calls a method of the environments."""
+        results = self.batch.call(method_name, *method_args, **method_kwargs)
+        return [results[i] for i in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+        """Nothing is around a single environment of a batch."""
+        return [False for _ in self._get_indices(indices)]

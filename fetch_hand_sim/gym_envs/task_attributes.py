@@ -1,0 +1,112 @@
+"""What one environment and a batch of them have in common: the task's rewards and thresholds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.rewards import RewardType
+from msgs_spec.tasks import TaskSpec
+
+
+class TaskAttributes:
+    """Rewards for any goals, and settings that may be changed between steps.
+
+    Attributes:
+        spec_of_task: The task as data.
+        simulation: The simulation behind it.
+    """
+
+    spec_of_task: TaskSpec
+    simulation: Simulation
+
+    def compute_reward(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
+    ) -> Any:
+        """Reward of goals of any batch shape (..., goal size)."""
+        return self.simulation.compute_reward(achieved_goal, desired_goal, info)
+
+    def compute_terminated(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
+    ) -> bool:
+        """Never: a reached goal is to be kept."""
+        return False
+
+    def compute_truncated(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
+    ) -> bool:
+        """Whether MuJoCo lost the simulation at the step that gave `info`."""
+        return bool(info and info.get('diverged', False))
+
+    @property
+    def dt(self) -> float:
+        """Simulated seconds per step."""
+        return self.simulation.tick_duration
+
+    @property
+    def reward_type(self) -> str:
+        """`sparse` or `dense`."""
+        return self.simulation.metric.reward_type
+
+    @reward_type.setter
+    def reward_type(self, reward_type: RewardType) -> None:
+        self.simulation.metric = replace(self.simulation.metric, reward_type=reward_type)
+
+    @property
+    def distance_threshold(self) -> float:
+        """Success within this distance, metres."""
+        return self.simulation.metric.spec.distance_threshold
+
+    @distance_threshold.setter
+    def distance_threshold(self, threshold: float) -> None:
+        self._set_threshold('distance_threshold', threshold)
+
+    @property
+    def rotation_threshold(self) -> float | None:
+        """Success within this rotation, radians; None where rotations do not count."""
+        return self.simulation.metric.spec.rotation_threshold
+
+    @rotation_threshold.setter
+    def rotation_threshold(self, threshold: float) -> None:
+        if self.rotation_threshold is None:
+            raise ValueError(f'{self.spec_of_task.name} has no rotation_threshold')
+        self._set_threshold('rotation_threshold', threshold)
+
+    def set_thresholds(self, distance: float | None, rotation: float | None) -> None:
+        """Sets those that are not None.
+
+        Raises:
+            ValueError: If one is negative or no number, or the task has no rotations.
+        """
+        if distance is not None:
+            self.distance_threshold = distance
+        if rotation is not None:
+            self.rotation_threshold = rotation
+
+    def _set_threshold(self, name: str, value: float) -> None:
+        if not (np.isfinite(value) and value >= 0.0):
+            raise ValueError(f'{name} must be a number of at least 0, not {value!r}')
+        metric = self.simulation.metric
+        changed: dict[str, Any] = {name: float(value)}
+        self.simulation.metric = replace(metric, spec=replace(metric.spec, **changed))
+
+
+def check_reset_options(options: Any, allowed: tuple[str, ...]) -> None:
+    """Refuses options of `reset` that are not there, before anything has moved.
+
+    Raises:
+        TypeError: If options is neither a dictionary nor None.
+        ValueError: If an option is not allowed.
+    """
+    if options is None:
+        return
+    if not isinstance(options, dict):
+        raise TypeError(f'options of reset are a dictionary or None, not {options!r}')
+    for name in options:
+        if name not in allowed:
+            known = ', '.join(allowed) or 'none'
+            raise ValueError(f'reset option {name!r} is not known; allowed: {known}')

@@ -1,0 +1,81 @@
+"""The batch for Stable-Baselines3 beside its own vectorisation of single environments."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+from fetch_hand_sim.gym_envs.registration import environment_id
+from fetch_hand_sim.gym_envs.stable_baselines3 import FetchHandVecEnv
+
+
+def test_it_equals_a_dummy_vec_env_over_several_episodes():
+    ours = FetchHandVecEnv('HandReach', 3, max_episode_steps=4, reward_type='dense')
+    name = f'fetch_hand_sim:{environment_id("HandReach")}'
+    members = [lambda: gymnasium.make(name, max_episode_steps=4, reward_type='dense')] * 3
+    reference = DummyVecEnv(members)
+    ours.seed(7)
+    reference.seed(7)
+    first, second = ours.reset(), reference.reset()
+    generator = np.random.default_rng(0)
+    ends = 0
+    for _ in range(9):
+        for key, values in first.items():
+            assert values.tobytes() == second[key].tobytes()
+        actions = generator.uniform(-1, 1, (3, 20)).astype(np.float32)
+        first, rewards, dones, infos = ours.step(actions)
+        second, expected_rewards, expected_dones, expected_infos = reference.step(actions)
+        assert rewards.tobytes() == expected_rewards.tobytes()
+        assert rewards.dtype == expected_rewards.dtype
+        assert dones.tolist() == expected_dones.tolist()
+        for info, expected in zip(infos, expected_infos, strict=True):
+            for key in ('is_success', 'TimeLimit.truncated'):
+                assert info[key] == expected[key]
+            assert ('terminal_observation' in info) == ('terminal_observation' in expected)
+            for key, values in info.get('terminal_observation', {}).items():
+                assert values.tobytes() == expected['terminal_observation'][key].tobytes()
+        ends += dones.sum()
+    assert ends == 6
+
+
+def test_attributes_of_some_environments():
+    env = FetchHandVecEnv('FetchReach', 3)
+    env.reset()
+    env.set_attr('goal', np.ones(3), indices=1)
+    assert env.get_attr('goal', indices=[1])[0].tolist() == [1.0, 1.0, 1.0]
+    assert env.get_attr('goal', indices=0)[0].tolist() != [1.0, 1.0, 1.0]
+    env.set_attr('distance_threshold', 0.5)
+    assert env.get_attr('distance_threshold') == [0.5] * 3
+    with pytest.raises(ValueError, match='share reward_type'):
+        env.set_attr('reward_type', 'dense', indices=[0])
+    assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
+    assert env.has_attr('spec_of_task')
+    assert not env.has_attr('colour')
+
+
+def test_it_learns_with_hindsight():
+    torch.set_num_threads(1)
+    env = VecMonitor(FetchHandVecEnv('FetchReach', 4, max_episode_steps=10))
+    model = SAC(
+        'MultiInputPolicy',
+        env,
+        replay_buffer_class=HerReplayBuffer,
+        policy_kwargs={'net_arch': [16]},
+        learning_starts=80,
+        batch_size=32,
+        seed=0,
+        device='cpu',
+    )
+    model.learn(120)
+    batch = model.replay_buffer.sample(256)
+    goals = batch.observations['desired_goal'].numpy()
+    reached = np.linalg.norm(batch.next_observations['achieved_goal'].numpy() - goals, axis=1)
+    clear = np.abs(reached - 0.05) > 1e-6
+    expected = -(reached > 0.05).astype(np.float32)
+    assert 0.0 in expected
+    assert np.array_equal(batch.rewards.numpy()[clear, 0], expected[clear])
+    assert len(model.ep_info_buffer) == 12
