@@ -1,4 +1,4 @@
-"""Quality of service of topics as data, for rclpy and for rosbag2."""
+"""Quality of service of topics as data, and for rclpy."""
 
 from __future__ import annotations
 
@@ -43,27 +43,3 @@ def rclpy_profile(spec: QosSpec) -> QoSProfile:
         reliability=QoSReliabilityPolicy.get_from_short_key(spec.reliability),
         durability=QoSDurabilityPolicy.get_from_short_key(spec.durability),
     )
-
-
-def rosbag2_yaml(spec: QosSpec) -> str:
-    """Returns the `offered_qos_profiles` of rosbag2 metadata version 9: a list of one profile.
-
-    Unset durations are written as rmw's infinity.
-    """
-    return f"""\
-- history: keep_last
-  depth: {spec.depth}
-  reliability: {spec.reliability}
-  durability: {spec.durability}
-  deadline:
-    sec: 9223372036
-    nsec: 854775807
-  lifespan:
-    sec: 9223372036
-    nsec: 854775807
-  liveliness: automatic
-  liveliness_lease_duration:
-    sec: 9223372036
-    nsec: 854775807
-  avoid_ros_namespace_conventions: false
-"""

@@ -20,6 +20,7 @@ from fetch_hand_sim.episode_log.limits import (
     MAX_TOPICS,
     MAX_UNPACKED_BYTES,
 )
+from fetch_hand_sim.episode_log.offered_qos import OfferedQos
 
 Compression = Literal['none', 'lz4', 'zstd']
 COMPRESSIONS = {
@@ -41,20 +42,20 @@ class ChannelSpec:
         topic: Resolved name, with a leading slash.
         type_name: ROS name of the message type.
         schema_text: `ros2msg` definition of the type and of all types it is made of.
-        qos_yaml: `offered_qos_profiles` as YAML text, a list of profiles.
+        qos: What its publishers offer.
         type_hash: RIHS01 hash of the type.
     """
 
     topic: str
     type_name: str
     schema_text: str
-    qos_yaml: str
+    qos: OfferedQos
     type_hash: str
 
 
 def _topic_bytes(spec: ChannelSpec) -> int:
     """Bytes of the schema and the channel of a topic, with some to spare."""
-    texts = (spec.topic, spec.type_name, spec.schema_text, spec.qos_yaml, spec.type_hash)
+    texts = (spec.topic, spec.type_name, spec.schema_text, spec.qos.text, spec.type_hash)
     return 4 * 64 + sum(len(text.encode()) for text in texts)
 
 
@@ -178,7 +179,7 @@ class BagFile:
             message_encoding='cdr',
             schema_id=self._schemas[spec.type_name],
             metadata={
-                'offered_qos_profiles': spec.qos_yaml,
+                'offered_qos_profiles': spec.qos.text,
                 'topic_type_hash': spec.type_hash,
             },
         )
@@ -217,7 +218,7 @@ class BagFile:
                 ChannelInfo(
                     topic=channel.spec.topic,
                     type_name=channel.spec.type_name,
-                    qos_yaml=channel.spec.qos_yaml,
+                    qos=channel.spec.qos,
                     type_hash=channel.spec.type_hash,
                     message_count=channel.count,
                 )

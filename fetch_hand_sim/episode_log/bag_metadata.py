@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import yaml
+
+from fetch_hand_sim.episode_log.offered_qos import OfferedQos
 
 VERSION = 9
 ROS_DISTRO = 'jazzy'
 
 # libyaml takes 1 ms where pure Python takes 6 ms, a good part of a tick.
 _SafeDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
-_SafeLoader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-# A list of profiles with nine keys, two of whose values have keys of their own: ours has 400 bytes.
-_LONGEST_QOS = 4096
-_DEEPEST_QOS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,14 +24,14 @@ class ChannelInfo:
     Attributes:
         topic: Resolved name, with a leading slash.
         type_name: ROS name of the message type.
-        qos_yaml: `offered_qos_profiles` as YAML text, a list of profiles.
+        qos: What its publishers offered.
         type_hash: RIHS01 hash of the type.
         message_count: Messages of this topic in the bag.
     """
 
     topic: str
     type_name: str
-    qos_yaml: str
+    qos: OfferedQos
     type_hash: str
     message_count: int
 
@@ -61,45 +58,13 @@ class BagInfo:
         return sum(channel.message_count for channel in self.channels)
 
 
-@lru_cache(maxsize=64)
-def qos_profiles(text: str) -> list[dict[str, Any]]:
-    """Returns the profiles that an `offered_qos_profiles` lists; the text may be anybody's.
-
-    Raises:
-        ValueError: If it is no such list, too long or deep, or refers to itself: a few hundred
-            bytes of anchors unfold to gigabytes.
-    """
-    if len(text) > _LONGEST_QOS:
-        raise ValueError(f'quality of service of {len(text)} bytes; allowed: {_LONGEST_QOS}')
-    try:
-        _require_plain(text)
-        profiles = yaml.load(text, Loader=_SafeLoader) or []
-    except yaml.YAMLError as error:
-        raise ValueError(f'quality of service is no YAML: {error}') from None
-    if not isinstance(profiles, list) or not all(isinstance(each, dict) for each in profiles):
-        raise ValueError('quality of service is no list of profiles')
-    return profiles
-
-
-def _require_plain(text: str) -> None:
-    """Refuses aliases and deep nesting before anything is built of them."""
-    depth = 0
-    for event in yaml.parse(text, Loader=_SafeLoader):
-        if isinstance(event, yaml.AliasEvent):
-            raise ValueError('quality of service with an alias')
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > _DEEPEST_QOS:
-            raise ValueError(f'quality of service nested more than {_DEEPEST_QOS} deep')
-
-
 def _topic_entry(channel: ChannelInfo) -> dict[str, Any]:
     return {
         'topic_metadata': {
             'name': channel.topic,
             'type': channel.type_name,
             'serialization_format': 'cdr',
-            'offered_qos_profiles': qos_profiles(channel.qos_yaml),
+            'offered_qos_profiles': list(channel.qos.profiles),
             'type_description_hash': channel.type_hash,
         },
         'message_count': channel.message_count,

@@ -23,6 +23,7 @@ from fetch_hand_sim.episode_log.episode_bag import (
 from fetch_hand_sim.episode_log.errors import EpisodeLogError, one_line
 from fetch_hand_sim.episode_log.leftovers import inspect_leftover
 from fetch_hand_sim.episode_log.limits import ReceivedAllowance
+from fetch_hand_sim.episode_log.offered_qos import parse_offered_qos
 from fetch_hand_sim.episode_log.reader import DAMAGED, read_episode
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from fetch_hand_sim.episode_log.untrusted import RECOVERY_LIMITS, read_records
@@ -212,6 +213,6 @@ def _channel_spec(remains: _Remains, channel: records.Channel) -> ChannelSpec:
         topic=channel.topic,
         type_name=schema.name,
         schema_text=schema.data.decode(),
-        qos_yaml=channel.metadata['offered_qos_profiles'],
+        qos=parse_offered_qos(channel.metadata['offered_qos_profiles']),
         type_hash=channel.metadata['topic_type_hash'],
     )

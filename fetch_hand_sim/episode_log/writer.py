@@ -19,8 +19,8 @@ from fetch_hand_sim.episode_log.limits import (
     ReceivedAllowance,
 )
 from fetch_hand_sim.episode_log.log_times import log_time
+from fetch_hand_sim.episode_log.offered_qos import offered_qos
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
-from msgs_spec.qos import rosbag2_yaml
 from msgs_spec.schemas import schema_text, type_hash
 from msgs_spec.topics import TopicSpec
 
@@ -236,7 +236,7 @@ class EpisodeWriter:
                 topic=topic.name if topic.name.startswith('/') else self._namespace + topic.name,
                 type_name=topic.type_name,
                 schema_text=schema_text(topic.type_name),
-                qos_yaml=rosbag2_yaml(topic.qos),
+                qos=offered_qos(topic.qos),
                 type_hash=type_hash(topic.type_name),
             )
         if channel.type_name != topic.type_name:

@@ -65,28 +65,8 @@ def test_serialisation_round_trip():
     assert deserialize(bool_type, data).data is True
 
 
-def test_rosbag2_yaml_is_metadata_version_9():
-    assert qos.rosbag2_yaml(qos.LATCHED) == (
-        '- history: keep_last\n'
-        '  depth: 1\n'
-        '  reliability: reliable\n'
-        '  durability: transient_local\n'
-        '  deadline:\n'
-        '    sec: 9223372036\n'
-        '    nsec: 854775807\n'
-        '  lifespan:\n'
-        '    sec: 9223372036\n'
-        '    nsec: 854775807\n'
-        '  liveliness: automatic\n'
-        '  liveliness_lease_duration:\n'
-        '    sec: 9223372036\n'
-        '    nsec: 854775807\n'
-        '  avoid_ros_namespace_conventions: false\n'
-    )
-
-
 @pytest.mark.parametrize('spec', [qos.STATE, qos.LATCHED, qos.COMMAND, qos.CLOCK])
-def test_rclpy_profile_says_the_same_as_the_yaml(spec):
+def test_rclpy_profile_says_the_same(spec):
     pytest.importorskip('rclpy')
     profile = qos.rclpy_profile(spec)
     assert profile.history.short_key == 'keep_last'

@@ -18,9 +18,9 @@ from fetch_hand_sim.episode_log import (
     read_summary,
     recover_episode,
 )
+from fetch_hand_sim.episode_log.offered_qos import offered_qos
 from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
-from msgs_spec.qos import rosbag2_yaml
 from msgs_spec.schemas import schema_text, type_hash
 from msgs_spec.topics import topic, topics
 from support.episode_recorder import Recorder
@@ -162,7 +162,7 @@ def write_as_before(stream, recorder, ticks, flood):
             spec.type_name, 'ros2msg', schema_text(spec.type_name).encode()
         )
         metadata = {
-            'offered_qos_profiles': rosbag2_yaml(spec.qos),
+            'offered_qos_profiles': offered_qos(spec.qos).text,
             'topic_type_hash': type_hash(spec.type_name),
         }
         name = '/' + spec.name.lstrip('/')
