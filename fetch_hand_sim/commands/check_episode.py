@@ -20,6 +20,7 @@ from msgs_spec.command_line import (
     EXIT_SUCCESS,
     EXIT_USAGE,
     complain,
+    printable,
     progress,
     run_command,
 )
@@ -81,7 +82,7 @@ def _check(episodes: Sequence[Path], results: list[CheckResult], is_quiet: bool)
                 results.append(result)
                 code = max(code, EXIT_SUCCESS if result.difference is None else EXIT_FAILURE)
                 if not is_quiet:
-                    print(result, flush=True)
+                    print(printable(str(result)), flush=True)
             advance(1)
     return code
 

@@ -19,6 +19,7 @@ from msgs_spec.command_line import (
     CommandError,
     UsageError,
     complain,
+    printable,
     progress,
     require_extra,
     run_command,
@@ -61,7 +62,8 @@ def _run(options: argparse.Namespace) -> int:
     with progress('episodes', len(episodes)) as advance:
         for task, group in by_task.items():
             try:
-                print(f'{len(group)} episodes of {task}: {_export(options, group)}', flush=True)
+                done = f'{len(group)} episodes of {task}: {_export(options, group)}'
+                print(printable(done), flush=True)
             except ExportError as error:
                 raise CommandError(str(error)) from None
             advance(len(group))

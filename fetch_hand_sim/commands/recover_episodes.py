@@ -7,6 +7,7 @@ Exit code 0: nothing is left unfinished; 1: something could not be recovered, na
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,7 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     try:
-        if not options.directory.is_dir():
+        # Path.is_dir raises where a name is too long.
+        if not os.path.isdir(options.directory):
             raise UsageError(f'{options.directory} is no directory')
         leftovers = find_leftovers(options.directory)
     except EpisodeLogError as error:

@@ -9,6 +9,7 @@ import copy
 import importlib
 import json
 import os
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +23,11 @@ from numpy.typing import NDArray
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
 from fetch_hand_sim.gym_envs.spaces import observation_space
+from msgs_spec.command_line import printable
 
+# Parts of a dataset's id become directories.
+_DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
+_VERSION = re.compile(r'-v\d+$')
 _OBSERVATIONS = ('observation', 'achieved_goal', 'desired_goal')
 
 
@@ -73,7 +78,8 @@ def export_parquet(episodes: Sequence[EpisodeArrays], directory: Path) -> list[P
         for path, table in tables.items():
             if path.exists():
                 raise ExportError(f'{path} exists; nothing is overwritten')
-            parquet.write_table(table, path, compression='zstd')
+            with path.open('xb') as stream:
+                parquet.write_table(table, stream, compression='zstd')
     except OSError as error:
         raise ExportError(f'{directory}: {error.strerror or error}') from error
     return list(tables)
@@ -114,7 +120,7 @@ def _vectors(pyarrow: Any, values: NDArray[np.float64], rows: int) -> Any:
 def _episode_row(index: int, episode: EpisodeArrays) -> dict[str, Any]:
     return {
         'episode_index': index,
-        'path': str(episode.path),
+        'path': printable(str(episode.path)),
         'task': episode.spec.name,
         'seed': int(episode.metadata['seed']),
         'steps': len(episode),
@@ -133,18 +139,25 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
     Args:
         episodes: At least one, all of one task.
         directory: Where Minari datasets live (`MINARI_DATASETS_PATH`).
-        name: Of the dataset, such as `logged-v0`; the task comes before it.
+        name: Of the dataset, such as `logged-v0` or `me/logged-v0`; the task comes before it, and a
+            version after it if it has none.
 
     Returns:
         The id of the dataset, `<task>/<name>`.
 
     Raises:
-        ExportError: If minari is missing, the dataset exists or cannot be written.
+        ExportError: If the name is not allowed, minari is missing, the dataset exists or cannot be
+            written; nothing is created then.
     """
+    if not _DATASET_NAME.fullmatch(name):
+        raise ExportError(
+            f'dataset name {name!r}; allowed: letters, digits, _ and -, parts separated by /, such '
+            'as logged-v0'
+        )
     os.environ['MINARI_DATASETS_PATH'] = str(directory.resolve())
     minari, collector = _require('minari'), _require('minari.data_collector')
     spec = episodes[0].spec
-    dataset_id = f'{spec.name}/{name}'
+    dataset_id = f'{spec.name}/{name if _VERSION.search(name) else f"{name}-v0"}'
     if (directory / dataset_id).exists():
         raise ExportError(f'{directory / dataset_id} exists; nothing is overwritten')
     buffers = [

@@ -66,6 +66,8 @@ class ReplaySchedule:
         for message in self.messages:
             _require_readable(episode.path, self.topics[message.name], message)
         times = [m.log_time_ns for logged in episode.topics.values() for m in logged.messages]
+        if not times:
+            raise EpisodeReadError(f'{episode.path}: an episode without messages')
         self.start_ns, self.end_ns = min(times), max(times)
         self.period_ns = _period_ns(episode)
         status = next((n for n in episode.topics if n.endswith('/episode_status')), '/')

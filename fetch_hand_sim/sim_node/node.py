@@ -14,7 +14,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from fetch_hand_sim.episode_log import find_leftovers
+from fetch_hand_sim.episode_log import EpisodeLogError, find_leftovers
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder, LoggedEpisode
 from fetch_hand_sim.episodes.runner import EpisodeRunner
@@ -135,7 +135,11 @@ class SimNode(Node):
             self._robot.runner.simulation,
             with_compiled_model=self._settings['log_compiled_model'],
         )
-        for leftover in find_leftovers(Path(directory)):
+        try:
+            leftovers = find_leftovers(Path(directory))
+        except EpisodeLogError as error:
+            raise UsageError(f'episode_dir: {error}') from None
+        for leftover in leftovers:
             self.get_logger().warning(str(leftover))
         return EpisodeRecorder(
             Path(directory),

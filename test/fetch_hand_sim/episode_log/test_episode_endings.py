@@ -204,6 +204,24 @@ def test_a_terminated_robot_completes_its_episode(start_process, tmp_path):
     assert find_leftovers(tmp_path) == []
 
 
+def test_a_directory_that_is_a_file_is_one_line(start_process, tmp_path):
+    (tmp_path / 'file').touch()
+    code, output = finish(start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path / 'file')))
+    assert code == 2
+    (line,) = output.splitlines()
+    assert 'episode_dir' in line and 'Not a directory' in line
+
+
+def test_a_pipe_among_the_leftovers_holds_nothing_up(start_process, tmp_path):
+    (tmp_path / '.bad.active').mkdir()
+    os.mkfifo(tmp_path / '.bad.active' / 'bad_0.mcap')
+    arguments = ros_args(episode_dir=tmp_path, episodes=1, real_time_factor=0.0)
+    code, output = finish(start_process(*SIM_NODE, *arguments))
+    assert code == 0
+    assert 'bad_0.mcap: is no regular file' in output
+    assert len(find_episodes(tmp_path)) == 1
+
+
 def test_leftovers_are_named_at_the_next_start(start_process, tmp_path):
     robot = start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path))
     deadline = time.monotonic() + TIMEOUT

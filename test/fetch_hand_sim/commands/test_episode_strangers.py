@@ -1,0 +1,304 @@
+"""Directories that anybody may have filled: one line each, nothing followed, nothing waited for."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from mcap.writer import Writer
+
+from fetch_hand_sim.commands import (
+    check_episode,
+    export_episodes,
+    list_episodes,
+    recover_episodes,
+)
+from fetch_hand_sim.episode_log import (
+    EpisodeDirectory,
+    EpisodeLogError,
+    EpisodeReadError,
+    find_leftovers,
+    load_episodes,
+    read_episode,
+    read_summary,
+    recover_episode,
+)
+from fetch_hand_sim.replay_node.schedule import ReplaySchedule
+from support import script_environment
+from support.episode_recorder import Recorder
+
+NAME = 'FetchReach_000000_seed0'
+
+
+@pytest.fixture(scope='module')
+def finished(tmp_path_factory):
+    return Recorder('FetchReach').record(EpisodeDirectory(tmp_path_factory.mktemp('finished')))
+
+
+@pytest.fixture
+def directory(finished, tmp_path):
+    """One finished episode and one that was cut off."""
+    path = tmp_path / 'episodes'
+    shutil.copytree(finished, path / NAME)
+    leave(path, 'cut', (finished / f'{NAME}_0.mcap').read_bytes()[:-2000])
+    return path
+
+
+def leave(directory, name, data):
+    """Makes what a killed robot leaves."""
+    leftover = directory / f'.{name}.active'
+    leftover.mkdir(parents=True)
+    (leftover / f'{name}_0.mcap').write_bytes(data)
+    return leftover
+
+
+def assert_one_line_each(text, count):
+    lines = text.splitlines()
+    assert len(lines) == count, text
+    assert all(line.isprintable() and len(line) < 500 for line in lines)
+
+
+# What lies beside good episodes hides none of them
+
+
+def fifo_inside(directory):
+    (directory / '.bad.active').mkdir()
+    os.mkfifo(directory / '.bad.active' / 'bad_0.mcap')
+
+
+def unknown_fifo_inside(directory):
+    leave(directory, 'bad', b'')
+    os.mkfifo(directory / '.bad.active' / 'pipe')
+
+
+def fifo(directory):
+    os.mkfifo(directory / '.bad.active')
+
+
+def file(directory):
+    (directory / '.bad.active').write_text('no directory')
+
+
+def folder_inside(directory):
+    (directory / '.bad.active' / 'bad_0.mcap').mkdir(parents=True)
+
+
+def link_to_itself(directory):
+    (directory / '.bad.active').symlink_to(directory / '.bad.active')
+
+
+def link_elsewhere(directory):
+    (directory / '.bad.active').symlink_to(directory / NAME)
+
+
+BAD_LEFTOVERS = [
+    fifo_inside,
+    unknown_fifo_inside,
+    fifo,
+    file,
+    folder_inside,
+    link_to_itself,
+    link_elsewhere,
+]
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize('make', BAD_LEFTOVERS)
+def test_a_bad_entry_hides_no_good_one(directory, make, capsys):
+    make(directory)
+    bad, good = find_leftovers(directory)
+    assert bad.problem and not good.problem
+    assert list_episodes.main([str(directory)]) == 0
+    assert '1 episodes' in capsys.readouterr().out
+    assert recover_episodes.main([str(directory)]) == 1
+    output = capsys.readouterr()
+    assert 'recovered' in output.out
+    assert_one_line_each(output.err, 1)
+    assert 'is no' in output.err or 'is not' in output.err
+    assert read_episode(directory / 'cut').metadata['task'] == 'FetchReach'
+    assert os.path.lexists(directory / '.bad.active')
+
+
+def test_a_bag_that_cannot_be_looked_into_hides_no_good_one(directory, capsys):
+    # A name of the longest length: whatever is looked up in it is too long.
+    (directory / 'loop').symlink_to(directory / 'loop')
+    (directory / 'loop.mcap').symlink_to(directory / 'loop.mcap')
+    assert list_episodes.main([str(directory)]) == 1
+    output = capsys.readouterr()
+    assert '1 episodes' in output.out
+    assert_one_line_each(output.err, 1)
+
+
+# Links are not followed
+
+
+@pytest.mark.parametrize('link', ['cut_0.recovered', 'metadata.yaml', 'cut_0.mcap'])
+def test_links_in_a_leftover_are_not_followed(directory, tmp_path, link):
+    target = tmp_path / 'precious'
+    target.write_text('precious')
+    entry = directory / '.cut.active' / link
+    entry.unlink(missing_ok=True)
+    entry.symlink_to(target)
+    with pytest.raises(EpisodeLogError, match='is no regular file'):
+        recover_episode(directory / '.cut.active')
+    assert target.read_text() == 'precious'
+    assert not (directory / 'cut').exists()
+
+
+# A file that unfolds
+
+
+def anchors(depth):
+    """YAML of a few hundred bytes that unfolds to nine to the power of `depth` words."""
+    lines = ['- &a0 [x, x, x, x, x, x, x, x, x]']
+    for level in range(1, depth):
+        lines.append(f'- &a{level} [{", ".join([f"*a{level - 1}"] * 9)}]')
+    return '\n'.join(lines)
+
+
+QUALITIES = {
+    'nine levels of anchors': (anchors(9), 'alias'),
+    'five levels of anchors': (anchors(5), 'alias'),
+    'deep': ('[' * 2000, 'nested'),
+    'long': ('- {}\n' * 2000, 'bytes; allowed: 4096'),
+    'no list': ('history: keep_last', 'no list of profiles'),
+    'no yaml': ('- {', 'no YAML'),
+    'python': ('- !!python/object/apply:os.system [echo owned]', 'no YAML'),
+}
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize('quality', QUALITIES)
+def test_quality_of_service_of_a_stranger_is_bounded(tmp_path, quality, capsys):
+    text, reason = QUALITIES[quality]
+    leftover = tmp_path / '.bad.active'
+    leftover.mkdir()
+    with (leftover / 'bad_0.mcap').open('wb') as stream:
+        writer = Writer(stream)
+        writer.start(profile='ros2')
+        writer.add_metadata('episode', {'task': 'FetchReach'})
+        schema = writer.register_schema('std_msgs/msg/Float64', 'ros2msg', b'float64 data')
+        metadata = {'offered_qos_profiles': text, 'topic_type_hash': ''}
+        channel = writer.register_channel('/reward', 'cdr', schema, metadata)
+        writer.add_message(channel, 1, bytes(12), 1)
+        writer.flush()
+    before = sorted((path.name, path.stat().st_size) for path in leftover.iterdir())
+    began = time.monotonic()
+    assert recover_episodes.main([str(tmp_path)]) == 1
+    assert time.monotonic() - began < 2.0
+    error = capsys.readouterr().err
+    assert_one_line_each(error, 1)
+    assert reason in error
+    assert [path.name for path in tmp_path.iterdir()] == [leftover.name]
+    assert sorted((path.name, path.stat().st_size) for path in leftover.iterdir()) == before
+
+
+# Files without what readers look for
+
+
+def without(data, opcode):
+    """An MCAP file without its records of a kind in the summary, whose CRC is left out too."""
+    start = struct.unpack_from('<Q', data, len(data) - 8 - 20)[0]
+    kept, position, end = b'', start, len(data) - 8 - 29
+    while position < end:
+        size = 9 + struct.unpack_from('<Q', data, position + 1)[0]
+        if data[position] != opcode:
+            kept += data[position : position + size]
+        position += size
+    footer = struct.pack('<BQQQI', 2, 20, start, 0, 0)
+    return data[:start] + kept + footer + data[-8:]
+
+
+def test_a_file_without_statistics_hides_no_good_one(directory, capsys):
+    data = (directory / NAME / f'{NAME}_0.mcap').read_bytes()
+    (directory / 'bare.mcap').write_bytes(without(data, opcode=11))
+    with pytest.raises(EpisodeReadError, match='no statistics'):
+        read_summary(directory / 'bare.mcap')
+    assert list_episodes.main([str(directory)]) == 1
+    output = capsys.readouterr()
+    assert '1 episodes' in output.out and 'no statistics' in output.err
+    # Its messages are whole.
+    assert len(load_episodes(directory / 'bare.mcap')[0]) == 50
+
+
+def test_an_episode_without_messages_cannot_be_replayed(tmp_path):
+    path = tmp_path / 'empty.mcap'
+    with path.open('wb') as stream:
+        writer = Writer(stream)
+        writer.start(profile='ros2')
+        writer.add_metadata('episode', {'task': 'FetchReach', 'control_hz': '25.0'})
+        writer.add_metadata('episode_result', {'complete': 'true'})
+        writer.finish()
+    with pytest.raises(EpisodeReadError, match='an episode without messages'):
+        ReplaySchedule(path)
+    assert check_episode.main([str(path)]) == 2
+
+
+# Paths
+
+
+def test_paths_are_paths_or_text(finished):
+    assert read_episode(str(finished)).metadata == read_episode(finished).metadata
+    assert read_summary(str(finished)).metadata == read_summary(finished).metadata
+
+
+def test_names_that_are_no_text_and_command_a_terminal(finished, tmp_path):
+    """Through real processes, since it is their output that must take them."""
+    name = b'\xff\xfe \x1b]0;owned\x07 line\nbreak'
+    directory = Path(os.fsdecode(os.fsencode(tmp_path) + b'/' + name))
+    shutil.copytree(finished, directory / NAME)
+    leave(directory, 'cut', (finished / f'{NAME}_0.mcap').read_bytes()[:-2000])
+    (directory / 'text.mcap').write_text('no bag')
+    parquet = ['--to', 'parquet', '--output', str(directory / 'out')]
+    for command, arguments, code in (
+        ('list_episodes', [], 1),
+        ('recover_episodes', [], 0),
+        ('check_episode', [], 2),
+        ('export_episodes', parquet, 1),
+    ):
+        run = subprocess.run(
+            [sys.executable, '-m', f'fetch_hand_sim.commands.{command}', directory, *arguments],
+            capture_output=True,
+            env=script_environment() | {'PYTHONIOENCODING': 'utf-8'},
+        )
+        output = (run.stdout + run.stderr).decode()
+        assert run.returncode == code, (command, output)
+        assert 'Traceback' not in output
+        assert all(line.isprintable() for line in output.splitlines())
+
+
+def test_too_long_a_name_is_one_line(capsys):
+    for tool in (list_episodes, check_episode, recover_episodes):
+        assert tool.main(['x' * 5000]) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+# Exports
+
+
+@pytest.mark.parametrize('name', ['../../../x', '/x', 'a/../b', '', 'a//b', '.x', 'a b', 'x\n'])
+def test_a_name_that_leads_elsewhere_creates_nothing(finished, tmp_path, name, capsys):
+    output = tmp_path / 'a' / 'b' / 'datasets'
+    arguments = [str(finished), '--to', 'minari', '--output', str(output), '--name', name]
+    assert export_episodes.main(arguments) in (1, 2)
+    assert_one_line_each(capsys.readouterr().err, 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('name', 'id'), [('a/b', 'a/b-v0'), ('c-v3', 'c-v3'), ('me/d-v1', 'me/d-v1')]
+)
+def test_a_dataset_keeps_the_name_it_is_given(finished, tmp_path, name, id, monkeypatch, capsys):
+    minari = pytest.importorskip('minari')
+    monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path))
+    arguments = [str(finished), '--to', 'minari', '--output', str(tmp_path), '--name', name]
+    assert export_episodes.main(arguments) == 0
+    assert f'Minari dataset FetchReach/{id} in' in capsys.readouterr().out
+    dataset = minari.load_dataset(f'FetchReach/{id}')
+    assert dataset.spec.dataset_id == f'FetchReach/{id}' and dataset.total_steps == 50
