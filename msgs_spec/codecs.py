@@ -57,14 +57,23 @@ def decode(topic: TopicSpec, message: Any) -> Array:
     return checked_size(topic, _CODECS[topic.type_name][1](topic, message))
 
 
-def build_status(topic: TopicSpec, stamp: int, name: str, values: Mapping[str, str]) -> Any:
-    """Returns a DiagnosticArray of one status, level OK, that holds key/value pairs."""
+def build_status(
+    topic: TopicSpec,
+    stamp: int,
+    name: str,
+    values: Mapping[str, str],
+    *,
+    level: int = 0,
+    message: str = '',
+    hardware_id: str = '',
+) -> Any:
+    """Returns a DiagnosticArray of one status that holds key/value pairs."""
     pair = message_class('diagnostic_msgs/msg/KeyValue')
     status = message_class('diagnostic_msgs/msg/DiagnosticStatus')(
-        level=0,
+        level=level,
         name=name,
-        message='',
-        hardware_id='',
+        message=message,
+        hardware_id=hardware_id,
         values=[pair(key=key, value=value) for key, value in values.items()],
     )
     return _stamped(topic, stamp, {'status': [status]})

@@ -13,7 +13,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from msgs_spec.schemas import message_class, serialize
+from msgs_spec.codecs import build_status
+from msgs_spec.schemas import serialize
 from msgs_spec.topics import DIAGNOSTICS
 
 REPORT_PERIOD = 1.0
@@ -36,6 +37,7 @@ class Report:
         hardware_id: What is reported on.
         values: The facts.
         summary: The message where nothing is wrong.
+        problems: What is wrong, each with its level.
     """
 
     name: str
@@ -71,30 +73,30 @@ def encode_reports(stamp_ns: int, reports: Sequence[Report]) -> bytes:
         stamp_ns: Wall time, nanoseconds, as REP 107 has it.
         reports: Its statuses.
     """
-    pair = message_class('diagnostic_msgs/msg/KeyValue')
-    status = message_class('diagnostic_msgs/msg/DiagnosticStatus')
-    seconds, nanoseconds = divmod(stamp_ns, 10**9)
-    stamp = message_class('builtin_interfaces/msg/Time')(sec=seconds, nanosec=nanoseconds)
-    statuses = [
-        status(
+    messages = [
+        build_status(
+            DIAGNOSTICS,
+            stamp_ns,
+            report.name,
+            report.values,
             level=int(report.level),
-            name=report.name,
             message=report.message,
             hardware_id=report.hardware_id,
-            values=[pair(key=key, value=value) for key, value in report.values.items()],
         )
         for report in reports
     ]
-    header = message_class('std_msgs/msg/Header')(stamp=stamp, frame_id='')
-    array = message_class(DIAGNOSTICS.type_name)(header=header, status=statuses)
-    return serialize(DIAGNOSTICS.type_name, array)
+    messages[0].status = [status for message in messages for status in message.status]
+    return serialize(DIAGNOSTICS.type_name, messages[0])
 
 
 class Durations:
-    """The latest durations of something that happens again and again."""
+    """The latest durations of something that happens again and again.
+
+    Args:
+        size: How many are kept.
+    """
 
     def __init__(self, size: int = 1000) -> None:
-        """Keeps the last `size` of them."""
         self._values: deque[float] = deque(maxlen=size)
 
     def add(self, seconds: float) -> None:
@@ -111,10 +113,9 @@ class Durations:
 
 
 class Increase:
-    """How much a counter has grown between two looks."""
+    """How much a counter has grown between two looks; it starts at zero."""
 
     def __init__(self) -> None:
-        """Starts at zero."""
         self._before = 0.0
 
     def since(self, value: float) -> float:

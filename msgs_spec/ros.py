@@ -45,10 +45,12 @@ class EventLoop:
     rclpy's EventsExecutor costs half of the wait-set one per message. It is used through
     `spin_once` alone, because its `spin` serves nothing in some builds. Releases before 7.1.4 lack
     it.
+
+    Args:
+        node: Whose callbacks.
     """
 
     def __init__(self, node: Node) -> None:
-        """Takes the node."""
         self._node = node
         self._executor, self._is_queue = _make_executor()
         self._executor.add_node(node)
@@ -179,11 +181,13 @@ class StopSignals:
     """Turns SIGINT and SIGTERM into a flag, so that a tick in progress is finished first.
 
     rclpy's own handlers would invalidate the context in the middle of a tick, and the last messages
-    with it.
+    with it. Only the main thread can make one.
+
+    Attributes:
+        received: Name of the signal that came, None if none did.
     """
 
     def __init__(self) -> None:
-        """Takes the signals over; only the main thread can."""
         self.received: str | None = None
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._handle)

@@ -29,6 +29,10 @@ MODELS = {
 }
 
 
+FETCH_MODELS = [name for name in MODELS if TASKS[name].robot is FETCH]
+HAND_MODELS = [name for name in MODELS if TASKS[name].robot is SHADOW_HAND]
+
+
 @pytest.fixture(scope='module', params=MODELS)
 def task_and_model(request):
     return TASKS[request.param], load_model(MODELS[request.param])
@@ -56,11 +60,19 @@ def test_object_is_the_free_joint_of_the_model(task_and_model):
         assert model.joint(f'{task.object_name}:joint').type == mujoco.mjtJoint.mjJNT_FREE
 
 
+@pytest.mark.parametrize('task_and_model', FETCH_MODELS, indirect=True)
+def test_gripper_commands_move_a_mocap_body_and_at_most_two_fingers(task_and_model):
+    task, model = task_and_model
+    assert model.nmocap == 1
+    driven = {model.joint(model.actuator(i).trnid[0]).name for i in range(model.nu)}
+    assert driven <= {name for name in task.robot.joints if 'finger' in name}
+    lower, upper = command_limits(task.robot)
+    np.testing.assert_array_equal(np.stack([lower, upper]), [[-1.0] * 4, [1.0] * 4])
+
+
+@pytest.mark.parametrize('task_and_model', HAND_MODELS, indirect=True)
 def test_hand_commands_are_the_actuators_and_their_ranges(task_and_model):
     task, model = task_and_model
-    if task.robot is FETCH:
-        assert model.nmocap == 1
-        return
     actuators = [model.actuator(i) for i in range(model.nu)]
     driven = [model.joint(actuator.trnid[0]).name for actuator in actuators]
     assert [part.name for part in task.robot.command] == driven
@@ -69,10 +81,12 @@ def test_hand_commands_are_the_actuators_and_their_ranges(task_and_model):
     np.testing.assert_array_equal(np.stack([lower, upper], axis=1), model.actuator_ctrlrange)
 
 
-def test_fingertips_are_sites_of_the_hand_models(task_and_model):
-    task, model = task_and_model
-    sites = {model.site(i).name for i in range(model.nsite)}
-    assert {f'robot0:S_{name}' for name in FINGERTIPS} <= sites or task.robot is FETCH
+@pytest.mark.parametrize('task_and_model', HAND_MODELS, indirect=True)
+def test_fingertips_are_sites_at_the_ends_of_the_fingers(task_and_model):
+    _, model = task_and_model
+    for name in FINGERTIPS:
+        body = model.body(model.site(f'robot0:S_{name}').bodyid[0])
+        assert body.name == f'robot0:{name[:2]}distal'
 
 
 def test_thirteen_tasks_and_their_names():
