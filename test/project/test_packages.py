@@ -17,7 +17,14 @@ from test_colcon_install import PYTHON_PACKAGES, tracked_files
 from support import ROOT
 
 # Generated or of use in a checkout alone.
-NOT_IN_SDIST = ('.ci/', '.github/', '.gitignore', '.pre-commit-config.yaml', '.dockerignore')
+NOT_IN_SDIST = (
+    '.ci/',
+    '.github/',
+    '.gitignore',
+    '.pre-commit-config.yaml',
+    '.dockerignore',
+    'Dockerfile',
+)
 
 
 @pytest.fixture(scope='module')
@@ -95,6 +102,21 @@ def test_package_xml_is_valid() -> None:
     assert warnings == []
     assert package.package_format == 3 and package.urls
     assert [license_.file for license_ in package.licenses] == ['LICENSE']
+
+
+def test_hooks_check_what_make_lint_checks() -> None:
+    """The same tools over the same files: a commit that passes the hooks passes `make lint`."""
+    hooks = yaml.safe_load((ROOT / '.pre-commit-config.yaml').read_text())['repos'][0]['hooks']
+    makefile = (ROOT / 'Makefile').read_text()
+    recipe = makefile.partition('\nlint: env\n')[2].partition('\n\n')[0]
+    linted = [line.split('-m ')[1].replace(' $(PYTHON_FILES)', '') for line in recipe.splitlines()]
+    assert [hook['entry'].split('-m ')[1] for hook in hooks] == linted
+
+
+def test_hosted_checks_are_make_test() -> None:
+    workflow = yaml.safe_load((ROOT / '.github/workflows/test.yml').read_text())
+    steps = workflow['jobs']['test']['steps']
+    assert [step['run'] for step in steps if 'run' in step] == ['make test']
 
 
 def test_an_old_python_is_refused_by_name(tmp_path: Path) -> None:
