@@ -96,8 +96,12 @@ def write_tensors(path: str | Path, tensors: dict[str, Tensor], metadata: dict[s
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f'.{path.name}.partial')
     contents = to_bytes({name: value.contiguous() for name, value in tensors.items()}, metadata)
-    partial.write_bytes(contents)
-    os.replace(partial, path)
+    try:
+        partial.write_bytes(contents)
+        os.replace(partial, path)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:

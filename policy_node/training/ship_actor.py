@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.command_line import EXIT_FAILURE, EXIT_SUCCESS, UsageError, run_command
 from policy_node.policies import checkpoint
 from policy_node.training.evaluate_policy import FIRST_SEED, print_table
 from policy_node.training.evaluation.episodes import evaluate, summarize
@@ -18,12 +19,13 @@ from policy_node.training.learning.run_folder import BEST_FILE, STATE_FILE, comp
 from policy_node.training.learning.run_log import draw_curve, read_progress
 from policy_node.training.learning.training_state import TrainingState, read_state, write_state
 
+_NAME = 'ship_actor'
 ACTORS = Path(__file__).parents[1] / 'actors'
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(prog='ship_actor', description=__doc__)
+    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
     add = parser.add_argument
     add('run', type=Path, help='output folder of train_her')
     add('--episodes', type=int, default=1000, help='default: 1000')
@@ -37,15 +39,18 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     options = parse_arguments(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     try:
-        return ship(options)
+        return EXIT_SUCCESS if ship(options) else EXIT_FAILURE
     except (ValueError, OSError) as error:
-        print(f'ship_actor: {error}', file=sys.stderr)
-        return 2
+        raise UsageError(str(error)) from None
 
 
-def ship(options: argparse.Namespace) -> int:
-    """Evaluates, compares with the shipped actor, and copies checkpoint, evaluation and curve."""
+def ship(options: argparse.Namespace) -> bool:
+    """Evaluates and, if it is better than the shipped actor, copies what belongs to an actor."""
     actor, info = checkpoint.load(options.run / options.checkpoint)
     num_envs = min(options.num_envs, options.episodes)
     simulation = Simulation(
@@ -56,7 +61,7 @@ def ship(options: argparse.Namespace) -> int:
     shipped = options.actors / f'{info.task}.json'
     if shipped.is_file() and not is_better(summary, json.loads(shipped.read_text())):
         print(f'ship_actor: the actor in {options.actors} is at least as good; nothing changed')
-        return 1
+        return False
     target = options.actors / f'{info.task}.safetensors'
     command = run_command(options.run) or info.command
     checkpoint.save(target, actor, replace(info, success=summary, command=command))
@@ -74,7 +79,7 @@ def ship(options: argparse.Namespace) -> int:
         ship_critic(options.run / STATE_FILE, target)
     title = f'{info.task}, {info.config["recipe"]} recipe, seed {info.seed}'
     draw_curve(read_progress(options.run / 'progress.csv'), title, target.with_suffix('.png'))
-    return 0
+    return True
 
 
 def ship_critic(state_file: Path, actor: Path) -> None:

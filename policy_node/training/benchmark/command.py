@@ -122,7 +122,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     except (ValueError, TypeError) as error:
         raise UsageError(str(error)) from None
     try:
-        whole = _run_on_ray(jobs) if options.ray else _run_in_turn(jobs)
+        whole = (_run_on_ray if options.ray else _run_in_turn)(jobs, command)
         return EXIT_SUCCESS if whole else EXIT_FAILURE
     except JobError as error:
         raise CommandError(str(error)) from None
@@ -139,7 +139,7 @@ def _report(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> N
         print(f'{len(finished)} of {len(jobs)} jobs are finished; the same command goes on')
 
 
-def _run_in_turn(jobs: Sequence[Job]) -> bool:
+def _run_in_turn(jobs: Sequence[Job], command: str) -> bool:
     """Runs what is not finished; whether all is now."""
     whole = True
     for number, job in enumerate(jobs, 1):
@@ -147,7 +147,7 @@ def _run_in_turn(jobs: Sequence[Job]) -> bool:
             continue
         print(f'job {number} of {len(jobs)}: {job.name}', flush=True)
         try:
-            if not run_job(job):
+            if not run_job(job, command):
                 # The trainer took the signal and finished its cycle.
                 raise KeyboardInterrupt
         except JobTakenError as error:
@@ -156,7 +156,7 @@ def _run_in_turn(jobs: Sequence[Job]) -> bool:
     return whole
 
 
-def _run_on_ray(jobs: Sequence[Job]) -> bool:
+def _run_on_ray(jobs: Sequence[Job], command: str) -> bool:
     """Gives every job that is not finished to Ray; folders must lie where all its machines see."""
     import ray
 
@@ -167,7 +167,9 @@ def _run_on_ray(jobs: Sequence[Job]) -> bool:
         if not job.is_finished:
             config = job.config
             cores = max(config.simulation_threads + config.torch_threads, 1)
-            waiting[remote.options(num_cpus=cores).remote(_with_absolute_folder(job))] = job
+            waiting[remote.options(num_cpus=cores).remote(_with_absolute_folder(job), command)] = (
+                job
+            )
     whole = True
     while waiting:
         (done, *_), _ = ray.wait(list(waiting))

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from policy_node.training import train_her
+from msgs_spec.command_line import CommandError
 from policy_node.training.learning.config import TrainConfig, config_from_dict, recipe_config
+from policy_node.training.learning.run import RunTakenError, train_run
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.training_state import read_state
 
 PROGRESS_FILE = 'progress.csv'
-LOCK_FILE = '.lock'
 # What may differ between two parts of a job without another result to be expected.
 _SPEED_FIELDS = ('simulation_threads', 'torch_threads', 'checkpoint_seconds', 'device')
 
@@ -149,42 +148,21 @@ def list_jobs(
     return jobs
 
 
-def run_job(job: Job) -> bool:
+def run_job(job: Job, command: str) -> bool:
     """Starts or continues a job in this process; False if a signal ended it early.
+
+    Args:
+        job: The job.
+        command: Command line of the benchmark, for the record.
 
     Raises:
         JobTakenError: If another process works on it.
-        JobError: If training failed; `train_her` has printed why.
+        JobError: If training failed.
     """
-    job.folder.mkdir(parents=True, exist_ok=True)
-    with (job.folder / LOCK_FILE).open('w') as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise JobTakenError(f'{job.name} is being run by another process') from None
-        if job.is_finished:
-            return True
-        resume = ['--resume', str(job.folder), *_assignments(job.config, _SPEED_FIELDS)]
-        status = train_her.main(resume if job.has_checkpoint else _start_arguments(job))
-        if status != 0:
-            raise JobError(f'{job.name} ended with status {status}; see {job.folder}')
-        return job.is_finished
-
-
-def _start_arguments(job: Job) -> list[str]:
-    """The command line of `train_her` that stands for the configuration: recipe and differences."""
-    config = job.config
-    recipe = recipe_config(config.task, config.recipe)
-    names = [field.name for field in dataclasses.fields(config)]
-    differing = [name for name in names if getattr(config, name) != getattr(recipe, name)]
-    arguments = ['--task', config.task, '--recipe', config.recipe, '--output', str(job.folder)]
-    return [*arguments, *_assignments(config, differing)]
-
-
-def _assignments(config: TrainConfig, names: Sequence[str]) -> list[str]:
-    arguments = []
-    for name in names:
-        value = getattr(config, name)
-        text = ','.join(map(str, value)) if isinstance(value, tuple) else str(value)
-        arguments += ['--set', f'{name}={text}']
-    return arguments
+    try:
+        train_run(job.config, job.folder, resume=job.has_checkpoint, command=command)
+    except RunTakenError:
+        raise JobTakenError(f'{job.name} is being run by another process') from None
+    except CommandError as error:
+        raise JobError(f'{job.name}: {error}') from None
+    return job.is_finished

@@ -23,18 +23,6 @@ class Evaluator:
     def __init__(self, simulation: Simulation, config: TrainConfig) -> None:
         self._simulation = simulation
         self._config = config
-        self._next = 0
-
-    def is_due(self, env_steps: int) -> bool:
-        """Whether it is time; if so, the next time is `evaluate_every` steps later."""
-        if env_steps < self._next:
-            return False
-        self.postpone(env_steps)
-        return True
-
-    def postpone(self, env_steps: int) -> None:
-        """Makes the next evaluation due `evaluate_every` steps after `env_steps`."""
-        self._next = env_steps + self._config.evaluate_every
 
     def evaluate(self, actor: Actor, best_success: float) -> EpisodeOutcomes:
         """Runs the episodes, fewer once their success cannot reach `best_success` any more.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import types
 import typing
 from dataclasses import dataclass
@@ -68,7 +67,9 @@ class TrainConfig:
     random_steps: int = 0
     """Steps with uniformly random actions before the policy acts."""
     learning_starts: int = 0
-    """Steps in the replay before the first update; also what `--resume` refills."""
+    """Steps in the replay before the first update."""
+    kept_transitions: int = 300_000
+    """Newest transitions kept beside the training state for `--resume`."""
     future_only_steps: int = 0
     """Steps during which futureactual is replaced by future."""
 
@@ -161,6 +162,7 @@ _RANGES = (
     ('replay_transitions', 1, _INFINITY),
     ('random_steps', 0, _INFINITY),
     ('learning_starts', 0, _INFINITY),
+    ('kept_transitions', 0, _INFINITY),
     ('future_only_steps', 0, _INFINITY),
     ('learning_rate', 0, 1),
     ('final_learning_rate', 0, 1),
@@ -314,9 +316,27 @@ def _parse(value: str, kind: Any) -> Any:
 
 
 def config_from_dict(values: dict[str, Any]) -> TrainConfig:
-    """Rebuilds a configuration from `dataclasses.asdict` that went through JSON."""
-    known = {field.name for field in dataclasses.fields(TrainConfig)}
-    unknown = sorted(values.keys() - known)
+    """Rebuilds a configuration from `dataclasses.asdict` that went through JSON.
+
+    Fields that came later have their default.
+
+    Raises:
+        ValueError: If a field is unknown or a value not allowed.
+    """
+    hints = typing.get_type_hints(TrainConfig)
+    unknown = sorted(values.keys() - hints.keys())
     if unknown:
         raise ValueError(f'unknown configuration fields: {", ".join(unknown)}')
-    return TrainConfig(**{**values, 'hidden_sizes': tuple(values['hidden_sizes'])})
+    return TrainConfig(**{name: _typed(name, value, hints[name]) for name, value in values.items()})
+
+
+def _typed(name: str, value: Any, kind: Any) -> Any:
+    """A value from JSON as its field has it."""
+    if isinstance(kind, types.GenericAlias):
+        fits = isinstance(value, list | tuple) and all(type(part) is int for part in value)
+        value = tuple(value) if fits else value
+    else:
+        fits = type(value) is kind or (kind is float and type(value) is int)
+    if not fits:
+        raise ValueError(f'{name} {value!r} is not of type {getattr(kind, "__name__", kind)}')
+    return value

@@ -40,7 +40,12 @@ class Losses:
 
 
 class DDPG:
-    """Actor, critic, their targets, and one update."""
+    """Actor, critic, their targets, and one update.
+
+    Attributes:
+        updates: Updates so far.
+        critic_first: The actor learns after this many of them.
+    """
 
     def __init__(
         self, shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
@@ -59,6 +64,7 @@ class DDPG:
         self.actor_optimizer = self._adam(self._actor_parameters)
         self.critic_optimizer = self._adam(self._critic_parameters)
         self._bfloat16 = uses_bfloat16(config.precision, device)
+        self.critic_first = config.critic_first
         self.updates = 0
 
     def _adam(self, parameters: list[nn.Parameter]) -> torch.optim.Adam:
@@ -104,7 +110,7 @@ class DDPG:
             action = self.actor(features)
             value = self.critic(features, action).mean()
             loss = -value + self.config.action_l2 * action.float().square().mean()
-        if self.updates >= self.config.critic_first:
+        if self.updates >= self.critic_first:
             self._step(self.actor_optimizer, loss, self._actor_parameters)
         return loss, value
 

@@ -130,6 +130,7 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         tensors |= {f'critic.{key}': value for key, value in critic.items()}
     origin = {
         'name': name,
+        'critic': source is not None,
         'task': info.task,
         'env_steps': info.env_steps,
         'command': info.command,

@@ -37,6 +37,10 @@ class Episodes:
         """Steps per episode."""
         return int(self.action.shape[1])
 
+    def last(self, count: int) -> Episodes:
+        """Returns the last `count` episodes, or all if there are fewer."""
+        return Episodes(*(getattr(self, name)[-count:] for name in Episodes.__slots__))
+
     def select(self, rows: NDArray[np.bool_]) -> Episodes:
         """Returns the episodes whose row is True."""
         return Episodes(
@@ -83,8 +87,27 @@ class EpisodeReplay:
             ring.action[:size],
         )
 
+    @property
+    def ticks(self) -> int:
+        """Steps per episode."""
+        return self._ring.ticks
+
+    def newest(self, count: int) -> Episodes:
+        """Copies of the newest episodes, the newest last; all if there are fewer than `count`."""
+        ring, number = self._ring, min(count, self._size)
+        rows = (self._next - number + np.arange(number)) % self.capacity
+        return Episodes(*(getattr(ring, name)[rows] for name in Episodes.__slots__))
+
     def add(self, episodes: Episodes) -> None:
-        """Adds episodes, the oldest ones making room."""
+        """Adds episodes, the oldest ones making room.
+
+        Raises:
+            ValueError: If there are more than the replay holds, or of other sizes.
+        """
+        for name in Episodes.__slots__:
+            given, held = getattr(episodes, name).shape[1:], getattr(self._ring, name).shape[1:]
+            if given != held:
+                raise ValueError(f'{name} of an episode is {given}, in the replay {held}')
         if len(episodes) > self.capacity:
             raise ValueError(f'{len(episodes)} episodes exceed the capacity of {self.capacity}')
         rows = (self._next + np.arange(len(episodes))) % self.capacity

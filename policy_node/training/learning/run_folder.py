@@ -19,6 +19,8 @@ from policy_node.training.learning.training_state import Counters, save_state
 STATE_FILE = 'training_state.safetensors'
 LATEST_FILE = 'latest.safetensors'
 BEST_FILE = 'best.safetensors'
+REPLAY_FILE = 'replay.safetensors'
+LOCK_FILE = '.lock'
 
 
 def companion_file(actor: Path) -> Path:
@@ -74,6 +76,10 @@ class RunFolder:
             init_from=self.init_from,
         )
         checkpoint.save(self.path / name, actor, info)
+
+    def replay_file(self, rank: int) -> Path:
+        """Where a worker keeps its newest episodes."""
+        return self.path / (REPLAY_FILE if rank == 0 else f'{rank}.{REPLAY_FILE}')
 
     def save_state(
         self, learner: DDPG, statistics: dict[str, RunningStatistics], counters: Counters

@@ -15,6 +15,7 @@ import torch
 
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
@@ -23,12 +24,23 @@ from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.ddpg import DDPG, Losses, choose_device
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
-from policy_node.training.learning.initial_networks import InitialNetworks, network_shape
+from policy_node.training.learning.initial_networks import (
+    CRITIC_FIRST,
+    InitialNetworks,
+    network_shape,
+)
 from policy_node.training.learning.replay import Episodes
+from policy_node.training.learning.replay_file import load_replay, save_replay
 from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE, RunFolder
 from policy_node.training.learning.run_log import RunLog
 from policy_node.training.learning.threads import split_threads
 from policy_node.training.learning.training_state import Counters, load_networks, load_state
+
+NAME = 'train_her'
+# Seconds between copies of the newest episodes beside the training state.
+REPLAY_SECONDS = 900.0
+# Steps that a resumed run without these episodes collects before it goes on.
+MOST_REFILLED = 100_000
 
 
 class TrainingError(RuntimeError):
@@ -79,10 +91,11 @@ class Trainer:
         self._build_learner()
         if init_from is not None:
             load_networks(init_from.tensors, self.learner, self.experience.statistics)
+            self._let_critic_learn_first()
         self.counters = Counters()
         self._stop_reason = ''
-        self._learning_starts = config.learning_starts
-        self._last_checkpoint = time.monotonic()
+        self._refill = 0
+        self._last_checkpoint = self._last_replay = time.monotonic()
 
     def _build_simulations(self) -> None:
         config, share = self.config, self.workers.share
@@ -125,7 +138,10 @@ class Trainer:
         self._stop_reason = reason
 
     def resume(self, path: Path) -> None:
-        """Continues from a training state; the replay fills up before learning goes on.
+        """Continues from a training state and the episodes beside it.
+
+        Where these are missing, as many are collected before learning goes on; they do not count as
+        steps of the run.
 
         Raises:
             ValueError: If the file does not fit the configuration.
@@ -133,11 +149,21 @@ class Trainer:
         state = load_state(path, self.learner, self.experience.statistics)
         self.counters = state.counters
         self._folder = replace(self._folder, init_from=state.extra.get('init_from', {}))
+        self._let_critic_learn_first()
         # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
         self.experience.generator = self._seed(self.counters.env_steps)
-        refill = min(self.counters.env_steps, self.config.replay_transitions, 100_000)
-        self._learning_starts = max(self._learning_starts, refill)
-        self._evaluator.postpone(self.counters.env_steps)
+        limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
+        self._refill = self.workers.share(min(limits))
+        try:
+            load_replay(self._folder.replay_file(self.workers.rank), self.experience.replay)
+        except ValueError as error:
+            complain(NAME, error)
+            complain(NAME, f'{self._refill:,} steps fill the replay before learning goes on')
+
+    def _let_critic_learn_first(self) -> None:
+        """Holds an actor back that began without its critic."""
+        if not self._folder.init_from.get('critic', True) and self.config.critic_first == 0:
+            self.learner.critic_first = CRITIC_FIRST
 
     def add_experience(self, episodes: Episodes) -> None:
         """Puts episodes from elsewhere into the replay; each worker takes its share.
@@ -161,12 +187,14 @@ class Trainer:
             TrainingError: If a loss or an observation is not finite; the checkpoints written before
                 are left as they are.
         """
+        if self.counters.env_steps >= self.config.total_steps:
+            return f'{self.config.total_steps:,} environment steps were done before'
         started = time.monotonic() - self.counters.seconds
         # The number of tensor threads belongs to a thread: without its own, the collector's small
         # products would start one per core, which then spin against the simulation and the learner.
         with ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,)) as executor:
             submit = executor.submit if self.config.overlap else _run_now
-            collected = self._collect_or_explain(submit(self._collect, *self._request()))
+            collected = self._collect_first(submit)
             while True:
                 before = time.monotonic()
                 self._absorb(collected)
@@ -181,18 +209,32 @@ class Trainer:
                 if log is not None:
                     log.write(self._row(collected, losses, time.monotonic() - before))
                 reason = self._reason_to_stop(collected)
-                if reason or self._checkpoint_due():
+                if reason:
                     self.save()
+                elif self._checkpoint_due():
+                    self._save_or_complain()
                 if reason:
                     return reason
 
-    def _request(self) -> tuple[Actor, bool, Actor | None]:
+    def _collect_first(self, submit: Callable[..., Future[Collected]]) -> Collected:
+        """Fills the replay of a resumed run that has lost it, then collects the first cycle."""
+        while True:
+            actor, random, _ = self._request(may_evaluate=False)
+            collected = self._collect_or_explain(submit(self._collect, actor, random, None))
+            filled = self.experience.transitions >= self._refill
+            if not self.workers.any(not filled and not self._stop_reason):
+                return collected
+            self.experience.replay.add(collected.episodes)
+
+    def _request(self, may_evaluate: bool = True) -> tuple[Actor, bool, Actor | None]:
         """What to collect next: with which actor, whether at random, and which to evaluate."""
-        steps = self.counters.env_steps
+        counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
         actor, evaluated = copy.deepcopy(self.learner.actor).cpu().eval(), None
-        if self.counters.updates > 0 and self._evaluator.is_due(steps) and self.workers.is_first:
-            evaluated = self.learner.evaluation_actor()
+        if may_evaluate and counters.updates > 0 and steps >= counters.next_evaluation:
+            counters.next_evaluation = steps + self.config.evaluate_every
+            if self.workers.is_first:
+                evaluated = self.learner.evaluation_actor()
         return actor, steps < self.config.random_steps, evaluated
 
     def _collect(self, actor: Actor, random: bool, evaluated: Actor | None) -> Collected:
@@ -228,8 +270,8 @@ class Trainer:
         self.experience.normalize(episodes, self.learner.actor, self.counters.env_steps)
 
     def _learn(self) -> list[Losses]:
-        needed = max(self.workers.share(self._learning_starts), 1)
-        if self.workers.any(self.experience.transitions < needed):
+        first = self.workers.share(self.config.learning_starts) if self.counters.updates == 0 else 0
+        if self.workers.any(self.experience.transitions < max(first, 1)):
             return []
         steps = self.counters.env_steps
         self.learner.set_progress(steps / self.config.total_steps)
@@ -282,11 +324,27 @@ class Trainer:
 
     def _checkpoint_due(self) -> bool:
         elapsed = time.monotonic() - self._last_checkpoint
-        return self.workers.is_first and elapsed >= self.config.checkpoint_seconds
+        return elapsed >= self.config.checkpoint_seconds
 
-    def save(self) -> None:
-        """Writes the latest actor and the training state (worker 0 only)."""
+    def _save_or_complain(self) -> None:
+        """Writes a checkpoint on the way, the replay only now and then; a full disk may empty."""
+        try:
+            self.save(time.monotonic() - self._last_replay >= REPLAY_SECONDS)
+        except OSError as error:
+            complain(NAME, f'no checkpoint, the one before is kept: {error}')
+
+    def save(self, with_replay: bool = True) -> None:
+        """Writes the newest episodes and, as worker 0, the latest actor and the training state.
+
+        Raises:
+            OSError: If there is no room for them; what was there before is kept.
+        """
         self._last_checkpoint = time.monotonic()
+        if with_replay:
+            self._last_replay = self._last_checkpoint
+            kept = self.workers.share(self.config.kept_transitions)
+            file = self._folder.replay_file(self.workers.rank)
+            save_replay(file, self.experience.replay, kept)
         if self.workers.is_first:
             self._folder.save_actor(LATEST_FILE, self.learner.actor, self.counters.env_steps)
             self._folder.save_state(self.learner, self.experience.statistics, self.counters)

@@ -29,6 +29,7 @@ class Counters:
         seconds: Time spent, over all parts of a resumed run.
         best_success: Best evaluated success so far; -1 before the first evaluation.
         best_return: Mean return of that evaluation.
+        next_evaluation: Environment steps at which the next evaluation is due.
     """
 
     env_steps: int = 0
@@ -37,6 +38,7 @@ class Counters:
     seconds: float = 0.0
     best_success: float = -1.0
     best_return: float = -1e9
+    next_evaluation: int = 0
 
 
 @dataclass(frozen=True, slots=True)

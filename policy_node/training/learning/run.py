@@ -1,0 +1,185 @@
+"""One run from its first step to its last: what it needs, its folder, signals, log and curve."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from msgs_spec.command_line import CommandError, UsageError, complain, require_extra
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.ddpg import choose_device
+from policy_node.training.learning.distributed import join_workers, leave_workers
+from policy_node.training.learning.initial_networks import (
+    InitialNetworks,
+    read_initial_networks,
+)
+from policy_node.training.learning.replay import Episodes
+from policy_node.training.learning.run_folder import LOCK_FILE, STATE_FILE
+from policy_node.training.learning.run_log import RunLog, draw_curve, read_progress
+from policy_node.training.learning.trainer import NAME, Trainer, TrainingError
+from policy_node.training.learning.training_state import Counters
+
+
+class RunTakenError(CommandError):
+    """Another process works on the run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How a run, or this part of it, ended.
+
+    Attributes:
+        reason: Why, for people.
+        counters: How far it is.
+        signal: Number of the signal that stopped it; 0 if it ended by itself.
+    """
+
+    reason: str
+    counters: Counters
+    signal: int = 0
+
+
+def train_run(
+    config: TrainConfig,
+    output: Path,
+    *,
+    resume: bool = False,
+    command: str = '',
+    experience: Episodes | None = None,
+) -> Ending:
+    """Trains as configured, in this process, until a limit or a signal ends it.
+
+    Args:
+        config: What to train and how.
+        output: Folder of the run.
+        resume: Continue the run in the folder; else it must hold none.
+        command: Command line, for the record.
+        experience: Episodes to learn from as well.
+
+    Raises:
+        UsageError: If something that the run needs is missing or does not fit; nothing is written.
+        RunTakenError: If another process works on the folder.
+        CommandError: If training failed; the last checkpoint is kept.
+    """
+    require_extra('train')
+    networks = _initial_networks(config) if config.init_from and not resume else None
+    is_first = os.environ.get('RANK', '0') == '0'
+    with lock_run(output) if is_first else contextlib.nullcontext():
+        if not resume and (output / STATE_FILE).exists():
+            raise UsageError(f'{output} holds a run; continue it with --resume or choose another')
+        try:
+            workers = join_workers(choose_device(config.device))
+            trainer = Trainer(config, output, workers, command, source_revision(), networks)
+            if resume:
+                trainer.resume(output / STATE_FILE)
+            if experience is not None:
+                trainer.add_experience(experience)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        try:
+            ending = _train(trainer, output, command)
+        except (TrainingError, OSError) as error:
+            raise CommandError(f'{error}; the last checkpoint is kept in {output}') from None
+        finally:
+            leave_workers(workers)
+        if workers.is_first:
+            title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
+            draw_curve(read_progress(output / 'progress.csv'), title, output / 'curve.png')
+        return ending
+
+
+def _train(trainer: Trainer, output: Path, command: str) -> Ending:
+    config, counters, log = trainer.config, trainer.counters, None
+    if trainer.workers.is_first:
+        with (output / 'command.txt').open('a') as file:
+            file.write(command + '\n')
+        log = RunLog(output, config.total_steps, config.time_limit, counters.env_steps)
+    try:
+        with _stop_on_signals(trainer) as received:
+            reason = trainer.train(log)
+    finally:
+        if log is not None:
+            log.close()
+    return Ending(reason, trainer.counters, received[0] if received else 0)
+
+
+@contextlib.contextmanager
+def lock_run(folder: Path) -> Iterator[None]:
+    """Makes the folder of a run and keeps other processes out of it.
+
+    The lock ends with the process, however that ends.
+
+    Raises:
+        UsageError: If the folder cannot be made or written to.
+        RunTakenError: If another process works on it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / LOCK_FILE).open('w')
+    except OSError as error:
+        raise UsageError(f'{folder} cannot hold a run: {error.strerror}') from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunTakenError(f'{folder} is being trained by another process') from None
+        yield
+
+
+def _initial_networks(config: TrainConfig) -> InitialNetworks:
+    """Reads the networks to start from."""
+    try:
+        networks = read_initial_networks(config.init_from)
+        networks.require_fit(config)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    if not networks.has_critic:
+        complain(NAME, f'{config.init_from} has no critic beside it: a new one learns first')
+    return networks
+
+
+@contextlib.contextmanager
+def _stop_on_signals(trainer: Trainer) -> Iterator[list[int]]:
+    """Ctrl-C and SIGTERM end the run after the cycle; a second one ends it at once.
+
+    Yields:
+        A list that will hold the number of the signal.
+    """
+    received: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        del frame
+        received.append(number)
+        complain(NAME, 'stopping after this cycle; once more stops at once')
+        trainer.stop(f'stopped by {signal.Signals(number).name}')
+        signal.signal(number, signal.SIG_DFL)
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def source_revision() -> str:
+    """Git revision of the source with `-dirty` where it differs, or the installed version."""
+    folder = Path(__file__).parent
+    command = ['git', '-C', str(folder), 'describe', '--always', '--dirty', '--abbrev=40']
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode == 0:
+        return result.stdout.strip()
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f'fetch_hand_sim {version("fetch_hand_sim")}'
+    except PackageNotFoundError:
+        return 'unknown'

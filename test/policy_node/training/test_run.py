@@ -1,0 +1,280 @@
+"""Runs that are interrupted, shared, killed, or meant for where they cannot go."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from policy_node.policies.checkpoint import read_tensors, write_tensors
+from policy_node.training.learning.config import TrainConfig, recipe_config
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.replay import EpisodeReplay
+from policy_node.training.learning.replay_file import load_replay, save_replay
+from policy_node.training.learning.run import lock_run
+from policy_node.training.learning.run_log import read_progress
+from policy_node.training.learning.trainer import Trainer
+from policy_node.training.train_her import main
+
+torch.set_num_threads(1)
+
+SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
+SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'evaluate_every': 1_000}
+SET = [f'--set={name}={value}' for name, value in SMALL.items()]
+STATE = 'training_state.safetensors'
+
+
+def small(**changes: object) -> TrainConfig:
+    return recipe_config('FetchReach', 'best', **{**SMALL, **changes})
+
+
+class StopAfter:
+    """Stands where the log does and stops the run after so many cycles."""
+
+    def __init__(self, trainer: Trainer, cycles: int) -> None:
+        self.trainer, self.left, self.rows = trainer, cycles, []
+
+    def write(self, row: dict[str, float | None]) -> None:
+        self.rows.append(row)
+        self.left -= 1
+        if self.left == 0:
+            self.trainer.stop('interrupted')
+
+
+def train_in_parts(config: TrainConfig, output: Path, cycles: int) -> list[dict]:
+    """Interrupts a run after every so many cycles and resumes it until it is done."""
+    rows: list[dict] = []
+    while True:
+        trainer = Trainer(config, output, Workers())
+        if (output / STATE).exists():
+            trainer.resume(output / STATE)
+        log = StopAfter(trainer, cycles)
+        reason = trainer.train(log)
+        rows += log.rows
+        if reason != 'interrupted':
+            return rows
+
+
+def test_a_run_interrupted_ten_times_learns_as_much_as_one_that_was_not(tmp_path: Path) -> None:
+    config = small(total_steps=4_400, evaluate_every=1_000)
+    whole = train_in_parts(config, tmp_path / 'whole', cycles=1000)
+    parts = train_in_parts(config, tmp_path / 'parts', cycles=1)
+    for name in ('env_steps', 'updates', 'episodes'):
+        assert [row[name] for row in parts] == [row[name] for row in whole]
+    assert parts[-1]['updates'] == 11 * 4
+    evaluated = [row['env_steps'] for row in parts if row['eval_success'] is not None]
+    assert len(evaluated) >= 3, 'although no part is as long as the time between evaluations'
+
+
+def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As runs from before replays were kept."""
+    Trainer(small(total_steps=2_000), tmp_path, Workers()).train()
+    (tmp_path / 'replay.safetensors').write_bytes(b'damaged')
+    trainer = Trainer(small(total_steps=2_400), tmp_path, Workers())
+    trainer.resume(tmp_path / STATE)
+    log = StopAfter(trainer, 100)
+    trainer.train(log)
+    assert [(row['env_steps'], row['updates']) for row in log.rows] == [(2_400, 24)]
+    assert trainer.experience.transitions == 2_000 + 400
+    count = trainer.experience.statistics['observation_statistics'].count.item()
+    assert count == 2_400, 'what fills the replay up is no training'
+    said = capsys.readouterr().err
+    assert 'is no replay of this run' in said
+    assert '2,000 steps fill the replay before learning goes on' in said
+
+
+def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / 'run'
+    assert main(['--task', 'FetchReach', *SET, '--steps', '1200', '--output', str(run)]) == 0
+    before = (run / STATE).read_bytes()
+    assert main(['--resume', str(run)]) == 0
+    assert '1,200 environment steps were done before' in capsys.readouterr().out
+    assert (run / STATE).read_bytes() == before
+    assert main(['--resume', str(run), '--steps', '2000']) == 0
+    assert [row['updates'] for row in read_progress(run / 'progress.csv')] == [4, 8, 12, 16, 20]
+
+
+def test_the_newest_episodes_are_kept_in_order(tmp_path: Path) -> None:
+    def replay() -> EpisodeReplay:
+        return EpisodeReplay(8, ticks=5, observation_size=3, goal_size=2, action_size=1)
+
+    first, file = replay(), tmp_path / 'replay.safetensors'
+    for number in range(13):
+        episodes = first.newest(0)
+        shapes = {name: getattr(episodes, name).shape[1:] for name in type(episodes).__slots__}
+        full = {name: np.full((1, *shape), number, np.float32) for name, shape in shapes.items()}
+        first.add(type(episodes)(**full))
+    for transitions, kept in ((0, []), (1, [12]), (15, [10, 11, 12]), (1000, list(range(5, 13)))):
+        save_replay(file, first, transitions)
+        second = replay()
+        load_replay(file, second)
+        assert second.newest(8).action[:, 0, 0].tolist() == kept
+    with pytest.raises(ValueError, match=r'is no replay of this run: .* of an episode is'):
+        load_replay(file, EpisodeReplay(8, 5, 3, 2, action_size=4))
+
+
+def test_a_folder_that_is_being_trained_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / 'run'
+    with lock_run(run):
+        assert main(['--task', 'FetchReach', *SET, '--steps', '400', '--output', str(run)]) == 1
+    error = capsys.readouterr().err
+    assert f'{run} is being trained by another process' in error and error.count('\n') == 1
+    assert sorted(path.name for path in run.iterdir()) == ['.lock']
+    assert main(['--task', 'FetchReach', *SET, '--steps', '400', '--output', str(run)]) == 0
+
+
+@pytest.fixture
+def start_run(tmp_path: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
+    """Starts a long run in `run` and waits until it has logged two cycles."""
+    run = tmp_path / 'run'
+    arguments = ['--task', 'FetchReach', *SET, '--steps', '100000000', '--output', str(run)]
+    command = [sys.executable, '-m', 'policy_node.training.train_her', *arguments]
+    started = []
+
+    def start() -> subprocess.Popen[str]:
+        pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'text': True}
+        started.append(process := subprocess.Popen(command, **pipes))
+        deadline = time.monotonic() + 90
+        log = run / 'progress.csv'
+        while not log.is_file() or log.read_text().count('\n') < 3:
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_answered_at_once_and_keeps_the_run(
+    tmp_path: Path, start_run: Callable[[], subprocess.Popen[str]], number: signal.Signals
+) -> None:
+    process = start_run()
+    process.send_signal(number)
+    assert process.stderr is not None
+    lines = iter(process.stderr.readline, '')
+    assert any('train_her: stopping after this cycle' in line for line in lines)
+    assert process.poll() is None, 'said before the cycle was over'
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert f'stopped by {number.name}' in output
+    run = tmp_path / 'run'
+    steps = read_progress(run / 'progress.csv')[-1]['env_steps']
+    counters = json.loads(read_tensors(run / STATE)[1]['counters'])
+    assert counters['env_steps'] == steps >= 800 and counters['updates'] == steps / 100
+    assert (run / 'replay.safetensors').is_file() and (run / 'curve.png').is_file()
+
+
+def test_the_lock_of_a_killed_run_is_stale(
+    tmp_path: Path, start_run: Callable[[], subprocess.Popen[str]]
+) -> None:
+    process = start_run()
+    with pytest.raises(Exception, match='is being trained by another process'):
+        with lock_run(tmp_path / 'run'):
+            pass
+    process.kill()
+    process.communicate()
+    with lock_run(tmp_path / 'run'):
+        pass
+
+
+def test_what_a_run_will_need_is_checked_before_its_first_step(tmp_path: Path) -> None:
+    code = (
+        'import importlib.abc, sys\n'
+        'class Without(importlib.abc.MetaPathFinder):\n'
+        '    def find_spec(self, name, *rest):\n'
+        '        if name == "matplotlib": sys.meta_path[:] = sys.meta_path[:1]\n'
+        'sys.meta_path.insert(0, Without())\n'
+        'from policy_node.training.train_her import main\n'
+        f'sys.exit(main(["--task", "FetchReach", "--output", {str(tmp_path / "run")!r}]))\n'
+    )
+    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert result.returncode == 2, result.stderr
+    assert 'train_her: matplotlib' in result.stderr
+    assert "pip install 'fetch_hand_sim[train]'" in result.stderr
+    assert result.stderr.count('\n') == 1 and not (tmp_path / 'run').exists()
+
+
+@pytest.mark.parametrize('output', ['file', '/proc/run', '/proc/1/run', 'file/run'])
+def test_an_output_that_cannot_be_a_folder_is_one_line(
+    output: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / 'file').write_text('')
+    assert main(['--task', 'FetchReach', *SET, '--output', str(tmp_path / output)]) == 2
+    error = capsys.readouterr().err
+    assert 'cannot hold a run: ' in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'counters': None}, "lacks 'counters' in its metadata"),
+        ({'extra': None}, "lacks 'extra' in its metadata"),
+        ({'extra': '{}'}, "lacks 'config' in its metadata"),
+        ({'counters': '[1]'}, 'has unreadable metadata: '),
+        ({'counters': '{"speed": 1}'}, 'has unreadable metadata: '),
+        (
+            {'extra': '{"config": {"task": ["FetchReach"]}}'},
+            "task ['FetchReach'] is not of type str",
+        ),
+        ({'extra': '{"config": {"task": "FetchReach", "hidden_sizes": [1e999]}}'}, 'hidden_sizes'),
+        ({'extra': '[' * 100_000}, 'has unreadable metadata: '),
+    ],
+)
+def test_a_damaged_state_is_one_line(
+    change: dict[str, str | None], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Trainer(small(), tmp_path, Workers()).save()
+    tensors, metadata = read_tensors(tmp_path / STATE)
+    metadata = {name: text for name, text in (metadata | change).items() if text is not None}
+    write_tensors(tmp_path / STATE, tensors, metadata)
+    assert main(['--resume', str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
+
+
+@contextlib.contextmanager
+def files_at_most(size: int) -> Iterator[None]:
+    """Lets every write beyond `size` bytes of a file fail, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_a_full_disk_leaves_no_partial_file_and_the_checkpoint_before(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = small(total_steps=2_000, checkpoint_seconds=0)
+    trainer = Trainer(config, tmp_path, Workers())
+    trainer.save()
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for size in (1_000, 700_000):
+        with files_at_most(size), pytest.raises(OSError):
+            trainer.train()
+        assert 'no checkpoint, the one before is kept: ' in capsys.readouterr().err
+        assert not [path for path in os.listdir(tmp_path) if path.endswith('.partial')]
+        assert (tmp_path / STATE).read_bytes() == before[STATE]
+    trainer.save()
+    assert json.loads(read_tensors(tmp_path / STATE)[1]['counters'])['updates'] == 20
