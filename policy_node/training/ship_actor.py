@@ -63,7 +63,7 @@ def ship(options: argparse.Namespace) -> bool:
         print(f'ship_actor: the actor in {options.actors} is at least as good; nothing changed')
         return False
     target = options.actors / f'{info.task}.safetensors'
-    command = run_command(options.run) or info.command
+    command = commands_of(options.run) or info.command
     checkpoint.save(target, actor, replace(info, success=summary, command=command))
     report = {
         'actor': info.task,
@@ -93,7 +93,7 @@ def ship_critic(state_file: Path, actor: Path) -> None:
     write_state(companion_file(actor), TrainingState(tensors, state.counters, extra))
 
 
-def run_command(run: Path) -> str:
+def commands_of(run: Path) -> str:
     """Every command of a run in order, the first and those that resumed it; '' if unknown."""
     path = run / 'command.txt'
     return ' && '.join(path.read_text().splitlines()) if path.is_file() else ''
