@@ -478,8 +478,8 @@ def test_what_cannot_be_learnt_from_is_left_out_and_named(reach, tmp_path):
     generate(tmp_path / 'mixed', 'FetchReach', episodes=1, control_hz=50.0)
     experience, skipped = read_experience(tmp_path / 'mixed', TASKS['FetchReach'])
     assert len(experience) == 1 and len(skipped) == 4
-    for reason in ('19 of 50 steps', 'FetchPush, not FetchReach', '50.0 Hz', 'no MCAP file'):
-        assert sum(reason in line or 'begin and end' in line for line in skipped) >= 1
+    reasons = ('19 of 50 steps', 'FetchPush, not FetchReach', '50.0 Hz', 'begin and end')
+    assert [sum(reason in line for line in skipped) for reason in reasons] == [1, 1, 1, 1]
     with pytest.raises(ValueError, match='holds no usable episode of HandReach'):
         read_experience(tmp_path / 'mixed', TASKS['HandReach'])
 
@@ -504,8 +504,6 @@ def test_equal_command_lines_give_equal_messages(tmp_path):
     runs = [generate(tmp_path / name, 'FetchReach', episodes=2) for name in ('a', 'b')]
     for first, second in zip(*runs, strict=True):
         assert read_episode(first).topics == read_episode(second).topics
-        files = [path / f'{path.name}_0.mcap' for path in (first, second)]
-        assert files[0].read_bytes() != b'' and files[0].name == files[1].name
 
 
 def test_arrays_are_as_documented(reach):
