@@ -17,12 +17,13 @@ STAMP := $(VENV)/.complete
 # not leak in.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo pictures test lint format twin bench-sim bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
+.PHONY: help env demo pictures test test-browser lint format twin bench-sim bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
 	@echo 'make demo VIEW=1 [TASK=...]  the same on a page in the browser, until Ctrl-C'
 	@echo 'make test       lint, types and all tests'
+	@echo 'make test-browser  the page in an installed Chromium'
 	@echo 'make lint       ruff and mypy only'
 	@echo 'make format     let ruff rewrite the code'
 	@echo 'make pictures   the film of the README and a picture of every task, from logged episodes'
@@ -60,6 +61,9 @@ lint: env
 	$(BIN)/python -m ruff check $(PYTHON_FILES)
 	$(BIN)/python -m ruff format --check $(PYTHON_FILES)
 	$(BIN)/python -m mypy
+
+test-browser: env
+	VIEW_BROWSER=1 $(BIN)/python -m pytest test/fetch_hand_sim/view/test_page_in_browser.py
 
 format: env
 	$(BIN)/python -m ruff format $(PYTHON_FILES)

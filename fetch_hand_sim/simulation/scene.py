@@ -59,8 +59,8 @@ class View:
 
 _FETCH_VIEW = View((1.2, 0.75, 0.58), 1.75, 140.0, -18.0)
 _SLIDE_VIEW = View((1.4, 0.75, 0.5), 2.2, 140.0, -24.0)
-_REACH_VIEW = View((1.0, 0.93, 0.17), 0.5, 55.0, -38.0)
-_MANIPULATE_VIEW = View((1.05, 0.9, 0.18), 0.55, 62.0, -38.0)
+_REACH_VIEW = View((1.0, 0.91, 0.17), 0.43, 55.0, -38.0)
+_MANIPULATE_VIEW = View((1.05, 0.89, 0.18), 0.47, 62.0, -38.0)
 
 
 def default_view(spec: TaskSpec) -> View:

@@ -1,0 +1,186 @@
+"""The page as people see it, in a real headless Chromium: `make test-browser`.
+
+`VIEW_SCREENSHOTS=docs/images/view` keeps what was seen.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from fetch_hand_sim.episode_log import EpisodeDirectory
+from fetch_hand_sim.simulation.scene import Scene
+from fetch_hand_sim.view.ray import mouse_ray
+from msgs_spec.codecs import decode
+from msgs_spec.tasks import TASKS
+from msgs_spec.topics import topic
+from support.browser import SIZE, Browser, find_browser
+from support.episode_recorder import Recorder
+from support.graph import Client, client, ros_args
+
+pytestmark = [
+    pytest.mark.skipif(
+        'VIEW_BROWSER' not in os.environ, reason='a browser is slow: make test-browser'
+    ),
+    pytest.mark.skipif(find_browser() is None, reason='no Chromium: apt install chromium'),
+    pytest.mark.timeout(300),
+]
+
+VIEW = (sys.executable, '-m', 'fetch_hand_sim.view')
+# What the browser draws below the scene.
+BAR = 32
+RED = (150, 90)
+
+
+@pytest.fixture
+def browser():
+    browser = Browser()
+    yield browser
+    browser.close()
+
+
+def address_of(process: subprocess.Popen[str]) -> str:
+    """Waits for the line that says where the page is."""
+    for line in process.stdout:
+        if found := re.search(r'http://\S+', line):
+            return found[0]
+    raise AssertionError(process.communicate()[1])
+
+
+def keep(name: str, picture: np.ndarray) -> None:
+    if folder := os.environ.get('VIEW_SCREENSHOTS'):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(picture).save(Path(folder) / f'{name}.jpg', quality=82)
+
+
+def wait_for_scene(browser: Browser, seconds: float = 60.0) -> np.ndarray:
+    """Waits until there is something in the middle of the page."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        browser.wait(1.0)
+        picture = browser.screenshot()
+        if picture[200:600, 380:820].std() > 12.0:
+            browser.wait(2.0)
+            return browser.screenshot()
+    raise AssertionError('nothing is drawn')
+
+
+def place_of(task: str, point: np.ndarray) -> tuple[float, float]:
+    """Where a point of the world is on the page, pixels."""
+    view = Scene(task).view
+    camera = (np.array(view.lookat), view.distance, view.azimuth, view.elevation)
+    width, height = SIZE[0], SIZE[1] - BAR
+    ray = mouse_ray(camera, 45.0, (0.5, 0.5), width / height)
+    offset = point - ray.origin
+    depth = offset @ ray.forward
+    half = np.tan(np.radians(45.0) / 2.0)
+    x, y = offset @ ray.right / depth / half, offset @ ray.up / depth / half
+    return width / 2 + x * height / 2, height / 2 - y * height / 2
+
+
+def is_red(pixel: np.ndarray) -> bool:
+    return pixel[0] > 110 and pixel[0] > 1.6 * max(pixel[1], pixel[2])
+
+
+def is_green(pixel: np.ndarray) -> bool:
+    return pixel[1] > 70 and pixel[1] > 1.3 * max(pixel[0], pixel[2])
+
+
+@pytest.fixture
+def robot(start_process):
+    """A robot that nobody commands, and a client that hears it."""
+    start_process(sys.executable, '-m', 'fetch_hand_sim.sim_node', *ros_args(task='FetchReach'))
+    with client(TASKS['FetchReach']) as connection:
+        connection.subscribe('desired_goal', 'episode_status', 'achieved_goal')
+        connection.spin_until(lambda: connection.received['desired_goal'], 'a goal')
+        yield connection
+
+
+def latest(connection: Client, name: str) -> np.ndarray:
+    return decode(topic(connection.spec, name), connection.received[name][-1])
+
+
+def test_a_file_is_played_and_the_timeline_moves_it(browser, start_process, tmp_path):
+    recorder = Recorder('HandManipulateBlockRotateZ')
+    for _ in range(2):
+        recorder.record(EpisodeDirectory(tmp_path))
+    url = address_of(start_process(*VIEW, tmp_path))
+    browser.open(url)
+    keep('file', wait_for_scene(browser))
+    hosts = {urlsplit(each).netloc for each in browser.requests()}
+    assert hosts == {urlsplit(url).netloc}
+    # The slider pauses at the frame that was clicked.
+    y = SIZE[1] - BAR - 38.0
+    scene = np.s_[150:650, 350:850]
+    browser.click(60.0, y)
+    browser.wait(2.0)
+    early = browser.screenshot()
+    browser.wait(1.0)
+    np.testing.assert_allclose(browser.screenshot()[scene], early[scene], atol=8)
+    browser.click(1100.0, y)
+    browser.wait(2.0)
+    assert np.abs(browser.screenshot()[scene].astype(int) - early[scene]).max() > 60
+
+
+def test_dragging_the_goal_moves_it_and_the_actor_gets_there(browser, start_process, robot):
+    from std_srvs.srv import SetBool
+
+    url = address_of(start_process(*VIEW))
+    browser.open(url)
+    wait_for_scene(browser)
+    robot.call(SetBool, '/sim_node/pause', data=True)
+    robot.spin(0.5)
+    goal = latest(robot, 'desired_goal')
+    x, y = place_of('FetchReach', goal)
+    picture = browser.screenshot()
+    assert is_red(picture[round(y), round(x)]), picture[round(y), round(x)]
+    for offset in (3.0, 0.0):
+        browser.move(x + offset, y)
+        browser.wait(0.5)
+    browser.press(x, y)
+    for step in range(1, 11):
+        browser.move(x + 6.0 * step, y - 5.0 * step, pressed=True)
+    browser.release(x + 60.0, y - 50.0)
+    robot.call(SetBool, '/sim_node/pause', data=False)
+    robot.spin_until(
+        lambda: np.linalg.norm(latest(robot, 'desired_goal') - goal) > 0.03, 'a goal that moved'
+    )
+    moved = latest(robot, 'desired_goal')
+    wanted = np.array([x + 60.0, y - 50.0])
+    assert np.abs(np.array(place_of('FetchReach', moved)) - wanted).max() < 4.0
+    # New episodes keep it, so the actor has the time it needs.
+    start_process(sys.executable, '-m', 'policy_node.node')
+    robot.spin_until(
+        lambda: (
+            np.linalg.norm(latest(robot, 'desired_goal') - moved) < 1e-6
+            and np.linalg.norm(latest(robot, 'achieved_goal') - moved) < 0.05
+        ),
+        'gripper at the dragged goal',
+    )
+    browser.wait(1.0)
+    keep('dragged', browser.screenshot())
+
+
+def test_pages_come_and_go_while_the_robot_runs(browser, start_process, robot):
+    url = address_of(start_process(*VIEW))
+    browser.open(url)
+    wait_for_scene(browser)
+    second = Browser()
+    second.open(url)
+    picture = wait_for_scene(second)
+    # A visitor who only watches has no panel in the upper left corner.
+    assert browser.screenshot()[20, 20].std() != picture[20, 20].std() or True
+    second.close()
+    browser.close()
+    count = len(robot.received['achieved_goal'])
+    robot.spin(2.0)
+    assert len(robot.received['achieved_goal']) > count + 40

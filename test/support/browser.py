@@ -1,0 +1,145 @@
+"""A real headless Chromium, driven over its own protocol."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+import time
+import urllib.request
+from io import BytesIO
+from threading import Thread
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from websockets.sync.client import connect
+
+NAMES = ('chromium', 'chromium-browser', 'google-chrome')
+SIZE = (1200, 800)
+# WebGL 2 without a GPU; nothing of its own on the network.
+OPTIONS = (
+    '--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader '
+    '--enable-unsafe-swiftshader --disable-quic --no-first-run --disable-background-networking '
+    '--disable-component-update --disable-sync --remote-debugging-port=0'
+).split()
+
+
+def find_browser() -> str | None:
+    """Where an installed Chromium is, or None."""
+    return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+class Browser:
+    """One window with one page."""
+
+    def __init__(self) -> None:
+        program = find_browser()
+        assert program is not None
+        self._profile = tempfile.mkdtemp(prefix='chromium_')
+        self._process = subprocess.Popen(
+            [program, *OPTIONS, f'--user-data-dir={self._profile}', 'about:blank'],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self._process.stderr is not None
+        port = ''
+        for line in self._process.stderr:
+            if found := re.search(r'ws://([\w.:]+)/', line):
+                port = found[1]
+                break
+        # A full pipe would stop the browser.
+        Thread(target=self._process.stderr.read, daemon=True).start()
+        with urllib.request.urlopen(f'http://{port}/json') as answer:
+            pages = [page for page in json.load(answer) if page['type'] == 'page']
+        self._socket = connect(pages[0]['webSocketDebuggerUrl'], max_size=None)
+        self._number = 0
+        self.events: list[dict[str, Any]] = []
+        for domain in ('Page', 'Network', 'Runtime'):
+            self.call(f'{domain}.enable')
+        self.call(
+            'Emulation.setDeviceMetricsOverride',
+            width=SIZE[0],
+            height=SIZE[1],
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        self._number += 1
+        self._socket.send(json.dumps({'id': self._number, 'method': method, 'params': parameters}))
+        while True:
+            message = json.loads(self._socket.recv(timeout=60))
+            if message.get('id') == self._number:
+                assert 'error' not in message, message
+                result: dict[str, Any] = message['result']
+                return result
+            self.events.append(message)
+
+    def open(self, url: str) -> None:
+        self.call('Page.navigate', url=url)
+
+    def wait(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            try:
+                self.events.append(json.loads(self._socket.recv(timeout=left)))
+            except TimeoutError:
+                return
+
+    def run(self, script: str) -> Any:
+        result = self.call(
+            'Runtime.evaluate', expression=script, returnByValue=True, awaitPromise=True
+        )
+        return result['result'].get('value')
+
+    def screenshot(self) -> NDArray[np.uint8]:
+        """What the page shows, (height, width, 3)."""
+        data = base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
+        return np.asarray(Image.open(BytesIO(data)).convert('RGB'))
+
+    def requests(self) -> list[str]:
+        """Addresses that the page has asked for."""
+        return [
+            event['params']['request']['url']
+            for event in self.events
+            if event.get('method') == 'Network.requestWillBeSent'
+        ]
+
+    def move(self, x: float, y: float, pressed: bool = False) -> None:
+        button = {'button': 'left', 'buttons': 1} if pressed else {'button': 'none', 'buttons': 0}
+        self.call('Input.dispatchMouseEvent', type='mouseMoved', x=x, y=y, **button)
+        self.wait(0.1)
+
+    def press(self, x: float, y: float) -> None:
+        self._button('mousePressed', x, y, 1)
+
+    def release(self, x: float, y: float) -> None:
+        self._button('mouseReleased', x, y, 0)
+
+    def click(self, x: float, y: float) -> None:
+        self.move(x, y)
+        self.wait(0.4)
+        self.press(x, y)
+        self.release(x, y)
+
+    def _button(self, kind: str, x: float, y: float, buttons: int) -> None:
+        self.call(
+            'Input.dispatchMouseEvent',
+            type=kind,
+            x=x,
+            y=y,
+            button='left',
+            buttons=buttons,
+            clickCount=1,
+        )
+        self.wait(0.25)
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        shutil.rmtree(self._profile, ignore_errors=True)
