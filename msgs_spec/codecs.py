@@ -181,6 +181,18 @@ def _read_free_joint(topic: TopicSpec, message: Any) -> Array:
     return np.concatenate([pose, _read_xyz(twist.linear, twist.angular)])
 
 
+def _build_pose_array(topic: TopicSpec, values: Array) -> dict[str, Any]:
+    rows = values.reshape(len(topic.layout), -1)
+    # Goals are positions alone.
+    return {'poses': [_pose(row[:3], row[3:] if row.size == 7 else _IDENTITY) for row in rows]}
+
+
+def _read_pose_array(topic: TopicSpec, message: Any) -> Array:
+    size = topic.layout[0].size
+    poses = [_read_pose(pose.position, pose.orientation)[:size] for pose in message.poses]
+    return np.concatenate([np.zeros(0), *poses])
+
+
 def _build_multi_array(topic: TopicSpec, values: Array) -> dict[str, Any]:
     label = ','.join(part.name for part in topic.layout)
     dimension = message_class('std_msgs/msg/MultiArrayDimension')
@@ -203,10 +215,7 @@ _CODECS: dict[str, tuple[_Builder, _Reader]] = {
         lambda _, values: {'pose': _pose(values[:3], values[3:])},
         lambda _, message: _read_pose(message.pose.position, message.pose.orientation),
     ),
-    'geometry_msgs/msg/PoseArray': (
-        lambda _, values: {'poses': [_pose(xyz, _IDENTITY) for xyz in values.reshape(-1, 3)]},
-        lambda _, message: _read_xyz(*(pose.position for pose in message.poses)),
-    ),
+    'geometry_msgs/msg/PoseArray': (_build_pose_array, _read_pose_array),
     'geometry_msgs/msg/TwistStamped': (
         lambda _, values: {'twist': _twist(values)},
         lambda _, message: _read_xyz(message.twist.linear, message.twist.angular),

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_spec.robots import FINGERTIPS
 from msgs_spec.rotations import matrix_to_euler, quaternion_to_matrix
 from msgs_spec.tasks import PHYSICS_TIMESTEP, GoalKind, TaskSpec, substeps_per_tick
 from msgs_spec.topics import topic
@@ -47,7 +48,7 @@ def observation(task: TaskSpec, readings: Readings, tick_duration: float) -> Arr
     position, velocity, _ = np.split(readings['joint_states'], 3, axis=-1)
     if task.goal is GoalKind.FINGERTIPS:
         # `shadow_dexterous_hand/reach.py` of Gymnasium-Robotics.
-        return np.concatenate([position, velocity, readings['fingertip_poses']], axis=-1)
+        return np.concatenate([position, velocity, _fingertip_positions(readings)], axis=-1)
     # `shadow_dexterous_hand/manipulate.py`.
     qpos, qvel = np.split(readings['object_joint'], [7], axis=-1)
     return np.concatenate([position, velocity, qvel, qpos], axis=-1)
@@ -79,10 +80,17 @@ def _fetch_parts(task: TaskSpec, readings: Readings, tick_duration: float) -> li
     ]
 
 
+def _fingertip_positions(readings: Readings) -> Array:
+    """Fingertip positions (..., 15), m, a fresh array."""
+    poses = readings['fingertip_poses']
+    positions = poses.reshape(*poses.shape[:-1], len(FINGERTIPS), 7)[..., :3]
+    return positions.reshape(*poses.shape[:-1], 3 * len(FINGERTIPS))
+
+
 def achieved_goal(task: TaskSpec, readings: Readings) -> Array:
     """Achieved goals (..., task.goal.size) from what the sensors say, a fresh array."""
     if task.goal is GoalKind.FINGERTIPS:
-        return readings['fingertip_poses'].copy()
+        return _fingertip_positions(readings)
     if task.goal is GoalKind.POSE:
         return readings['object_joint'][..., :7].copy()
     place = readings['object_pose' if task.has_object else 'end_effector_pose']

@@ -23,6 +23,7 @@ _FREE_JOINT = (
     VectorPart('angular, object frame', 3, 'rad/s'),
 )
 _FINGERTIPS = tuple(VectorPart(name, 3, 'm') for name in FINGERTIPS)
+_FINGERTIP_POSES = tuple(VectorPart(name, 7, 'm, quaternion') for name in FINGERTIPS)
 
 _GOAL_TYPES = {
     GoalKind.POINT: ('geometry_msgs/msg/PointStamped', (_POSITION,)),
@@ -124,9 +125,9 @@ def _body_topics(task: TaskSpec) -> list[TopicSpec]:
             _published('end_effector_twist', twist, 'The same site.', _TWIST, frame=WORLD),
         ]
     else:
-        text = 'Fingertip positions; orientations are identity.'
+        text = 'Sites at the fingertips, oriented as the distal segments.'
         array = 'geometry_msgs/msg/PoseArray'
-        specs = [_published('fingertip_poses', array, text, _FINGERTIPS, frame=WORLD)]
+        specs = [_published('fingertip_poses', array, text, _FINGERTIP_POSES, frame=WORLD)]
     if task.has_object:
         specs += [
             _published('object_pose', pose, 'Centre of the object.', _POSE, frame=WORLD),

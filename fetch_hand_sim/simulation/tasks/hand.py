@@ -35,8 +35,10 @@ class HandTask(Task):
         super().__init__(spec, model, batch)
         self._ctrl: Array = self.batch.bind('ctrl')
         self._site_xpos: Array = self.output('site_xpos')
+        self._xquat = self.output('xquat')
         self._fingertip_sites = fingertip_sites(model)
-        self._sensors['fingertip_poses'] = self._fingertips
+        self._fingertip_bodies = model.site_bodyid[self._fingertip_sites]
+        self._sensors['fingertip_poses'] = self._fingertip_poses
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
         """Sets the position actuators to absolute joint angles, radians."""
@@ -46,6 +48,8 @@ class HandTask(Task):
         """Returns the joint angles that the actuators hold now."""
         return self._ctrl.copy()
 
-    def _fingertips(self) -> Array:
-        """Fingertip positions, (N, 15), metres."""
-        return self._site_xpos[:, self._fingertip_sites].reshape(self.batch.nsim, -1)
+    def _fingertip_poses(self) -> Array:
+        """Fingertip positions, metres, and orientations wxyz, (N, 35); sites turn as bodies do."""
+        positions = self._site_xpos[:, self._fingertip_sites]
+        quaternions = self._xquat[:, self._fingertip_bodies]
+        return np.concatenate([positions, quaternions], axis=2).reshape(self.batch.nsim, -1)
