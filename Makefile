@@ -93,7 +93,7 @@ bench-rate: env
 
 torture: env
 	$(BIN)/python -m pytest --hostile-messages 100000 --soak-seconds 3600 --timeout 0 \
-		test/fetch_hand_sim/sim_node/test_robot.py \
+		test/fetch_hand_sim/sim_node/test_receivers.py \
 		test/policy_node/node/test_responder.py test/nodes/test_nodes_hostile.py
 	EPISODE_KILLS=50 EPISODE_LIFE=3 EPISODE_MUTATIONS=10000 $(BIN)/python -m pytest --timeout 0 -s \
 		test/fetch_hand_sim/episode_log/test_episode_endings.py \

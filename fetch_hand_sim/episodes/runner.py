@@ -62,7 +62,8 @@ class EpisodeRunner:
         self._episodes = episodes
         self._period_ns = round(simulation.tick_duration * 1e9)
         self._first_stamp_ns = self._next_stamp_ns = self._reset_stamp_ns = first_stamp_ns
-        self._episode = first_episode
+        self._first_episode = self._episode = first_episode
+        self._series_seed = first_seed
         self._new_first_seed: int | None = None
         self._tick = 0
         self._return = 0.0
@@ -132,6 +133,12 @@ class EpisodeRunner:
         """Gives the running episode up: the next tick starts another."""
         if not self.is_between_episodes:
             self._finish()
+
+    def start_over(self) -> None:
+        """Gives the series up: the next tick starts its first episode again, and time goes on."""
+        self.is_between_episodes = True
+        self._episode = self._first_episode
+        self._first_seed, self._new_first_seed = self._series_seed, None
 
     def advance(self, command: Array) -> Tick:
         """Advances by one tick: the reset of the next episode, or one step of the running one.

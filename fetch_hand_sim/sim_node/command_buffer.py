@@ -7,77 +7,59 @@ first valid one, and when commands stop for longer than the timeout the robot ho
 
 from __future__ import annotations
 
+import time
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from msgs_spec.commands import clip_command
+from msgs_spec.commands import clip_command, command_limits
 from msgs_spec.robots import RobotSpec
 
 Array = NDArray[np.float64]
-Source = Literal['rest', 'command', 'hold']
 # Characters of a received name that an error line repeats.
 _NAME_SHOWN = 40
-
-
-class CommandRejected(ValueError):
-    """A received command is not valid.
-
-    Attributes:
-        reason: Short, for counting: `wrong size`, `not finite`, `unknown joint`, ...
-    """
-
-    def __init__(self, reason: str, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
-
-
-@dataclass(frozen=True, slots=True)
-class NextCommand:
-    """What the next tick applies.
-
-    Attributes:
-        values: (action size,), command units, within limits.
-        source: `command`: received in time; `rest`: none came yet in this episode; `hold`: the last
-            one is older than the timeout.
-    """
-
-    values: Array
-    source: Source
+# A value this many times the width of its range beyond a limit is no overshoot of a controller.
+_FAR = 2.0
 
 
 class CommandBuffer:
     """The latest valid command of one robot.
 
-    Times are seconds of any steady clock.
+    Args:
+        robot: Whose commands.
+        timeout: Seconds after which the last command is replaced by holding; 0 never.
+        clock: A steady clock, seconds.
 
     Attributes:
-        timeout: Seconds after which the last command is replaced by holding; 0 never.
+        timeout: As above.
         accepted: Valid commands so far.
-        rejected: Others, by reason.
+        clipped: Those of them that were clipped.
+        far_out: Those of them that were so far out of range that somebody took another unit.
+        rejected: Other commands, by reason.
+        last_far_out: What was said of the last command that was far out of range.
         last_rejection: Why the last command was rejected; empty if it was not.
     """
 
-    def __init__(self, robot: RobotSpec, timeout: float) -> None:
-        """Starts empty.
-
-        Args:
-            robot: Whose commands.
-            timeout: Seconds after which the last command is replaced by holding; 0 never.
-        """
+    def __init__(
+        self, robot: RobotSpec, timeout: float, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._robot = robot
         self._names = [part.name for part in robot.command]
+        self._lower, self._upper = command_limits(robot)
         self.timeout = timeout
         self.accepted = 0
+        self.clipped = 0
+        self.far_out = 0
         self.rejected: Counter[str] = Counter()
+        self.last_far_out = ''
         self.last_rejection = ''
+        self._clock = clock
         self._resting = np.zeros(robot.action_size)
         self._command: Array | None = None
-        self._received_at = 0.0
+        self._received_at: float | None = None
         self._is_fresh = False
 
     @property
@@ -85,9 +67,9 @@ class CommandBuffer:
         """Whether a command came since the last `take` or `start_episode`."""
         return self._is_fresh
 
-    def age(self, now: float) -> float | None:
-        """Seconds since the last valid command of this episode, or None if none came."""
-        return None if self._command is None else now - self._received_at
+    def age(self) -> float | None:
+        """Seconds since the last valid command of any episode, or None if none ever came."""
+        return None if self._received_at is None else self._clock() - self._received_at
 
     def start_episode(self, resting_command: ArrayLike) -> None:
         """Forgets the command.
@@ -100,54 +82,59 @@ class CommandBuffer:
         self._command = None
         self._is_fresh = False
 
-    def accept(self, values: ArrayLike, now: float) -> None:
+    def accept(self, values: ArrayLike) -> None:
         """Takes a whole command, in order.
 
         Raises:
-            CommandRejected: If its size is wrong or a value is not finite; the buffer is unchanged.
+            ValueError: If its size is wrong or a value is not finite; the buffer is unchanged.
         """
         command = np.asarray(values, dtype=np.float64).ravel()
         size = self._robot.action_size
         if command.size != size:
-            self._reject('wrong size', f'command of {command.size} values dropped; allowed: {size}')
-        self._store(command, now)
+            self._reject('wrong size', f'{command.size} values given; allowed: {size}')
+        self._store(command)
 
-    def accept_named(self, names: Sequence[str], positions: ArrayLike, now: float) -> None:
+    def accept_named(self, names: Sequence[str], positions: ArrayLike) -> None:
         """Takes joint positions by name, in any order; joints not named keep their target.
 
         Raises:
-            CommandRejected: If names and positions do not match, a name is unknown or given twice,
+            ValueError: If names and positions do not match, a name is unknown or given twice,
                 or a value is not finite; the buffer is unchanged.
         """
         values = np.asarray(positions, dtype=np.float64).ravel()
         if len(names) != values.size:
-            self._reject(
-                'wrong size',
-                f'joint command dropped: {len(names)} names but {values.size} positions',
-            )
+            self._reject('wrong size', f'{len(names)} names but {values.size} positions given')
         unknown = [name for name in names if name not in self._names]
         if unknown:
             self._reject(
                 'unknown joint',
-                f'joint command dropped: unknown joint {unknown[0][:_NAME_SHOWN]!r}; allowed: '
-                f'{", ".join(self._names)}',
+                f'joint {unknown[0][:_NAME_SHOWN]!r} given; allowed: {", ".join(self._names)}',
             )
         if len(set(names)) != len(names):
-            self._reject('repeated joint', 'joint command dropped: a joint is named twice')
+            self._reject('repeated joint', 'a joint is named twice')
         if not names:
-            self._reject('wrong size', 'joint command dropped: it names no joint')
+            self._reject('wrong size', 'no joint is named')
         command = (self._resting if self._command is None else self._command).copy()
         command[[self._names.index(name) for name in names]] = values
-        self._store(command, now)
+        self._store(command)
 
-    def take(self, now: float) -> NextCommand:
-        """Returns what the next tick applies."""
+    def count_rejection(self, reason: str, line: str) -> None:
+        """Counts what never was a command.
+
+        Args:
+            reason: Short, for counting: `wrong size`, `not finite`, `unknown joint`, ...
+            line: What was given and what is allowed.
+        """
+        self.rejected[reason] += 1
+        self.last_rejection = line
+
+    def take(self) -> Array:
+        """Returns what the next tick applies, (action size,), command units, within limits."""
         self._is_fresh = False
         if self._command is None:
-            return NextCommand(self._resting, 'rest')
-        if self.timeout > 0.0 and now - self._received_at > self.timeout:
-            return NextCommand(self._holding(self._command), 'hold')
-        return NextCommand(self._command, 'command')
+            return self._resting
+        is_late = 0.0 < self.timeout < (self.age() or 0.0)
+        return self._holding(self._command) if is_late else self._command
 
     def _holding(self, command: Array) -> Array:
         """Keeps the pose: the gripper stops and keeps its grip, joints keep their targets."""
@@ -155,22 +142,33 @@ class CommandBuffer:
             return command
         return np.array([0.0, 0.0, 0.0, command[3]])
 
-    def _store(self, command: Array, now: float) -> None:
+    def _store(self, command: Array) -> None:
         finite = np.isfinite(command)
         if not finite.all():
             index = int(np.argmin(finite))
-            self._reject(
-                'not finite',
-                f'command dropped: {self._names[index]} is {command[index]}; allowed: finite '
-                'numbers',
-            )
+            line = f'{self._names[index]} is {command[index]}; allowed: finite numbers'
+            self._reject('not finite', line)
         self._command = clip_command(self._robot, command)
-        self._received_at = now
+        if not np.array_equal(command, self._command):
+            self._count_clipping(command)
+        self._received_at = self._clock()
         self._is_fresh = True
         self.accepted += 1
         self.last_rejection = ''
 
-    def _reject(self, reason: str, message: str) -> None:
-        self.rejected[reason] += 1
-        self.last_rejection = message
-        raise CommandRejected(reason, message)
+    def _count_clipping(self, command: Array) -> None:
+        self.clipped += 1
+        lower, upper = self._lower, self._upper
+        beyond = np.maximum(lower - command, command - upper) - _FAR * (upper - lower)
+        index = int(beyond.argmax())
+        if beyond[index] > 0.0:
+            self.far_out += 1
+            part = self._robot.command[index]
+            self.last_far_out = (
+                f'{part.name} is {command[index]:g}; allowed: {part.lower:.4g} ... '
+                f'{part.upper:.4g} {part.unit}'
+            )
+
+    def _reject(self, reason: str, line: str) -> NoReturn:
+        self.count_rejection(reason, line)
+        raise ValueError(line)

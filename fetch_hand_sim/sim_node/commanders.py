@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+
+# Seconds after which the graph has forgotten a process that was killed: until then it may stand
+# beside its successor. DDS implementations take 20 s or less.
+_MEMORY_OF_THE_GRAPH = 25.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,48 +30,66 @@ class Endpoint:
 
 
 class CommanderWatch:
-    """Compares what the graph shows now with what it showed before."""
+    """Compares what the graph shows now with what it showed before.
+
+    Args:
+        type_names: Fully qualified topics that carry commands, with their types.
+    """
 
     def __init__(self, type_names: Mapping[str, str]) -> None:
-        """Starts with nobody.
-
-        Args:
-            type_names: Fully qualified topics that carry commands, with their types.
-        """
         self._type_names = type_names
-        self._known: dict[bytes, Endpoint] = {}
+        self._endpoints: list[Endpoint] = []
+        self._since: dict[bytes, float] = {}
+        self._now = 0.0
 
     @property
     def names(self) -> list[str]:
         """Nodes whose commands this robot receives; one that runs twice is named twice."""
-        publishers: Counter[str] = Counter()
+        copies: dict[str, int] = {}
         for topic in self._type_names:
-            heard = (each for each in self._known.values() if not self._deafness(each))
-            publishers |= Counter(each.node for each in heard if each.topic == topic)
-        return sorted(publishers.elements())
+            for node in {endpoint.node for endpoint in self._endpoints}:
+                copies[node] = max(copies.get(node, 0), self._copies(node, topic))
+        return sorted(name for name, count in copies.items() for _ in range(count))
 
-    def look(self, found: Iterable[Endpoint]) -> bool:
+    def update(self, found: Iterable[Endpoint], now: float) -> bool:
         """Takes what the graph shows now.
+
+        Args:
+            found: Publishers of topics that carry commands.
+            now: Seconds of a steady clock.
 
         Returns:
             Whether somebody came who was not there before.
         """
-        before = self._known.keys()
-        self._known = {endpoint.gid: endpoint for endpoint in found}
-        return bool(self._known.keys() - before)
+        known = self._since
+        self._endpoints, self._now = list(found), now
+        self._since = {each.gid: known.get(each.gid, now) for each in self._endpoints}
+        return bool(self._since.keys() - known.keys())
 
     def problems(self) -> list[str]:
         """What is wrong with the commanders, a line each."""
         problems = []
         if len(self.names) > 1:
             problems.append(f'{len(self.names)} publish commands: {", ".join(self.names)}')
-        for endpoint in self._known.values():
-            reason = self._deafness(endpoint)
+        for endpoint in self._endpoints:
+            reason = self._why_unheard(endpoint)
             if reason:
                 problems.append(f'{endpoint.topic} of {endpoint.node} is not received: {reason}')
         return problems
 
-    def _deafness(self, endpoint: Endpoint) -> str:
+    def _copies(self, node: str, topic: str) -> int:
+        """How many processes of this name publish a topic.
+
+        One that was killed and its successor count as one.
+        """
+        heard = [
+            self._now - self._since[each.gid]
+            for each in self._endpoints
+            if (each.node, each.topic) == (node, topic) and not self._why_unheard(each)
+        ]
+        return len(heard) if heard and min(heard) > _MEMORY_OF_THE_GRAPH else min(len(heard), 1)
+
+    def _why_unheard(self, endpoint: Endpoint) -> str:
         """Why messages of a publisher never arrive, or ''."""
         if endpoint.type_name != self._type_names[endpoint.topic]:
             return f'its type is {endpoint.type_name}'

@@ -1,4 +1,4 @@
-"""What the ROS graph shows a robot: who commands it, who else publishes time, who hears it."""
+"""What the ROS graph shows a robot: who commands it, who else is like it, who hears it."""
 
 from __future__ import annotations
 
@@ -20,59 +20,89 @@ _SETTLING_TIME = 0.2
 
 
 class GraphWatch:
-    """Looks at the graph when asked to.
+    """Takes in what the graph shows when asked to.
+
+    Args:
+        node: The robot's.
+        spec: Its task.
+        publishers: Its publishers by topic.
 
     Attributes:
         commanders: Who publishes commands.
-        clock_publishers: Nodes that publish `/clock`.
-        has_newcomer: Whether a commander came since this was last set to False.
+        clock_publishers: Other nodes that publish `/clock`, each name once.
+        robots: Nodes that publish the state of a robot under this one's topics, itself included.
+        has_newcomer: Whether a commander or listener came since this was last set to False.
     """
 
-    def __init__(self, node: Node, spec: TaskSpec) -> None:
-        """Looks at nothing yet."""
+    def __init__(self, node: Node, spec: TaskSpec, publishers: Mapping[str, Publisher]) -> None:
         self._node = node
-        self._topics = {
-            node.resolve_topic_name(topic.name): topic.type_name
-            for topic in topics(spec)
-            if topic.direction == 'subscribed' and topic.name.endswith('commands')
+        self._publishers = publishers
+        self._command_topics = {
+            node.resolve_topic_name(each.name): each.type_name
+            for each in topics(spec)
+            if each.direction == 'subscribed' and each.name.endswith('commands')
         }
-        self.commanders = CommanderWatch(self._topics)
+        self.commanders = CommanderWatch(self._command_topics)
         self.clock_publishers: list[str] = []
+        self.robots: list[str] = []
         self.has_newcomer = False
-        self._subscribers: list[int] = []
+        self._listeners = [0 for _ in publishers]
         self._changed_at = 0.0
+        self._status = node.resolve_topic_name('episode_status')
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Takes in what the graph shows now."""
-        found = [endpoint for topic in self._topics for endpoint in self._publishers(topic)]
-        if self.commanders.look(found):
-            self.has_newcomer = True
-            self._changed_at = time.monotonic()
-        self.clock_publishers = sorted(each.node for each in self._publishers('/clock'))
-
-    def is_heard(self, publishers: Mapping[str, Publisher]) -> bool:
-        """Whether everybody who subscribes is connected: only then a message reaches them."""
-        known = [self._node.count_subscribers(each.topic_name) for each in publishers.values()]
         now = time.monotonic()
-        if known != self._subscribers:
-            self._subscribers, self._changed_at = known, now
+        found = [each for topic in self._command_topics for each in self._found(topic)]
+        if self.commanders.update(found, now):
+            self.has_newcomer = True
+            self._changed_at = now
+        me = self._node.get_fully_qualified_name()
+        self.clock_publishers = sorted({each.node for each in self._found('/clock')} - {me})
+        self.robots = sorted(each.node for each in self._found(self._status))
+        self._count_listeners(now)
+
+    def is_heard(self) -> bool:
+        """Whether everybody who subscribes is connected: only then a message reaches them."""
+        now = time.monotonic()
+        self._count_listeners(now)
         if now - self._changed_at < _SETTLING_TIME:
             return False
-        connected = (each.get_subscription_count() for each in publishers.values())
-        return all(have >= want for have, want in zip(connected, known, strict=True))
+        connected = (each.get_subscription_count() for each in self._publishers.values())
+        return all(have >= want for have, want in zip(connected, self._listeners, strict=True))
+
+    def waiting_elsewhere(self) -> list[str]:
+        """Policies that wait for a robot in another namespace than this one's."""
+        return [
+            f'{info.node_namespace.rstrip("/")}/{info.node_name} waits for a robot on {name}'
+            for name, _ in self._node.get_topic_names_and_types()
+            if name.endswith('/episode_status') and name != self._status
+            if not self._node.count_publishers(name)
+            for info in self._node.get_subscriptions_info_by_topic(name)
+        ]
 
     def will_introduce(self) -> bool:
         """Whether somebody publishes `policy_status`."""
         return bool(self._node.count_publishers('policy_status'))
 
-    def _publishers(self, topic: str) -> list[Endpoint]:
+    def _count_listeners(self, now: float) -> None:
+        before = self._listeners
+        self._listeners = [
+            self._node.count_subscribers(each.topic_name) for each in self._publishers.values()
+        ]
+        if self._listeners != before:
+            self._changed_at = now
+            came = (have > had for have, had in zip(self._listeners, before, strict=True))
+            self.has_newcomer |= any(came)
+
+    def _found(self, topic_name: str) -> list[Endpoint]:
         return [
             Endpoint(
                 node=f'{info.node_namespace.rstrip("/")}/{info.node_name}',
-                topic=topic,
+                topic=topic_name,
                 type_name=info.topic_type,
                 is_reliable=info.qos_profile.reliability.name != 'BEST_EFFORT',
                 gid=bytes(info.endpoint_gid),
             )
-            for info in self._node.get_publishers_info_by_topic(topic)
+            for info in self._node.get_publishers_info_by_topic(topic_name)
         ]

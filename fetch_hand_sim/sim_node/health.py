@@ -6,31 +6,35 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from fetch_hand_sim.sim_node.robot import Robot
-from msgs_spec.diagnostics import Increase, Report
+from msgs_spec.diagnostics import Increase, Level, Report
 
 # Where a robot is asked for more than it does by this share, the report warns.
 _RATE_TOLERANCE = 0.05
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Surroundings:
     """What the graph and the disk say.
 
     Attributes:
         commanders: Nodes that publish commands.
-        problems: What is wrong with them.
-        clock_publishers: Nodes that publish `/clock`, this one included.
+        commander_problems: What is wrong with them.
+        robots: Nodes that publish this robot's topics, this one included.
+        waiting_elsewhere: Policies that wait for a robot in another namespace.
+        clock_publishers: Other nodes that publish `/clock`.
         publishes_clock: Whether this node does.
         log: `off`, a directory, or what failed.
         has_log_failed: Whether the log has stopped.
     """
 
-    commanders: Sequence[str]
-    problems: Sequence[str]
-    clock_publishers: Sequence[str]
-    publishes_clock: bool
-    log: str
-    has_log_failed: bool
+    commanders: Sequence[str] = ()
+    commander_problems: Sequence[str] = ()
+    robots: Sequence[str] = ()
+    waiting_elsewhere: Sequence[str] = ()
+    clock_publishers: Sequence[str] = ()
+    publishes_clock: bool = True
+    log: str = 'off'
+    has_log_failed: bool = False
 
 
 @dataclass(slots=True)
@@ -39,21 +43,24 @@ class _Growth:
     simulated: Increase = field(default_factory=Increase)
     missed: Increase = field(default_factory=Increase)
     rejected: Increase = field(default_factory=Increase)
+    far_out: Increase = field(default_factory=Increase)
     goals_rejected: Increase = field(default_factory=Increase)
     diverged: Increase = field(default_factory=Increase)
 
 
 class Health:
-    """Turns a robot's counters into reports; rates are over the time between two of them."""
+    """Turns a robot's counters into reports; rates are over the time between two of them.
+
+    Args:
+        robot: Whose health.
+        name: Fully qualified name of the node.
+        now: Seconds of a steady clock.
+
+    Attributes:
+        real_time_factor: Simulated seconds per second in the last period.
+    """
 
     def __init__(self, robot: Robot, name: str, now: float) -> None:
-        """Starts the first period.
-
-        Args:
-            robot: Whose health.
-            name: Fully qualified name of the node.
-            now: Seconds of a steady clock.
-        """
         self._robot = robot
         self._name = name
         self._then = now
@@ -81,8 +88,12 @@ class Health:
             self._values(rate, surroundings),
             f'{task} {self._state()}, {rate:.1f} ticks per second',
         )
-        self._judge(report, rate, surroundings.commanders)
-        _judge_surroundings(report, surroundings)
+        self._judge_period(report, rate)
+        if surroundings.has_log_failed:
+            report.fail(surroundings.log)
+        report.problems += lasting_problems(robot, surroundings)
+        if robot.misses_commands and robot.schedule.waits_for_commands:
+            report.warn(waiting_line(robot, surroundings))
         return report
 
     def _state(self) -> str:
@@ -94,7 +105,7 @@ class Health:
     def _values(self, rate: float, surroundings: Surroundings) -> dict[str, str]:
         robot = self._robot
         counters, buffer, schedule = robot.counters, robot.buffer, robot.schedule
-        age = robot.command_age()
+        age = buffer.age()
         tick_time = counters.tick_time.milliseconds()
         return {
             'mode': schedule.mode,
@@ -108,6 +119,8 @@ class Health:
             **{f'tick time {name} (ms)': value for name, value in tick_time.items()},
             'command age (s)': '-' if age is None else f'{age:.3f}',
             'commands accepted': str(buffer.accepted),
+            'commands clipped': str(buffer.clipped),
+            'commands far out of range': str(buffer.far_out),
             'commands rejected': str(buffer.rejected.total()),
             **{f'rejected: {reason}': str(n) for reason, n in sorted(buffer.rejected.items())},
             'goals set': str(counters.goals_set),
@@ -120,10 +133,15 @@ class Health:
             'divergences': str(robot.runner.simulation.divergences),
             'log': surroundings.log,
             'commanders': ', '.join(surroundings.commanders) or '-',
-            'clock publishers': ', '.join(surroundings.clock_publishers) or '-',
+            'clock publishers': ', '.join(self._clock_publishers(surroundings)) or '-',
         }
 
-    def _judge(self, report: Report, rate: float, commanders: Sequence[str]) -> None:
+    def _clock_publishers(self, surroundings: Surroundings) -> list[str]:
+        own = [self._name] if surroundings.publishes_clock else []
+        return sorted([*surroundings.clock_publishers, *own])
+
+    def _judge_period(self, report: Report, rate: float) -> None:
+        """Reports what went wrong since the last report."""
         robot, growth = self._robot, self._growth
         diverged = growth.diverged.since(robot.runner.simulation.divergences)
         if diverged:
@@ -139,40 +157,45 @@ class Health:
         rejected = growth.rejected.since(robot.buffer.rejected.total())
         if rejected:
             report.warn(f'{rejected:.0f} commands rejected; {robot.buffer.last_rejection}')
+        far_out = growth.far_out.since(robot.buffer.far_out)
+        if far_out:
+            line = f'{far_out:.0f} commands clipped from far out of range'
+            report.warn(f'{line}; {robot.buffer.last_far_out}')
         goals_rejected = growth.goals_rejected.since(robot.counters.goals_rejected)
         if goals_rejected:
             report.warn(f'{goals_rejected:.0f} goals rejected')
-        if robot.schedule.waits_for_commands and not rate:
-            report.warn(waiting_line(robot, commanders))
 
 
-def _judge_surroundings(report: Report, surroundings: Surroundings) -> None:
-    if surroundings.has_log_failed:
-        report.fail(surroundings.log)
-    for problem in clock_problems(surroundings):
-        report.fail(problem)
-    for problem in surroundings.problems:
-        report.warn(problem)
+def lasting_problems(robot: Robot, surroundings: Surroundings) -> list[tuple[Level, str]]:
+    """What is wrong and stays so until somebody does something; the same words all the time."""
+    problems: list[tuple[Level, str]] = []
+    robots = surroundings.robots
+    if len(robots) > 1:
+        line = f'{len(robots)} publish as one robot: {", ".join(robots)}; start each in a '
+        problems.append((Level.ERROR, f'{line}namespace of its own: --ros-args -r __ns:=/robot2'))
+    elif surroundings.clock_publishers and surroundings.publishes_clock:
+        line = f'/clock comes from {", ".join(surroundings.clock_publishers)} too; start all '
+        problems.append((Level.ERROR, f'{line}robots but one with publish_clock:=false'))
+    problems += [(Level.WARN, line) for line in surroundings.commander_problems]
+    if robot.misses_commands and not robot.schedule.waits_for_commands:
+        does = 'holds' if robot.buffer.timeout else 'repeats the last one'
+        who = _who_commands(surroundings)
+        problems.append((Level.WARN, f'commands have stopped, the robot {does}; {who}'))
+    return problems
 
 
-def clock_problems(surroundings: Surroundings) -> list[str]:
-    """What to say of several sources of time."""
-    clocks = surroundings.clock_publishers
-    if len(clocks) < 2 or not surroundings.publishes_clock:
-        return []
-    return [
-        f'/clock has {len(clocks)} publishers: {", ".join(clocks)}; start all robots but one with '
-        'publish_clock:=false'
-    ]
-
-
-def waiting_line(robot: Robot, commanders: Sequence[str]) -> str:
-    """What a robot in lockstep waits for."""
-    tick = robot.runner.tick + 1
-    what = f'tick {tick} of episode {robot.runner.episode}'
-    if robot.runner.is_between_episodes:
-        what = f'the start of episode {robot.runner.episode}'
-    who = f'{", ".join(commanders)} sends none' if commanders else 'nobody publishes any'
-    text = f'{what} waits for a valid command; {who}'
+def waiting_line(robot: Robot, surroundings: Surroundings) -> str:
+    """What a robot that needs a command waits for."""
+    runner = robot.runner
+    what = f'tick {runner.tick + 1} of episode {runner.episode}'
+    if runner.is_between_episodes:
+        what = f'the start of episode {runner.episode}'
+    text = f'{what} waits for a valid command; {_who_commands(surroundings)}'
     rejected = robot.buffer.last_rejection
     return f'{text}; the last one was refused: {rejected}' if rejected else text
+
+
+def _who_commands(surroundings: Surroundings) -> str:
+    if surroundings.commanders:
+        return f'{", ".join(surroundings.commanders)} sends none'
+    return '; '.join(['nobody publishes any', *surroundings.waiting_elsewhere])

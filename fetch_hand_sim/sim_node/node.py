@@ -12,6 +12,7 @@ from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
 from fetch_hand_sim.episode_log import EpisodeLogError, find_leftovers
@@ -21,7 +22,7 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node import NODE_NAME
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
-from fetch_hand_sim.sim_node.health import Health, Surroundings, clock_problems, waiting_line
+from fetch_hand_sim.sim_node.health import Health, Surroundings, lasting_problems, waiting_line
 from fetch_hand_sim.sim_node.pacing import RealTimePacer
 from fetch_hand_sim.sim_node.receivers import Receivers
 from fetch_hand_sim.sim_node.robot import Messages, Robot
@@ -41,7 +42,7 @@ from msgs_spec.ros import (
     ros_message_class,
     set_callback,
 )
-from msgs_spec.tick import Tick
+from msgs_spec.tick import EpisodeStatus, Tick
 from msgs_spec.topics import DIAGNOSTICS, MONITORING, REAL_TIME_FACTOR, topics
 
 _WARN_PERIOD = 1.0
@@ -51,7 +52,7 @@ _BEAT_TIME = 0.01
 _SERVED_FIRST = 100
 # Seconds a robot waits for the name of a commander who is about to give it.
 _INTRODUCTION_TIME = 1.0
-# Seconds a robot waits in lockstep before it says so, and between two lines about it.
+# Seconds between two lines about what a robot waits for, and before the first command of all.
 _WAITING_PERIOD = 5.0
 _LAST_WORDS_TIMEOUT = 1.0
 
@@ -67,16 +68,19 @@ class SimNode(Node):
         """
         super().__init__(NODE_NAME)
         self._settings = declare_parameters(self, SIM_NODE)
+        self._refuse_simulated_time()
         self._robot = self._make_robot()
         self._recording_context: RecordingContext | None = None
         self._recorder = self._make_recorder()
-        self._watch = GraphWatch(self, self._robot.runner.spec)
         self._outputs = self._open_topics()
+        self._watch = GraphWatch(self, self._robot.runner.spec, self._outputs)
         open_services(self, self._robot)
         now = time.monotonic()
         self._health = Health(self._robot, self.get_fully_qualified_name(), now)
         self._factor_codec = TopicCodec(REAL_TIME_FACTOR)
         self._said: set[str] = set()
+        self._has_said_far_out = False
+        self._commanders: list[str] = []
         self._has_introduction = False
         self._beat_due = self._ticked_at = now
         self._report_due = now + REPORT_PERIOD
@@ -84,6 +88,14 @@ class SimNode(Node):
         self.add_post_set_parameters_callback(self._apply_changes)
 
     # Set-up
+
+    def _refuse_simulated_time(self) -> None:
+        """Goes on in wall time where a launch file tells all nodes to use simulated time."""
+        if self.get_parameter('use_sim_time').value:
+            self.set_parameters([Parameter('use_sim_time', value=False)])
+            self.get_logger().warning(
+                'use_sim_time is set back to false: sim_node makes simulated time and follows none'
+            )
 
     def _make_robot(self) -> Robot:
         values = self._settings
@@ -156,6 +168,7 @@ class SimNode(Node):
     def run(self, stop: StopSignals) -> None:
         """Runs episodes until all are done or the signals say stop."""
         loop = EventLoop(self)
+        self.get_logger().info(self._introduction())
         try:
             self._publish(self._robot.waiting_status())
             if self._settings['wait_for_commands']:
@@ -170,12 +183,26 @@ class SimNode(Node):
             self._close(stop)
             loop.close()
 
+    def _introduction(self) -> str:
+        """What is simulated, how fast, where to find it and who is to command it."""
+        values = self._settings
+        pace = 'as fast as possible'
+        if values['mode'] == 'lockstep':
+            pace = 'in lockstep'
+        elif values['real_time_factor']:
+            pace = f'at {values["real_time_factor"]:g} x real time'
+        return (
+            f'{values["task"]}, {values["control_hz"]:g} ticks per simulated second, {pace}; '
+            f'topics in {self.get_namespace()}; log: {values["episode_dir"] or "off"}; '
+            + ('waits for commands' if values['wait_for_commands'] else 'nobody commands yet')
+        )
+
     def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
         """Lets nothing move until there is a commander who hears everything."""
         watch = self._watch
-        while not stop and not (watch.commanders.names and watch.is_heard(self._outputs)):
+        while not stop and not (watch.commanders.names and watch.is_heard()):
             loop.wait(BEAT)
-            watch.look()
+            watch.update()
             self._beat_when_due()
         # Latched, so it comes a little after its publisher is seen; the log names who commands.
         end = time.monotonic() + _INTRODUCTION_TIME
@@ -211,26 +238,36 @@ class SimNode(Node):
             self._report(now)
 
     def _stand_still(self, now: float) -> None:
-        """Keeps time alive without ticks; lets a commander who came too late hear the last one."""
+        """Keeps time alive without ticks; lets whoever comes late hear the last one."""
         robot, watch = self._robot, self._watch
-        if robot.schedule.is_paused or not robot.runner.has_started:
+        has_started = robot.runner.has_started
+        if robot.schedule.is_paused or not has_started:
             self._publish([robot.clock_message()])
-        elif robot.schedule.waits_for_commands:
-            watch.look()
-            if watch.has_newcomer and watch.is_heard(self._outputs):
+        is_waiting = robot.schedule.waits_for_commands and robot.misses_commands
+        if robot.stands_still:
+            watch.update()
+            if watch.has_newcomer and watch.is_heard():
                 watch.has_newcomer = False
-                self._publish(robot.present())
-            if now - self._ticked_at > _WAITING_PERIOD:
-                line = waiting_line(robot, watch.commanders.names)
-                self.get_logger().warning(line, throttle_duration_sec=_WAITING_PERIOD)
+                self._publish(robot.last_messages)
+        elif not has_started:
+            is_waiting = now - self._ticked_at > _WAITING_PERIOD
+        if is_waiting:
+            line = waiting_line(robot, self._surroundings())
+            self.get_logger().warning(line, throttle_duration_sec=_WAITING_PERIOD)
 
     def _emit(self, tick: Tick, messages: Messages) -> None:
-        if self._watch.has_newcomer and self._watch.is_heard(self._outputs):
+        if self._watch.has_newcomer and self._watch.is_heard():
             self._watch.has_newcomer = False
         self._publish(messages)
         if self._recorder is not None:
             self._recorder.record(tick, messages)
-        if tick.status.phase == 'finished' and self._robot.runner.has_diverged:
+        if tick.status.phase == 'finished':
+            self._report_episode(tick.status)
+
+    def _report_episode(self, status: EpisodeStatus) -> None:
+        if self._recorder is None:
+            self.get_logger().info(_episode_line(status))
+        if self._robot.runner.has_diverged:
             count = self._robot.runner.simulation.divergences
             self.get_logger().error(
                 f'MuJoCo reports divergence; the episode ends early (so far {count} times)'
@@ -255,42 +292,47 @@ class SimNode(Node):
     # Reports
 
     def _report(self, now: float) -> None:
-        self._watch.look()
+        self._watch.update()
         surroundings = self._surroundings()
         report = self._health.report(surroundings, now)
         self._say_news(surroundings)
-        stamp_ns = self.get_clock().now().nanoseconds
         factor = self._factor_codec.encode(0, [self._health.real_time_factor])
-        self._publish([(DIAGNOSTICS, encode_reports(stamp_ns, [report]))])
+        self._publish([(DIAGNOSTICS, encode_reports(time.time_ns(), [report]))])
         self._publish([(REAL_TIME_FACTOR, factor)])
 
     def _surroundings(self) -> Surroundings:
-        recorder, directory = self._recorder, self._settings['episode_dir']
+        recorder, directory, watch = self._recorder, self._settings['episode_dir'], self._watch
         has_failed = recorder is not None and recorder.has_failed
+        names = watch.commanders.names
         return Surroundings(
-            commanders=self._watch.commanders.names,
-            problems=self._watch.commanders.problems(),
-            clock_publishers=self._watch.clock_publishers,
+            commanders=names,
+            commander_problems=watch.commanders.problems(),
+            robots=watch.robots,
+            waiting_elsewhere=watch.waiting_elsewhere() if not names else [],
+            clock_publishers=watch.clock_publishers,
             publishes_clock=self._settings['publish_clock'],
             log=f'logging to {directory} has failed' if has_failed else directory or 'off',
             has_log_failed=has_failed,
         )
 
     def _say_news(self, surroundings: Surroundings) -> None:
-        """Logs each problem once when it begins."""
-        problems = {*surroundings.problems, *clock_problems(surroundings)}
+        """Logs who commands when it changes, and each problem once when it begins."""
+        if surroundings.commanders != self._commanders:
+            self._commanders = list(surroundings.commanders)
+            names = ', '.join(self._commanders) or 'nobody any more'
+            self.get_logger().info(f'commands come from {names}')
+        if self._robot.buffer.far_out and not self._has_said_far_out:
+            self._has_said_far_out = True
+            line = self._robot.buffer.last_far_out
+            self.get_logger().warning(f'command clipped from far out of range: {line}')
+        problems = {line for _, line in lasting_problems(self._robot, surroundings)}
         for line in sorted(problems - self._said):
             self.get_logger().warning(line)
         self._said = problems
 
     def _on_logged(self, episode: LoggedEpisode) -> None:
-        status = episode.status
-        outcome = 'success' if status.is_success else 'failure'
-        self.get_logger().info(
-            f'episode {status.episode} seed {status.seed}: {status.tick} steps, return '
-            f'{status.episode_return:g}, {outcome if episode.is_complete else "cut short"}, '
-            f'{episode.path}'
-        )
+        end = '' if episode.is_complete else ', cut short'
+        self.get_logger().info(f'{_episode_line(episode.status)}{end}, {episode.path}')
 
     # Callbacks
 
@@ -311,3 +353,10 @@ class SimNode(Node):
                 self._robot.runner.set_next_seed(int(change.value))
             elif change.name == 'command_timeout':
                 self._robot.buffer.timeout = float(change.value)
+
+
+def _episode_line(status: EpisodeStatus) -> str:
+    return (
+        f'episode {status.episode} seed {status.seed}: {status.tick} steps, return '
+        f'{status.episode_return:g}, {"success" if status.is_success else "failure"}'
+    )

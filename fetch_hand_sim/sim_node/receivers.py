@@ -1,11 +1,12 @@
-"""What the robot does with the messages it receives; nothing here needs rclpy."""
+"""What the robot does with the bytes it receives; nothing here needs rclpy."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from fetch_hand_sim.sim_node.command_buffer import CommandRejected
+from fetch_hand_sim.episode_log.limits import MAX_MESSAGE_BYTES
 from fetch_hand_sim.sim_node.robot import Robot
 from msgs_spec.codecs import decode_status
 from msgs_spec.schemas import deserialize, serialize
@@ -20,7 +21,17 @@ class ReceivedLog(Protocol):
 
 
 class Receivers:
-    """Hands received messages to a robot; what it refuses is said and counted, never raised."""
+    """Hands received messages to a robot; what it refuses is said and counted, never raised.
+
+    The log gets every message that can be read, also a command that is refused. Bytes that are no
+    message of their type, or more of them than a reader of logs takes, are dropped before.
+
+    Args:
+        robot: Gets commands and goals.
+        log: Gets messages; None for none.
+        on_commander: Gets the SHA-256 of the commander's checkpoint, None if it has none.
+        warn: Gets a line about what was refused; expected to throttle.
+    """
 
     def __init__(
         self,
@@ -29,22 +40,16 @@ class Receivers:
         on_commander: Callable[[str | None], None],
         warn: Callable[[str], None],
     ) -> None:
-        """Connects.
-
-        Args:
-            robot: Gets commands and goals.
-            log: Gets every message; None for none.
-            on_commander: Gets the SHA-256 of the commander's checkpoint, None if it has none.
-            warn: Gets a line about what was refused; expected to throttle.
-        """
         self._robot = robot
         self._log = log
         self._on_commander = on_commander
         self._warn = warn
         self._handlers: dict[str, Callable[[TopicSpec, Any], None]] = {
-            'commands': self._command,
-            'joint_commands': self._joint_command,
-            'set_goal': self._goal,
+            'commands': lambda spec, message: robot.buffer.accept(message.data),
+            'joint_commands': lambda spec, message: robot.buffer.accept_named(
+                message.name, message.position
+            ),
+            'set_goal': robot.set_goal,
             'policy_status': self._policy_status,
         }
 
@@ -53,46 +58,39 @@ class Receivers:
         handle = self._handlers[spec.name]
 
         def on_message(data: bytes) -> None:
-            try:
-                message = deserialize(spec.type_name, data)
-            except ValueError as error:
-                self._drop(spec, error)
+            message = self._read(spec, data)
+            if message is None:
                 return
             if self._log is not None:
                 # Serialised again, because senders leave the bytes between fields uninitialised.
                 self._log.record_received(spec, serialize(spec.type_name, message))
-            handle(spec, message)
+            try:
+                handle(spec, message)
+            except ValueError as error:
+                self._warn(f'{spec.name} dropped: {error}')
 
         return on_message
 
-    def _drop(self, spec: TopicSpec, error: ValueError) -> None:
-        """Counts bytes that are no message."""
+    def _read(self, spec: TopicSpec, data: bytes) -> Any:
+        """The message, or None after a line and a count where there is none."""
+        if len(data) > MAX_MESSAGE_BYTES:
+            line = f'{len(data)} bytes given; allowed: up to {MAX_MESSAGE_BYTES}'
+            return self._drop(spec, 'too long', line)
+        try:
+            return deserialize(spec.type_name, data)
+        except ValueError as error:
+            return self._drop(spec, 'unreadable', str(error))
+
+    def _drop(self, spec: TopicSpec, reason: str, line: str) -> None:
         if spec.name == 'set_goal':
             self._robot.counters.goals_rejected += 1
         elif spec.name != 'policy_status':
-            self._robot.buffer.rejected['unreadable'] += 1
-        self._warn(f'{spec.name} dropped: {error}')
-
-    def _command(self, spec: TopicSpec, message: Any) -> None:
-        del spec
-        try:
-            self._robot.accept_command(message.data)
-        except CommandRejected as error:
-            self._warn(str(error))
-
-    def _joint_command(self, spec: TopicSpec, message: Any) -> None:
-        del spec
-        try:
-            self._robot.accept_named_command(message.name, message.position)
-        except CommandRejected as error:
-            self._warn(str(error))
-
-    def _goal(self, spec: TopicSpec, message: Any) -> None:
-        try:
-            self._robot.set_goal(spec, message)
-        except ValueError as error:
-            self._warn(f'goal dropped: {error}')
+            self._robot.buffer.count_rejection(reason, line)
+        self._warn(f'{spec.name} dropped: {line}')
 
     def _policy_status(self, spec: TopicSpec, message: Any) -> None:
         del spec
-        self._on_commander(decode_status(message).get('checkpoint_sha256') or None)
+        sha256 = decode_status(message).get('checkpoint_sha256') or None
+        if sha256 and not re.fullmatch('[0-9a-f]{64}', sha256):
+            raise ValueError(f'checkpoint_sha256 {sha256[:40]!r} given; allowed: 64 hex digits')
+        self._on_commander(sha256)

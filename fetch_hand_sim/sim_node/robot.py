@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
-
-from numpy.typing import ArrayLike
 
 from fetch_hand_sim.episodes.goals import accept_goal
 from fetch_hand_sim.episodes.runner import EpisodeRunner
@@ -19,6 +18,11 @@ from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import TopicSpec
 
 Messages = list[tuple[TopicSpec, bytes]]
+
+# Seconds within which a commander answers a tick.
+_ANSWER_TIME = 0.2
+# Seconds without a command, where there should be one, that pass without a word.
+_LONGEST_SILENCE = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +57,22 @@ class Counters:
 
 
 class Robot:
-    """Ticks when they are due, and does what services and topics ask for."""
+    """Ticks when they are due, and does what services and topics ask for.
+
+    Args:
+        runner: Makes the ticks.
+        buffer: Says what they apply.
+        schedule: Says when they are due.
+        emit: Gets every tick with its messages.
+        clock: A steady clock, seconds.
+
+    Attributes:
+        runner: As above.
+        buffer: As above.
+        schedule: As above.
+        counters: What the robot has done.
+        last_messages: Those of the last tick; whoever hears them again can tell by the stamp.
+    """
 
     def __init__(
         self,
@@ -63,15 +82,6 @@ class Robot:
         emit: Callable[[Tick, Messages], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Prepares the first episode.
-
-        Args:
-            runner: Makes the ticks.
-            buffer: Says what they apply.
-            schedule: Says when they are due.
-            emit: Gets every tick with its messages.
-            clock: A steady clock, seconds.
-        """
         self.runner = runner
         self.buffer = buffer
         self.schedule = schedule
@@ -79,12 +89,36 @@ class Robot:
         self._emit = emit
         self._clock = clock
         self._encoder = TickEncoder(runner.spec)
-        self._present: Messages = []
+        self.last_messages: Messages = []
+        self._ticked_at = -math.inf
+        self._reset_due: float | None = None
 
     def wait(self) -> float:
         """Seconds until the next tick is due; the first reset needs no command."""
+        now = self._clock()
         has_command = self.buffer.has_fresh_command or not self.runner.has_started
-        return self.schedule.wait(self._clock(), has_command)
+        wait = self.schedule.wait(now, has_command)
+        return wait if self._reset_due is None else min(wait, max(0.0, self._reset_due - now))
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether only a person or a command brings the next tick."""
+        waits = self.schedule.waits_for_commands and self.runner.has_started
+        return self.schedule.is_paused or waits
+
+    @property
+    def misses_commands(self) -> bool:
+        """Whether a second or more has passed without a command that is due.
+
+        That is one for the next tick in lockstep, and any where there was one before.
+        """
+        schedule = self.schedule
+        if schedule.is_paused or not self.runner.has_started:
+            return False
+        if schedule.mode == 'lockstep':
+            return self._clock() - self._ticked_at > _LONGEST_SILENCE
+        silence = max(_LONGEST_SILENCE, self.buffer.timeout, 2.0 * schedule.pacer.period)
+        return (self.buffer.age() or 0.0) > silence
 
     def tick_when_due(self) -> None:
         """Runs the tick that `wait` says is due."""
@@ -94,27 +128,21 @@ class Robot:
     def tick(self) -> None:
         """Applies the latest command, advances by one tick and emits it."""
         began = self._clock()
-        tick = self.runner.advance(self.buffer.take(began).values)
+        tick = self.runner.advance(self.buffer.take())
         phase = tick.status.phase
         messages = self._encoder.encode(tick, latched=phase != 'running')
         self._emit(tick, messages)
-        self._present = messages
+        self.last_messages = messages
+        self._ticked_at, self._reset_due = self._clock(), None
         if phase == 'reset':
             self.buffer.start_episode(self.runner.resting_command())
         elif phase == 'finished':
             self.counters.episodes += 1
             self.counters.successes += tick.status.is_success
         self.counters.ticks += 1
-        self.counters.tick_time.add(self._clock() - began)
+        self.counters.tick_time.add(self._ticked_at - began)
 
-    # What the network may ask to hear again
-
-    def present(self) -> Messages:
-        """The messages of the present tick once more, for a commander who was not there.
-
-        They carry the same stamp and the same bytes, so whoever has seen them can tell.
-        """
-        return list(self._present)
+    # What a robot that stands still says
 
     def waiting_status(self) -> Messages:
         """`/clock` and `episode_status` of a robot that has not started."""
@@ -125,24 +153,6 @@ class Robot:
     def clock_message(self) -> tuple[TopicSpec, bytes]:
         """`/clock` of a robot that stands still."""
         return self._encoder.encode_clock(self.runner.stamp_ns)
-
-    # Commands and goals
-
-    def accept_command(self, values: ArrayLike) -> None:
-        """Takes a command of all values.
-
-        Raises:
-            CommandRejected: If it is not valid.
-        """
-        self.buffer.accept(values, self._clock())
-
-    def accept_named_command(self, names: Sequence[str], positions: ArrayLike) -> None:
-        """Takes a command that names joints.
-
-        Raises:
-            CommandRejected: If it is not valid.
-        """
-        self.buffer.accept_named(names, positions, self._clock())
 
     def set_goal(self, topic: TopicSpec, message: Any) -> None:
         """Replaces the goal of the running episode from the next tick on.
@@ -161,35 +171,45 @@ class Robot:
             raise
         self.counters.goals_set += 1
 
-    def command_age(self) -> float | None:
-        """Seconds since the last valid command of this episode."""
-        return self.buffer.age(self._clock())
-
     # Services and parameters
 
-    def reset(self) -> Answer:
-        """Gives the running episode up."""
-        episode = self.runner.episode
-        if self.runner.is_between_episodes:
-            return Answer(True, f'episode {episode} is about to start anyway')
-        self.runner.end_episode()
-        self.counters.given_up += 1
-        if self.runner.is_done:
-            return Answer(True, f'episode {episode} ends; it was the last')
-        starts = f'starts episode {self.runner.episode} with seed {self.runner.seed}'
-        if self.schedule.is_paused:
-            return Answer(True, f'episode {episode} ends; the next step {starts}')
-        if self.schedule.waits_for_commands:
-            return Answer(True, f'episode {episode} ends; the next command {starts}')
-        return Answer(True, f'episode {episode} ends; the next tick {starts}')
+    def reset(self, *, to_first_episode: bool = False) -> Answer:
+        """Gives the running episode up; a robot that stands still begins the next one by itself.
+
+        Args:
+            to_first_episode: Whether to begin the whole series again, not only the next episode.
+        """
+        runner = self.runner
+        episode, was_running = runner.episode, not runner.is_between_episodes
+        if was_running:
+            runner.end_episode()
+            self.counters.given_up += 1
+        if to_first_episode:
+            runner.start_over()
+        ends = f'episode {episode} ends' if was_running else 'no episode is running'
+        if runner.is_done:
+            return Answer(True, f'{ends}; it was the last')
+        starts = f'starts episode {runner.episode} with seed {runner.seed}'
+        if not self.stands_still:
+            return Answer(True, f'{ends}; the next tick {starts}')
+        self._reset_due = self._time_of_silence()
+        return Answer(True, f'{ends}; a tick of its own {starts}')
+
+    def _time_of_silence(self) -> float:
+        """When no command is on its way that answers the last tick.
+
+        Such a command would otherwise count for the state after the reset, and its commander be a
+        tick behind from then on.
+        """
+        is_answered = self.schedule.is_paused or self.buffer.has_fresh_command
+        return self._clock() if is_answered else self._ticked_at + _ANSWER_TIME
 
     def pause(self, paused: bool) -> Answer:
         """Stops ticks and simulated time, or goes on."""
         if paused == self.schedule.is_paused:
             return Answer(True, 'already paused' if paused else 'already running')
         self.schedule.set_paused(paused, self._clock())
-        seconds = self.runner.stamp_ns * 1e-9
-        return Answer(True, f'{"paused" if paused else "running"} at {seconds:.3f} s')
+        return Answer(True, f'{"paused" if paused else "running"} at {self._now()}')
 
     def step(self, ticks: int = 1) -> Answer:
         """Runs ticks at once."""
@@ -201,8 +221,11 @@ class Robot:
             if self.runner.is_done:
                 return Answer(False, f'all episodes are done; {done} of {ticks} ticks ran')
             self.tick()
-        return Answer(True, f'{ticks} run, now at {self.runner.stamp_ns * 1e-9:.3f} s')
+        return Answer(True, f'{ticks} run, now at {self._now()}')
 
     def set_real_time_factor(self, factor: float) -> None:
         """Changes the pace from now on."""
         self.schedule.set_real_time_factor(factor, self._clock())
+
+    def _now(self) -> str:
+        return f'{self.runner.stamp_ns * 1e-9:.3f} s'

@@ -12,7 +12,8 @@ from typing import Any
 from fetch_hand_sim.sim_node.robot import Answer, Robot
 
 PLAYING, PAUSED = 1, 2
-SCOPE_DEFAULT, SCOPE_STATE = 0, 2
+# The default is to reset all.
+SCOPE_DEFAULT, SCOPE_STATE, SCOPE_ALL = 0, 2, 255
 FEATURE_UNSUPPORTED, OK, OPERATION_FAILED = 0, 1, 4
 ALREADY_IN_TARGET_STATE = 101
 
@@ -66,12 +67,13 @@ class SimulationInterfaces:
         return _finish(response, ALREADY_IN_TARGET_STATE if is_there else OK, answer.message)
 
     def reset_simulation(self, request: Any, response: Any) -> Any:
-        """Ends the episode; the scene is the state, and time is never set back."""
-        if request.scope not in (SCOPE_DEFAULT, SCOPE_STATE):
-            line = f'scope {request.scope} asked for; allowed: {SCOPE_DEFAULT} (default), '
-            line += f'{SCOPE_STATE} (state): time never goes back and nothing is spawned'
+        """Ends the episode (state) or begins the series again (all); time is never set back."""
+        if request.scope not in (SCOPE_DEFAULT, SCOPE_STATE, SCOPE_ALL):
+            line = f'scope {request.scope} asked for; allowed: {SCOPE_STATE} (state), '
+            line += f'{SCOPE_DEFAULT} and {SCOPE_ALL} (all but time, which never goes back)'
             return _finish(response, FEATURE_UNSUPPORTED, line)
-        return _answer(response, self._robot.reset())
+        answer = self._robot.reset(to_first_episode=request.scope != SCOPE_STATE)
+        return _answer(response, answer)
 
     def step_simulation(self, request: Any, response: Any) -> Any:
         """Runs the given number of ticks, which are control periods, while paused."""

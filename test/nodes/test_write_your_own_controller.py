@@ -7,10 +7,9 @@ import re
 import sys
 
 import pytest
-from test_nodes import episodes_in, finish
 
 from support import ROOT
-from support.graph import SIM_NODE, ros_args
+from support.graph import SIM_NODE, episodes_in, finish, ros_args
 
 PAGE = ROOT / 'docs' / 'write_your_own_controller.md'
 

@@ -1,4 +1,4 @@
-"""Launch file, parameter file and nodes agree; discovery stays on this machine unless asked."""
+"""Launch file, parameter files and nodes agree; discovery stays on this machine unless asked."""
 
 from __future__ import annotations
 
@@ -7,40 +7,105 @@ import re
 import xml.etree.ElementTree as ElementTree
 
 import pytest
+import rclpy
 import yaml
 
 from msgs_spec.parameters import POLICY_NODE, SIM_NODE, validate
-from msgs_spec.ros import keep_discovery_local
+from msgs_spec.ros import declare_parameters, keep_discovery_local
 from support import ROOT
 
 SPECS = {'sim_node': SIM_NODE, 'policy_node': POLICY_NODE}
 LAUNCH = ElementTree.parse(ROOT / 'launch' / 'demo.launch.xml').getroot()
-ARGUMENTS = {arg.get('name'): arg.get('default') for arg in LAUNCH.findall('arg')}
+DEFAULTS = {arg.get('name'): arg.get('default') for arg in LAUNCH.findall('arg')}
+GROUPS = {group.find('node').get('exec'): group for group in LAUNCH.findall('group')}
+SHARE = '$(find-pkg-share fetch_hand_sim)'
 
 
-def resolved(value: str) -> str:
-    """A value of the launch file with the defaults of its arguments."""
-    return re.sub(r'\$\(var (\w+)\)', lambda match: ARGUMENTS[match[1]], value)
+def resolved(text: str, arguments: dict[str, str]) -> str:
+    """A value of the launch file, with its substitutions made."""
+    text = re.sub(r'\$\(var (\w+)\)', lambda match: (DEFAULTS | arguments)[match[1]], text)
+    return text.replace(SHARE, str(ROOT))
 
 
-@pytest.mark.parametrize('node', LAUNCH.findall('node'), ids=lambda node: node.get('exec'))
-def test_launched_nodes_get_parameters_they_have(node):
-    specs = {spec.name: spec for spec in SPECS[node.get('exec')]}
-    assert node.get('name') == node.get('exec')
-    given = {p.get('name'): p.get('value') for p in node.findall('param') if p.get('name')}
-    assert given
-    for name, value in given.items():
-        # launch reads a value as YAML.
-        validate(specs[name], yaml.safe_load(resolved(value)))
+def is_meant(action: ElementTree.Element, arguments: dict[str, str]) -> bool:
+    """What `if` says; its one form here is `not-equals`."""
+    condition = action.get('if')
+    if condition is None:
+        return True
+    (operands,) = re.findall(r'^\$\(not-equals (\S+ \S*)\)$', resolved(condition, arguments))
+    left, _, right = operands.partition(' ')
+    return left != right
+
+
+def node_arguments(node: str, **arguments: str) -> list[str]:
+    """The command line that ros2 launch makes of a group: its actions in their order."""
+    words = ['--ros-args']
+    for action in GROUPS[node]:
+        if action.tag == 'node' or not is_meant(action, arguments):
+            continue
+        if action.tag == 'set_parameters_from_file':
+            words += ['--params-file', resolved(action.get('filename'), arguments)]
+        else:
+            value = resolved(action.get('value'), arguments)
+            words += ['-p', f'{action.get("name")}:={value}']
+    return words
+
+
+def parameters_of(node: str, **arguments: str) -> dict[str, object]:
+    """The parameters with which a launched node runs."""
+    rclpy.init(args=node_arguments(node, **arguments))
+    try:
+        launched = rclpy.create_node(node)
+        return declare_parameters(launched, SPECS[node])
+    finally:
+        rclpy.shutdown()
+
+
+def test_without_arguments_the_demo_runs():
+    values = parameters_of('sim_node')
+    assert (values['task'], values['episodes'], values['episode_dir']) == (
+        'FetchReach',
+        5,
+        'episodes',
+    )
+    assert values['wait_for_commands'] is True
+    assert parameters_of('policy_node') == {spec.name: spec.default for spec in POLICY_NODE}
+
+
+def test_arguments_that_are_not_given_leave_a_params_file_as_it_is(tmp_path):
+    mine = {
+        'task': 'FetchPush',
+        'episodes': 2,
+        'mode': 'lockstep',
+        'episode_dir': 'mine',
+        'wait_for_commands': False,
+        'publish_clock': False,
+    }
+    path = tmp_path / 'my.yaml'
+    path.write_text(yaml.safe_dump({'/**/sim_node': {'ros__parameters': mine}}))
+    values = parameters_of('sim_node', params_file=str(path))
+    assert {name: values[name] for name in mine} == mine
+    values = parameters_of('sim_node', params_file=str(path), task='HandReach', episodes='0')
+    assert {name: values[name] for name in mine} == mine | {'task': 'HandReach', 'episodes': 0}
+
+
+def test_every_argument_replaces_what_it_names():
+    given = {'task': 'HandReach', 'episodes': '7', 'mode': 'lockstep', 'episode_dir': 'there'}
+    values = parameters_of('sim_node', **given, publish_clock='false')
+    assert {name: str(values[name]) for name in given} == given
+    assert values['publish_clock'] is False
+    assert parameters_of('policy_node', task='HandReach')['task'] == 'HandReach'
 
 
 def test_launch_file_starts_what_setup_py_installs():
-    text = (ROOT / 'setup.py').read_text()
-    for node in LAUNCH.findall('node'):
-        assert re.search(rf"'{node.get('exec')} = [\w.]+:main'", text)
-        assert resolved(node.get('namespace')) == ''
-    used = set(re.findall(r'\$\(var (\w+)\)', (ROOT / 'launch/demo.launch.xml').read_text()))
-    assert used == set(ARGUMENTS)
+    setup, text = ((ROOT / name).read_text() for name in ('setup.py', 'launch/demo.launch.xml'))
+    for name, group in GROUPS.items():
+        node = group.find('node')
+        assert node.get('name') == name
+        assert re.search(rf"'{name} = [\w.]+:main'", setup)
+        assert resolved(node.get('namespace'), {}) == ''
+    assert set(re.findall(r'\$\(var (\w+)\)', text)) == set(DEFAULTS)
+    assert set(DEFAULTS.values()) == {''}
     assert all(arg.get('description') for arg in LAUNCH.findall('arg'))
 
 
@@ -53,6 +118,25 @@ def test_parameter_file_holds_the_defaults(node):
     assert {name: type(value) for name, value in given.items()} == {
         name: type(value) for name, value in wanted.items()
     }
+
+
+def test_parameter_file_of_the_demo_holds_what_the_node_takes():
+    nodes = yaml.safe_load((ROOT / 'config' / 'demo.yaml').read_text())
+    specs = {spec.name: spec for spec in SIM_NODE}
+    for name, value in nodes['/**/sim_node']['ros__parameters'].items():
+        validate(specs[name], value)
+        assert value != specs[name].default
+
+
+@pytest.mark.parametrize('page', ['README.md', 'docs/write_your_own_controller.md'])
+def test_a_page_that_starts_a_robot_and_then_who_commands_it_lets_the_robot_wait(page):
+    """A policy takes seconds to load, in which a robot that does not wait fails its episodes."""
+    robots = re.findall(
+        r'ros2 run fetch_hand_sim sim_node(.*)\n.*(?:policy_node|controller)',
+        (ROOT / page).read_text(),
+    )
+    assert robots
+    assert all('-p wait_for_commands:=true' in arguments for arguments in robots)
 
 
 @pytest.mark.parametrize(('before', 'after'), [(None, 'LOCALHOST'), ('SUBNET', 'SUBNET')])

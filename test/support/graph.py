@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 
-from msgs_spec.codecs import decode_status
+from fetch_hand_sim.episode_log import Episode, read_episode
+from msgs_spec.codecs import decode_status, message_stamp
 from msgs_spec.qos import rclpy_profile
 from msgs_spec.ros import ros_message_class
 from msgs_spec.tasks import TaskSpec
@@ -22,6 +27,7 @@ from msgs_spec.topics import MONITORING, TopicSpec, topic, topics
 SIM_NODE = (sys.executable, '-m', 'fetch_hand_sim.sim_node')
 POLICY_NODE = (sys.executable, '-m', 'policy_node.node')
 TIMEOUT = 30.0
+Start = Callable[..., subprocess.Popen[str]]
 
 
 def ros_args(**parameters: object) -> list[str]:
@@ -31,6 +37,34 @@ def ros_args(**parameters: object) -> list[str]:
         text = str(value).lower() if isinstance(value, bool) else str(value)
         words += ['-p', f'{name}:={text}']
     return words
+
+
+def finish(process: subprocess.Popen[str], timeout: float = TIMEOUT) -> tuple[int, str]:
+    """Waits for a process; returns its exit code and all it printed."""
+    output, errors = process.communicate(timeout=timeout)
+    return process.returncode, output + errors
+
+
+def end(process: subprocess.Popen[str]) -> str:
+    """Ends a node as Ctrl-C does; returns what it printed."""
+    process.send_signal(signal.SIGINT)
+    code, output = finish(process)
+    assert code == 0, output
+    assert 'Traceback' not in output
+    return output
+
+
+def episodes_in(directory: Path) -> list[Episode]:
+    """The finished episodes of a directory, in order."""
+    return [read_episode(path) for path in sorted(directory.iterdir()) if path.name[0] != '.']
+
+
+def payload(episode: Episode) -> dict[str, list[tuple[int, int, bytes]]]:
+    """Everything the messages of an episode consist of."""
+    return {
+        name: [(m.log_time_ns, m.sequence, m.data) for m in logged.messages]
+        for name, logged in episode.topics.items()
+    }
 
 
 class Client:
@@ -44,6 +78,7 @@ class Client:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._publishers: dict[str, Any] = {}
+        self._service_clients: dict[str, Any] = {}
 
     def subscribe(self, *names: str) -> None:
         for name in names or [s.name for s in topics(self.spec) if s.direction == 'published']:
@@ -85,15 +120,30 @@ class Client:
             self._executor.spin_once(timeout_sec=0.05)
 
     def call(self, type_: Any, name: str, **fields: Any) -> Any:
-        client = self.node.create_client(type_, name)
+        if name not in self._service_clients:
+            self._service_clients[name] = self.node.create_client(type_, name)
+        client = self._service_clients[name]
         self.spin_until(client.service_is_ready, f'service {name}')
         future = client.call_async(type_.Request(**fields))
         self.spin_until(future.done, f'answer of {name}')
         return future.result()
 
+    def stamps(self, name: str) -> list[int]:
+        """The stamps received on a topic, each once: a robot that stands still repeats itself."""
+        return list(dict.fromkeys(message_stamp(message) for message in self.received[name]))
+
     def statuses(self) -> list[EpisodeStatus]:
         messages = self.received['episode_status']
         return [EpisodeStatus.from_values(decode_status(message)) for message in messages]
+
+    def reports(self, node: str = '/sim_node') -> list[DiagnosticStatus]:
+        """What a node has said on `/diagnostics`."""
+        found = (message.status[0] for message in self.received['/diagnostics'])
+        return [status for status in found if status.name == node]
+
+    def values(self, node: str = '/sim_node') -> dict[str, str]:
+        """The facts of its last report."""
+        return {pair.key: pair.value for pair in self.reports(node)[-1].values}
 
     def close(self) -> None:
         self._executor.remove_node(self.node)

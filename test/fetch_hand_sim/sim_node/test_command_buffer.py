@@ -1,0 +1,52 @@
+"""Which commands are applied, and what is said of the others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
+from msgs_spec.tasks import task_spec
+
+REACH, HAND = task_spec('FetchReach').robot, task_spec('HandReach').robot
+NAMES = [part.name for part in HAND.command]
+
+
+@pytest.mark.parametrize('value', [1.0, 1.0 + 1e-12, 4.9, -4.9])
+def test_overshoot_of_a_controller_is_clipped_and_counted(value):
+    buffer = CommandBuffer(REACH, 0.0)
+    buffer.accept([value, 0.0, 0.0, 0.0])
+    assert buffer.take().tolist() == [np.clip(value, -1.0, 1.0), 0.0, 0.0, 0.0]
+    assert (buffer.clipped, buffer.far_out) == (abs(value) > 1.0, 0)
+
+
+def test_degrees_by_mistake_are_clipped_and_named():
+    buffer = CommandBuffer(HAND, 0.0)
+    buffer.accept_named(['robot0:FFJ2'], [100.0])
+    assert buffer.take()[NAMES.index('robot0:FFJ2')] == HAND.command[3].upper
+    assert (buffer.clipped, buffer.far_out) == (1, 1)
+    assert buffer.last_far_out == 'robot0:FFJ2 is 100; allowed: 0 ... 1.571 rad'
+    buffer.accept(np.zeros(20))
+    assert (buffer.clipped, buffer.far_out) == (1, 1)
+
+
+@pytest.mark.parametrize('value', [1e308, -1e308])
+def test_the_largest_numbers_are_clipped_too(value):
+    buffer = CommandBuffer(HAND, 0.0)
+    buffer.accept(np.full(20, value))
+    assert np.isfinite(buffer.take()).all()
+    assert buffer.far_out == 1
+
+
+def test_a_command_is_held_after_the_timeout_and_its_age_outlives_the_episode():
+    now = 5.0
+    buffer = CommandBuffer(REACH, 0.5, lambda: now)
+    assert buffer.age() is None
+    buffer.accept([0.5, 0.0, 0.0, 1.0])
+    now = 5.4
+    assert buffer.take().tolist() == [0.5, 0.0, 0.0, 1.0]
+    now = 6.0
+    assert buffer.take().tolist() == [0.0, 0.0, 0.0, 1.0]
+    buffer.start_episode([0.0, 0.0, 0.0, 0.25])
+    assert buffer.take().tolist() == [0.0, 0.0, 0.0, 0.25]
+    assert buffer.age() == 1.0

@@ -1,0 +1,142 @@
+"""What a robot reports about itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.sim_node.health import Health, Surroundings
+from msgs_spec.diagnostics import Level, encode_reports
+from msgs_spec.schemas import deserialize
+from msgs_spec.topics import DIAGNOSTICS, topics
+
+FINE = Surroundings(commanders=['/policy_node'], robots=['/sim_node'], log='episodes')
+
+
+def report_after(case, surroundings=FINE, seconds=1.0, ticks=25):
+    health = Health(case.robot, '/sim_node', case.clock.now)
+    health.report(surroundings, case.clock.now)
+    for _ in range(ticks):
+        case.clock.now += case.robot.wait() if case.robot.wait() < math.inf else 0.0
+        case.robot.tick_when_due()
+    case.clock.now = max(case.clock.now, 100.0 + seconds)
+    return health.report(surroundings, case.clock.now)
+
+
+def test_report_of_a_healthy_robot(make):
+    report = report_after(make(), ticks=26)
+    assert report.level is Level.OK, report.message
+    assert report.message == 'FetchReach runs, 26.0 ticks per second'
+    assert report.values['real time factor'] == '1.040'
+    assert report.values['missed ticks'] == '0'
+    assert report.values['commanders'] == '/policy_node'
+    assert report.values['clock publishers'] == '/sim_node'
+
+
+@pytest.mark.parametrize(
+    ('changes', 'level', 'text'),
+    [
+        (
+            {'clock_publishers': ['/b/sim_node']},
+            Level.ERROR,
+            '/clock comes from /b/sim_node too; start all robots but one with publish_clock:=false',
+        ),
+        (
+            {'log': 'logging to episodes has failed', 'has_log_failed': True},
+            Level.ERROR,
+            'logging to episodes has failed',
+        ),
+        (
+            {'commander_problems': ['2 publish commands: /a, /b']},
+            Level.WARN,
+            '2 publish commands: /a, /b',
+        ),
+        (
+            {'robots': ['/sim_node', '/sim_node'], 'clock_publishers': ['/other']},
+            Level.ERROR,
+            '2 publish as one robot: /sim_node, /sim_node; start each in a namespace of its own: '
+            '--ros-args -r __ns:=/robot2',
+        ),
+    ],
+)
+def test_report_says_what_is_wrong_around_the_robot(make, changes, level, text):
+    report = report_after(make(), replace(FINE, **changes), ticks=26)
+    assert (report.level, report.message) == (level, text)
+    status = deserialize(DIAGNOSTICS.type_name, encode_reports(5, [report])).status[0]
+    assert (status.level, status.name, status.message) == (level, '/sim_node', report.message)
+
+
+def test_only_who_publishes_the_clock_minds_others_who_do(make):
+    others = replace(FINE, clock_publishers=['/b/sim_node'], publishes_clock=False)
+    report = report_after(make(), others, ticks=26)
+    assert report.level is Level.OK
+    assert report.values['clock publishers'] == '/b/sim_node'
+
+
+@pytest.mark.parametrize(
+    ('problem', 'level', 'text'),
+    [
+        ('missed', Level.WARN, '3 ticks missed'),
+        ('rejected', Level.WARN, '1 commands rejected; 3 values given; allowed: 4'),
+        (
+            'far out',
+            Level.WARN,
+            '1 commands clipped from far out of range; y is 100; allowed: -1 ... 1 x 0.05 m',
+        ),
+        ('stalled', Level.WARN, 'tick 1 of episode 0 waits for a valid command; nobody publishes'),
+        (
+            'elsewhere',
+            Level.WARN,
+            'nobody publishes any; /policy_node waits for a robot on /episode_status',
+        ),
+        ('stopped', Level.WARN, 'commands have stopped, the robot holds; /policy_node sends none'),
+        ('diverged', Level.ERROR, 'MuJoCo lost the state 1 times'),
+    ],
+)
+def test_report_says_what_went_wrong_in_the_robot(make, monkeypatch, problem, level, text):
+    case = make('lockstep' if problem in ('stalled', 'elsewhere') else 'realtime')
+    waiting = ['/policy_node waits for a robot on /episode_status']
+    surroundings = {
+        'stalled': replace(FINE, commanders=[]),
+        'elsewhere': replace(FINE, commanders=[], waiting_elsewhere=waiting),
+    }.get(problem, FINE)
+    health = Health(case.robot, '/sim_node', case.clock.now)
+    case.robot.tick_when_due()
+    health.report(surroundings, case.clock.now)
+    if problem == 'missed':
+        case.clock.now += 0.17
+        case.robot.tick_when_due()
+    elif problem == 'rejected':
+        with pytest.raises(ValueError, match='3 values'):
+            case.robot.buffer.accept([1.0] * 3)
+    elif problem == 'diverged':
+        monkeypatch.setattr(case.robot.runner.simulation, 'divergences', 1)
+    elif problem == 'far out':
+        case.robot.buffer.accept([0.0, 100.0, 0.0, 0.0])
+    elif problem == 'stopped':
+        case.robot.buffer.accept([0.0] * 4)
+    case.clock.now += 1.1
+    report = health.report(surroundings, case.clock.now)
+    assert report.level is level
+    assert text in report.message
+
+
+def test_report_counts_rejections_by_reason(make):
+    case = make()
+    case.robot.tick()
+    for bad in ([0.0] * 3, [np.nan] * 4, [np.inf] * 4):
+        with pytest.raises(ValueError, match='allowed: '):
+            case.robot.buffer.accept(bad)
+    values = Health(case.robot, '/sim_node', case.clock.now).report(FINE, 101.0).values
+    assert values['commands rejected'] == '3'
+    assert (values['rejected: wrong size'], values['rejected: not finite']) == ('1', '2')
+
+
+def test_monitoring_is_no_part_of_a_tick(make):
+    case = make()
+    case.robot.tick()
+    assert {spec.name for spec, _ in case.ticks[0][1]}.isdisjoint({'/diagnostics'})
+    assert DIAGNOSTICS not in topics(case.robot.runner.spec)

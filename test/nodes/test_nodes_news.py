@@ -1,0 +1,152 @@
+"""What a robot tells people and latecomers: who commands, what is missing, where it stands."""
+
+from __future__ import annotations
+
+import re
+import signal
+from pathlib import Path
+
+import pytest
+from std_srvs.srv import SetBool, Trigger
+
+from fetch_hand_sim.episodes.checker import EpisodeChecker
+from msgs_spec.codecs import message_stamp
+from msgs_spec.tasks import task_spec
+from support.graph import POLICY_NODE, SIM_NODE, Start, client, end, episodes_in, ros_args
+
+REACH = task_spec('FetchReach')
+
+
+def test_a_policy_that_is_killed_is_missed_in_real_time(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(wait_for_commands=True, real_time_factor=4.0))
+    policy = start_process(*POLICY_NODE, *ros_args(checkpoint='resting'))
+    with client(REACH) as robot:
+        robot.subscribe('/diagnostics', 'reward')
+        robot.spin_until(lambda: len(robot.received['reward']) > 5, 'ticks')
+        policy.send_signal(signal.SIGKILL)
+        text = 'commands have stopped, the robot holds; /policy_node sends none'
+        robot.spin_until(
+            lambda: any(text in report.message for report in robot.reports()), 'warning', 5.0
+        )
+        assert robot.reports()[-1].level == b'\x01'
+        # A successor is one commander, though the graph remembers the first for 20 s.
+        successor = start_process(*POLICY_NODE, *ros_args(checkpoint='resting'))
+        robot.spin_until(lambda: 'stopped' not in robot.reports()[-1].message, 'commands')
+        assert 'publish commands' not in robot.reports()[-1].message
+        assert robot.values()['commanders'] == '/policy_node'
+    output = end(sim)
+    assert output.count(text) == 1
+    assert 'commands come from /policy_node' in output
+    end(successor)
+
+
+def test_a_robot_without_a_log_says_what_it_is_and_how_episodes_end(start_process: Start) -> None:
+    arguments = ros_args(real_time_factor=0.0, episodes=2, seed=5, use_sim_time=True)
+    sim = start_process(*SIM_NODE, *arguments, '-r', '__ns:=/arm1')
+    output, errors = sim.communicate(timeout=30.0)
+    assert sim.returncode == 0, errors
+    use_sim_time, first, *episodes = (output + errors).strip().splitlines()
+    assert 'use_sim_time is set back to false: sim_node makes simulated time' in use_sim_time
+    assert first.endswith(
+        'FetchReach, 25 ticks per simulated second, as fast as possible; topics in /arm1; '
+        'log: off; nobody commands yet'
+    )
+    assert [re.search(r'episode \d seed \d: 50 steps, return', line)[0] for line in episodes] == [
+        'episode 0 seed 5: 50 steps, return',
+        'episode 1 seed 6: 50 steps, return',
+    ]
+
+
+def test_two_robots_of_one_name_are_both_told_so(start_process: Start) -> None:
+    sims = [start_process(*SIM_NODE, *ros_args()) for _ in range(2)]
+    line = '2 publish as one robot: /sim_node, /sim_node; start each in a namespace of its own'
+    with client(REACH) as robot:
+        robot.subscribe('/diagnostics')
+        robot.spin_until(
+            lambda: sum(line in report.message for report in robot.reports()) > 2, 'errors'
+        )
+        assert all(each.level == b'\x02' for each in robot.reports() if line in each.message)
+        assert not any('publish_clock' in report.message for report in robot.reports())
+    assert [line in end(sim) for sim in sims] == [True, True]
+
+
+def test_a_robot_in_another_namespace_names_the_policy_that_waits(start_process: Start) -> None:
+    policy = start_process(*POLICY_NODE)
+    sim = start_process(*SIM_NODE, *ros_args(mode='lockstep'), '-r', '__ns:=/arm1')
+    text = 'nobody publishes any; /policy_node waits for a robot on /episode_status'
+    with client(REACH) as robot:
+        robot.subscribe('/diagnostics')
+        robot.spin_until(
+            lambda: any(text in each.message for each in robot.reports('/arm1/sim_node')), 'line'
+        )
+    assert text in end(sim)
+    end(policy)
+
+
+@pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
+def test_the_state_after_a_reset_comes_also_while_the_robot_stands_still(
+    start_process: Start, mode: str
+) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(mode=mode))
+    with client(REACH) as robot:
+        robot.subscribe('joint_states', 'episode_status')
+        robot.spin_until(lambda: bool(robot.received['joint_states']), 'a tick')
+        if mode == 'realtime':
+            assert robot.call(SetBool, 'sim_node/pause', data=True).success
+            robot.spin(0.2)
+        for episode in (1, 2):
+            count = len(robot.stamps('joint_states'))
+            assert robot.call(Trigger, 'sim_node/reset').success
+            robot.spin_until(lambda: len(robot.stamps('joint_states')) > count, 'state', 5.0)  # noqa: B023
+            robot.spin_until(lambda: robot.statuses()[-1].episode >= episode, 'status', 5.0)  # noqa: B023
+            assert robot.statuses()[-1].tick == 0
+        robot.spin(0.3)
+        assert len(robot.stamps('joint_states')) == count + 1
+    end(sim)
+
+
+@pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
+def test_whoever_joins_a_robot_that_stands_still_sees_its_last_state(
+    start_process: Start, mode: str
+) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(mode=mode))
+    with client(REACH, 'early') as robot:
+        robot.subscribe('joint_states')
+        robot.spin_until(lambda: bool(robot.received['joint_states']), 'a tick')
+        if mode == 'realtime':
+            assert robot.call(SetBool, 'sim_node/pause', data=True).success
+        robot.spin(0.2)
+        last = message_stamp(robot.received['joint_states'][-1])
+    with client(REACH, 'late') as robot:
+        robot.subscribe('joint_states', 'end_effector_pose', 'achieved_goal', 'desired_goal')
+        robot.spin_until(lambda: len(robot.received) == 4, 'the last state', 5.0)
+        stamps = {message_stamp(each[0]) for each in robot.received.values()}
+        assert stamps == {last}
+    end(sim)
+
+
+def test_oversized_messages_cost_neither_the_log_nor_the_rate(
+    start_process: Start, tmp_path: Path
+) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path))
+    with client(REACH) as robot:
+        robot.subscribe('joint_states', '/diagnostics')
+        robot.connect('commands')
+        robot.spin_until(lambda: len(robot.received['joint_states']) > 5, 'ticks')
+        # As CDR: an empty layout and 1.25 million numbers.
+        size = 1_250_000
+        data = b'\0\1\0\0' + bytes(8) + size.to_bytes(4, 'little') + bytes(4 + 8 * size)
+        for _ in range(8):
+            robot.publish('commands', data)
+            robot.spin(0.1)
+        robot.spin_until(
+            lambda: bool(robot.reports()) and robot.values().get('rejected: too long') == '8',
+            'the count',
+        )
+    output = end(sim)
+    assert f'commands dropped: {len(data)} bytes given; allowed: up to 65536' in output
+    episodes = episodes_in(tmp_path)
+    assert not any('/commands' in episode.topics for episode in episodes)
+    for episode in episodes:
+        assert EpisodeChecker().check(episode.path).difference is None
+    assert sum(path.stat().st_size for path in tmp_path.rglob('*.mcap')) < 20_000_000
