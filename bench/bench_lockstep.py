@@ -33,11 +33,20 @@ from fetch_hand_sim.simulation import Simulation  # noqa: E402
 from msgs_spec.cdr import TopicCodec  # noqa: E402
 from msgs_spec.codecs import decode_status  # noqa: E402
 from msgs_spec.observations import ObservationAssembler  # noqa: E402
-from msgs_spec.qos import STATE, rclpy_profile  # noqa: E402
-from msgs_spec.ros import EventLoop, keep_discovery_local, ros_message_class  # noqa: E402
+from msgs_spec.ros import (  # noqa: E402
+    EventLoop,
+    keep_discovery_local,
+    rclpy_profile,
+    ros_message_class,
+)
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec  # noqa: E402
 from msgs_spec.tick import TickEncoder  # noqa: E402
-from msgs_spec.topics import DIAGNOSTICS, topic, topics  # noqa: E402
+from msgs_spec.topics import (  # noqa: E402
+    DIAGNOSTICS,
+    STATE,
+    topic,
+    topics,
+)
 
 SUBSTEPS = 20
 TIMEOUT = 60.0

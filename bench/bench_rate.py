@@ -25,8 +25,12 @@ import numpy as np  # noqa: E402
 import rclpy  # noqa: E402
 
 from msgs_spec.codecs import decode_status  # noqa: E402
-from msgs_spec.qos import rclpy_profile  # noqa: E402
-from msgs_spec.ros import EventLoop, keep_discovery_local, ros_message_class  # noqa: E402
+from msgs_spec.ros import (  # noqa: E402
+    EventLoop,
+    keep_discovery_local,
+    rclpy_profile,
+    ros_message_class,
+)
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic  # noqa: E402
 

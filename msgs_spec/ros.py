@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 from msgs_spec.command_line import EXIT_SUCCESS, CommandError, complain, require_extra
 from msgs_spec.command_line import UsageError as UsageError
 from msgs_spec.parameters import ParameterSpec, unknown_parameter, usage, validate
+from msgs_spec.topics import QosSpec
 
 if TYPE_CHECKING:
     from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
     from rclpy.executors import Executor
     from rclpy.node import Node
     from rclpy.parameter import Parameter
+    from rclpy.qos import QoSProfile
 
 # Seconds between looks at what no callback announces: signals, the graph.
 BEAT = 0.1
@@ -37,6 +39,18 @@ def ros_message_class(type_name: str) -> Any:
 def ros_service_class(type_name: str) -> Any:
     """Returns rclpy's class of a service type such as `std_srvs/srv/Trigger`."""
     return ros_message_class(type_name)
+
+
+def rclpy_profile(spec: QosSpec) -> QoSProfile:
+    """Returns the profile for rclpy's `create_publisher` and `create_subscription`."""
+    from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+
+    return QoSProfile(
+        history=QoSHistoryPolicy.KEEP_LAST,
+        depth=spec.depth,
+        reliability=QoSReliabilityPolicy.get_from_short_key(spec.reliability),
+        durability=QoSDurabilityPolicy.get_from_short_key(spec.durability),
+    )
 
 
 class EventLoop:

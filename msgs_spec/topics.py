@@ -3,13 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Literal
 
-from msgs_spec import qos
-from msgs_spec.qos import QosSpec
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import GoalKind, TaskSpec, VectorPart
+
+
+@dataclass(frozen=True, slots=True)
+class QosSpec:
+    """What a publisher offers; history is always keep_last.
+
+    Attributes:
+        depth: Messages kept.
+        reliability: Whether lost messages are sent again.
+        durability: `transient_local` topics are latched: late subscribers get the last messages.
+    """
+
+    depth: int
+    reliability: Literal['reliable', 'best_effort']
+    durability: Literal['volatile', 'transient_local']
+
+
+# All offers are reliable: a best-effort publisher silently starves reliable subscribers, while a
+# reliable one serves both kinds.
+STATE = QosSpec(depth=10, reliability='reliable', durability='volatile')
+LATCHED = QosSpec(depth=1, reliability='reliable', durability='transient_local')
+# Named joint commands add up, and a rejected one is to be counted, so none may push another out.
+COMMAND = QosSpec(depth=10, reliability='reliable', durability='volatile')
+CLOCK = QosSpec(depth=1, reliability='reliable', durability='volatile')
+
 
 WORLD = 'world'
 
@@ -39,23 +62,23 @@ class TopicSpec:
     Attributes:
         name: Relative to the node's namespace, except `/clock`.
         type_name: ROS name of the message type.
-        qos: What the publisher offers, or what the subscriber asks for.
-        frame: `header.frame_id`, empty where a frame has no meaning.
+        description: What the topic says.
         layout: Parts of the float64 vector that `codecs` makes of the message, in order.
             Quaternions are wxyz there and xyzw in the message.
+        frame: `header.frame_id`, empty where a frame has no meaning.
         names: Joint names inside of the message, in order.
+        qos: What the publisher offers, or what the subscriber asks for.
         direction: As `sim_node` sees it.
-        description: What the topic says.
     """
 
     name: str
     type_name: str
-    qos: QosSpec
-    frame: str
-    layout: tuple[VectorPart, ...]
-    names: tuple[str, ...]
-    direction: Literal['published', 'subscribed']
     description: str
+    layout: tuple[VectorPart, ...] = ()
+    frame: str = ''
+    names: tuple[str, ...] = ()
+    qos: QosSpec = STATE
+    direction: Literal['published', 'subscribed'] = 'published'
 
     @property
     def size(self) -> int:
@@ -68,30 +91,7 @@ class TopicSpec:
         return ', '.join(dict.fromkeys(part.unit for part in self.layout if part.unit))
 
 
-def _published(
-    name: str,
-    type_name: str,
-    description: str,
-    layout: tuple[VectorPart, ...] = (),
-    *,
-    frame: str = '',
-    names: tuple[str, ...] = (),
-    offer: QosSpec = qos.STATE,
-) -> TopicSpec:
-    return TopicSpec(name, type_name, offer, frame, layout, names, 'published', description)
-
-
-def _subscribed(
-    name: str,
-    type_name: str,
-    description: str,
-    layout: tuple[VectorPart, ...],
-    *,
-    frame: str = '',
-    names: tuple[str, ...] = (),
-    offer: QosSpec = qos.COMMAND,
-) -> TopicSpec:
-    return TopicSpec(name, type_name, offer, frame, layout, names, 'subscribed', description)
+_subscribed = partial(TopicSpec, direction='subscribed', qos=COMMAND)
 
 
 def _command_layout(task: TaskSpec) -> tuple[VectorPart, ...]:
@@ -103,7 +103,7 @@ def _joint_topic(task: TaskSpec) -> TopicSpec:
     units = ('rad', 'rad/s', 'N m')
     if 'm' in task.robot.joint_units:
         units = ('rad or m', 'rad/s or m/s', 'N m or N')
-    return _published(
+    return TopicSpec(
         'joint_states',
         'sensor_msgs/msg/JointState',
         'All scalar joints of the robot.',
@@ -121,25 +121,23 @@ def _body_topics(task: TaskSpec) -> list[TopicSpec]:
     pose, twist = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/TwistStamped'
     if task.robot.has_gripper_command:
         specs = [
-            _published('end_effector_pose', pose, 'Site between the fingers.', _POSE, frame=WORLD),
-            _published('end_effector_twist', twist, 'The same site.', _TWIST, frame=WORLD),
+            TopicSpec('end_effector_pose', pose, 'Site between the fingers.', _POSE, frame=WORLD),
+            TopicSpec('end_effector_twist', twist, 'The same site.', _TWIST, frame=WORLD),
         ]
     else:
         text = 'Sites at the fingertips, oriented as the distal segments.'
         array = 'geometry_msgs/msg/PoseArray'
-        specs = [_published('fingertip_poses', array, text, _FINGERTIP_POSES, frame=WORLD)]
+        specs = [TopicSpec('fingertip_poses', array, text, _FINGERTIP_POSES, frame=WORLD)]
     if task.has_object:
         specs += [
-            _published('object_pose', pose, 'Centre of the object.', _POSE, frame=WORLD),
-            _published('object_twist', twist, 'The same, in world axes.', _TWIST, frame=WORLD),
+            TopicSpec('object_pose', pose, 'Centre of the object.', _POSE, frame=WORLD),
+            TopicSpec('object_twist', twist, 'The same, in world axes.', _TWIST, frame=WORLD),
         ]
     if task.goal is GoalKind.POSE:
         joint = f'{task.object_name}:joint'
         text = 'Free joint of the object as MuJoCo holds it: angular velocity in the object frame.'
         dof = 'sensor_msgs/msg/MultiDOFJointState'
-        specs.append(
-            _published('object_joint', dof, text, _FREE_JOINT, frame=WORLD, names=(joint,))
-        )
+        specs.append(TopicSpec('object_joint', dof, text, _FREE_JOINT, frame=WORLD, names=(joint,)))
     return specs
 
 
@@ -147,32 +145,32 @@ def _goal_topics(task: TaskSpec) -> list[TopicSpec]:
     type_name, layout = _GOAL_TYPES[task.goal]
     desired, achieved = 'Goal of the episode.', 'What the goal is compared with, as it is now.'
     return [
-        _published('desired_goal', type_name, desired, layout, frame=WORLD, offer=qos.LATCHED),
-        _published('achieved_goal', type_name, achieved, layout, frame=WORLD),
+        TopicSpec('desired_goal', type_name, desired, layout, frame=WORLD, qos=LATCHED),
+        TopicSpec('achieved_goal', type_name, achieved, layout, frame=WORLD),
     ]
 
 
 def _result_topics(task: TaskSpec) -> list[TopicSpec]:
     number, array = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
     return [
-        _published('reward', number, 'Reward of the tick.', (VectorPart('reward', 1, ''),)),
-        _published(
+        TopicSpec('reward', number, 'Reward of the tick.', (VectorPart('reward', 1, ''),)),
+        TopicSpec(
             'is_success',
             'std_msgs/msg/Bool',
             'Whether the goal is reached now.',
             (VectorPart('is_success', 1, ''),),
         ),
-        _published(
+        TopicSpec(
             'applied_command',
             array,
             'The command this tick applied, after clipping.',
             _command_layout(task),
         ),
-        _published(
+        TopicSpec(
             'episode_status',
             'diagnostic_msgs/msg/DiagnosticArray',
             'Task, episode, seed, tick, phase and settings as key/value pairs.',
-            offer=qos.LATCHED,
+            qos=LATCHED,
         ),
     ]
 
@@ -197,17 +195,17 @@ def _command_topics(task: TaskSpec) -> list[TopicSpec]:
     specs.append(_subscribed('set_goal', type_name, text, goal_layout, frame=WORLD))
     text = 'Who commands: checkpoint and its SHA-256 as key/value pairs, for the log.'
     status = 'diagnostic_msgs/msg/DiagnosticArray'
-    specs.append(_subscribed('policy_status', status, text, (), offer=qos.LATCHED))
+    specs.append(_subscribed('policy_status', status, text, (), qos=LATCHED))
     return specs
 
 
 # Wall-clock content, of both nodes or of `sim_node`: no part of a tick and never logged.
-DIAGNOSTICS = _published(
+DIAGNOSTICS = TopicSpec(
     '/diagnostics',
     'diagnostic_msgs/msg/DiagnosticArray',
     'Health of `sim_node` and of `policy_node`, 1 Hz wall time; not logged.',
 )
-REAL_TIME_FACTOR = _published(
+REAL_TIME_FACTOR = TopicSpec(
     'real_time_factor',
     'std_msgs/msg/Float64',
     'Achieved in the last second, 1 Hz wall time; not logged.',
@@ -223,8 +221,8 @@ def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     The order is part of the contract: published topics come first, as a tick publishes and logs
     them, then the subscribed ones.
     """
-    clock = _published(
-        '/clock', 'rosgraph_msgs/msg/Clock', 'Simulated time, once per tick.', offer=qos.CLOCK
+    clock = TopicSpec(
+        '/clock', 'rosgraph_msgs/msg/Clock', 'Simulated time, once per tick.', qos=CLOCK
     )
     return (
         clock,

@@ -12,12 +12,11 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from msgs_spec.parameters import NODES, ParameterSpec
-from msgs_spec.qos import QosSpec
 from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, CommandPart
 from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS, GoalKind, TaskSpec, VectorPart
 from msgs_spec.tick import PHASES, EpisodeStatus
-from msgs_spec.topics import MONITORING, TopicSpec, topics
+from msgs_spec.topics import MONITORING, QosSpec, TopicSpec, topics
 
 START, END = '<!-- interface table -->', '<!-- /interface table -->'
 

@@ -27,8 +27,7 @@ from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import EpisodeReadError, read_episode
 from msgs_spec.codecs import decode_status
-from msgs_spec.qos import rclpy_profile
-from msgs_spec.ros import StopSignals, keep_discovery_local, ros_message_class
+from msgs_spec.ros import StopSignals, keep_discovery_local, rclpy_profile, ros_message_class
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic

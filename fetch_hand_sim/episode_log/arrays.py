@@ -14,8 +14,8 @@ from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.messages import MessageFile, MessageRows, read_messages
 from fetch_hand_sim.episode_log.summary import expand_episodes
+from msgs_spec.actions import action_from_command
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.commands import action_from_command
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import TaskSpec, task_spec

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from msgs_spec.qos import QosSpec
+from msgs_spec.topics import QosSpec
 
 # libyaml is six times as fast as pure Python.
 _Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)

@@ -20,8 +20,8 @@ from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.recorder import LoggedEpisode, episode_result
 from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS
 from fetch_hand_sim.simulation import Observation, Simulation
+from msgs_spec.actions import clip_command, command_from_action
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.commands import clip_command, command_from_action
 from msgs_spec.tick import EpisodeStatus, Phase, Tick, TickEncoder
 from msgs_spec.topics import topic
 

@@ -17,11 +17,11 @@ from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.replay_node import NODE_NAME
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
 from msgs_spec.parameters import REPLAY_NODE
-from msgs_spec.qos import rclpy_profile
 from msgs_spec.ros import (
     StopSignals,
     UsageError,
     declare_parameters,
+    rclpy_profile,
     ros_message_class,
     set_callback,
 )

@@ -15,7 +15,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from msgs_spec.commands import clip_command, command_limits
+from msgs_spec.actions import clip_command, command_limits
 from msgs_spec.robots import RobotSpec
 
 Array = NDArray[np.float64]

@@ -32,13 +32,13 @@ from fetch_hand_sim.simulation import Simulation
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports
 from msgs_spec.parameters import SIM_NODE
-from msgs_spec.qos import rclpy_profile
 from msgs_spec.ros import (
     BEAT,
     EventLoop,
     StopSignals,
     UsageError,
     declare_parameters,
+    rclpy_profile,
     ros_message_class,
     set_callback,
 )

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
 from fetch_hand_sim.simulation.tasks import Task, make_task
-from msgs_spec.commands import command_from_action
+from msgs_spec.actions import command_from_action
 from msgs_spec.observations import Readings
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind
 
@@ -202,7 +202,7 @@ class Simulation:
 
         Args:
             commands: (N, action size): Fetch as actions; hand absolute joint positions in radians.
-                What lies beyond a limit must have been clipped (`msgs_spec.commands`).
+                What lies beyond a limit must have been clipped (`msgs_spec.actions`).
 
         Raises:
             ValueError: If the shape is wrong or a value is not finite.

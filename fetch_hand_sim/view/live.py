@@ -37,11 +37,10 @@ from fetch_hand_sim.view.messages import (
 from fetch_hand_sim.view.remote_node import RemoteNode
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode_status
-from msgs_spec.qos import QosSpec, rclpy_profile
-from msgs_spec.ros import ros_message_class
+from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic
+from msgs_spec.topics import DIAGNOSTICS, QosSpec, TopicSpec, topic
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from fetch_hand_sim.view.messages import (
 )
 from fetch_hand_sim.view.plots import draw_plots
 from fetch_hand_sim.view.timeline import draw_timeline
-from msgs_spec.commands import resting_command
+from msgs_spec.actions import resting_command
 from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
 
 Array = NDArray[np.float64]

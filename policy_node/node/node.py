@@ -12,19 +12,19 @@ from rclpy.publisher import Publisher
 from msgs_spec.codecs import build_status, decode_status
 from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports
 from msgs_spec.parameters import POLICY_NODE
-from msgs_spec.qos import STATE, rclpy_profile
 from msgs_spec.ros import (
     BEAT,
     EventLoop,
     NodeFailure,
     StopSignals,
     declare_parameters,
+    rclpy_profile,
     ros_message_class,
 )
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic
+from msgs_spec.topics import DIAGNOSTICS, STATE, TopicSpec, topic
 from policy_node.node import NODE_NAME
 from policy_node.node.health import Health
 from policy_node.node.responder import Responder

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.commands import command_from_action
+from msgs_spec.actions import command_from_action
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from msgs_spec import qos
+from msgs_spec.ros import rclpy_profile
 from msgs_spec.schemas import deserialize, message_class, schema_text, serialize, type_hash
 from msgs_spec.tasks import TASKS
-from msgs_spec.topics import topics
+from msgs_spec.topics import CLOCK, COMMAND, LATCHED, STATE, topics
 
 TYPES = sorted({spec.type_name for task in TASKS.values() for spec in topics(task)})
 
@@ -65,10 +65,10 @@ def test_serialisation_round_trip():
     assert deserialize(bool_type, data).data is True
 
 
-@pytest.mark.parametrize('spec', [qos.STATE, qos.LATCHED, qos.COMMAND, qos.CLOCK])
+@pytest.mark.parametrize('spec', [STATE, LATCHED, COMMAND, CLOCK])
 def test_rclpy_profile_says_the_same(spec):
     pytest.importorskip('rclpy')
-    profile = qos.rclpy_profile(spec)
+    profile = rclpy_profile(spec)
     assert profile.history.short_key == 'keep_last'
     assert profile.depth == spec.depth
     assert profile.reliability.short_key == spec.reliability

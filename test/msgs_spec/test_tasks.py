@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation.models import load_model
-from msgs_spec.commands import (
+from msgs_spec.actions import (
     action_from_command,
     clip_command,
     command_from_action,

@@ -9,8 +9,7 @@ import time
 
 import pytest
 
-from msgs_spec.qos import rclpy_profile
-from msgs_spec.ros import ros_message_class
+from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import TickEncoder

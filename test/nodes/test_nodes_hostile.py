@@ -15,9 +15,9 @@ from rcl_interfaces.srv import SetParameters
 from std_msgs.msg import Float64MultiArray
 
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.qos import QosSpec, rclpy_profile
+from msgs_spec.ros import rclpy_profile
 from msgs_spec.tasks import task_spec
-from msgs_spec.topics import topic
+from msgs_spec.topics import QosSpec, topic
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,

@@ -267,7 +267,7 @@ def test_a_forbidden_import_is_found(module, source):
 @pytest.mark.parametrize(
     ('module', 'source'),
     [
-        ('msgs_spec.qos', 'def profile():\n    from rclpy.qos import QoSProfile'),
+        ('msgs_spec.topics', 'def profile():\n    from rclpy.qos import QoSProfile'),
         ('fetch_hand_sim.simulation.rewards', 'import mujoco\nfrom msgs_spec.tasks import TASKS'),
         ('fetch_hand_sim.simulation.rewards', 'import torchless'),
         (

@@ -18,8 +18,8 @@ from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeWriter, episode_
 from fetch_hand_sim.episode_log.model import model_sha256
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.actions import command_from_action
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.commands import command_from_action
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import TopicSpec, topic
 

@@ -18,8 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 from fetch_hand_sim.episode_log import Episode, read_episode
 from msgs_spec.codecs import decode_status, message_stamp
-from msgs_spec.qos import rclpy_profile
-from msgs_spec.ros import ros_message_class
+from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import MONITORING, TopicSpec, topic, topics

@@ -25,7 +25,7 @@ from fetch_hand_sim.simulation.tasks.task import (
     joint_qpos_slice,
     joint_qvel_slice,
 )
-from msgs_spec.commands import resting_command
+from msgs_spec.actions import resting_command
 from msgs_spec.rotations import (
     euler_to_matrix,
     euler_to_quaternion,

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from fetch_hand_sim.episode_log.offered_qos import offered_qos, parse_offered_qos
-from msgs_spec.qos import CLOCK, COMMAND, LATCHED, STATE
+from msgs_spec.topics import CLOCK, COMMAND, LATCHED, STATE
 
 
 def test_text_is_metadata_version_9():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.commands import command_from_action
+from msgs_spec.actions import command_from_action
 from msgs_spec.rotations import quaternion_from_axis_angle, quaternion_multiply
 from msgs_spec.tasks import TASKS
 

@@ -9,9 +9,9 @@ import pytest
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.actions import command_from_action
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode
-from msgs_spec.commands import command_from_action
 from msgs_spec.diagnostics import Level
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import task_spec

@@ -12,7 +12,7 @@ import pytest
 import fetch_hand_sim  # noqa: F401  registers the environments
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.commands import command_from_action
+from msgs_spec.actions import command_from_action
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import load_actor
 from policy_node.policies.commander import make_commander
