@@ -143,6 +143,7 @@ def list_jobs(
                     config,
                     reward_type=arm.reward_type,
                     strategy=config.strategy if arm.hindsight else 'none',
+                    goals=config.goals if arm.hindsight else '',
                 )
                 jobs.append(Job(arm, config, output / task / arm.name / f'seed{seed}'))
     return jobs

@@ -33,7 +33,12 @@ class Collector:
     """
 
     def __init__(
-        self, simulation: Simulation, seeds: list[int], noise_std: float, random_epsilon: float
+        self,
+        simulation: Simulation,
+        seeds: list[int],
+        noise_std: float,
+        random_epsilon: float,
+        noise_spread: float = 0.0,
     ) -> None:
         """Prepares collection.
 
@@ -42,11 +47,13 @@ class Collector:
             seeds: One seed per simulation for its resets; the first also seeds exploration.
             noise_std: Standard deviation of the Gaussian noise on actions.
             random_epsilon: Probability of a uniformly random action instead.
+            noise_spread: The first simulation has 1 - spread times both, the last 1 + spread.
         """
         self.simulation = simulation
         self.noise_std = noise_std
         self.random_epsilon = random_epsilon
         self.exploration = 1.0
+        self._shares = 1.0 + noise_spread * np.linspace(-1.0, 1.0, simulation.num_envs)
         self._generator = np.random.default_rng(seeds[0])
         self._seeds: list[int] | None = seeds
 
@@ -93,11 +100,9 @@ class Collector:
         if random:
             return uniform
         action, _ = policy.predict(observation, deterministic=True)
-        noise = (
-            self.exploration
-            * self.noise_std
-            * self._generator.standard_normal(shape, dtype=np.float32)
-        )
-        noisy = np.clip(action + noise, -1.0, 1.0)
-        replaced = self._generator.random(shape[0]) < self.exploration * self.random_epsilon
+        share = self.exploration * self._shares
+        noise = self._generator.standard_normal(shape, dtype=np.float32)
+        noisy = action + (self.noise_std * share[:, None]).astype(np.float32) * noise
+        noisy = np.clip(noisy, -1.0, 1.0)
+        replaced = self._generator.random(shape[0]) < share * self.random_epsilon
         return np.where(replaced[:, None], uniform, noisy)

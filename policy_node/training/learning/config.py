@@ -7,8 +7,9 @@ import typing
 from dataclasses import dataclass
 from typing import Any
 
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind, TaskSpec, task_spec
 from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
+from policy_node.training.learning.hindsight import parse_mixture
 
 RECIPES = ('paper', 'best')
 
@@ -36,12 +37,22 @@ class TrainConfig:
     reward_distance: float = 1.0
     """Share of the task's success distance within which the sparse reward of training is 0. Below 1
     the actor learns to come closer than it has to; evaluation keeps the task's distance."""
+    reward_rotation: float = 1.0
+    """Share of the task's success rotation likewise."""
     strategy: str = 'future'
     """Hindsight goals: final, future, episode, random, futureactual, or none (no hindsight)."""
     hindsight_k: int = 4
     """Relabelled goals for each goal kept, so k/(k+1) of a batch is relabelled."""
+    goals: str = ''
+    """Goal sources as a mixture instead of `strategy`: `future=.4,actual=.3,near=.1`; what is left
+    of 1 keeps the goal. Also `next` (what this step achieved) and `near` (one of the next ten)."""
     moved_share: float = 0.0
-    """Share of a batch from episodes in which the achieved goal moved; 0 draws uniformly."""
+    """Share of a batch drawn by `episode_weights`; 0 draws uniformly."""
+    episode_weights: str = 'moved'
+    """Weights of episodes: `moved` (1 where the achieved goal moved, else 0) or `energy` (given to
+    the object)."""
+    ticks_after_drop: int = -1
+    """Ticks after an object fell off the palm that are still learnt from; -1 is all."""
 
     init_from: str = ''
     """Networks and normalisers to start from: a run folder, a shipped actor or the file of one;
@@ -100,6 +111,8 @@ class TrainConfig:
     """Probability of a uniformly random action."""
     noise_std: float = 0.2
     """Standard deviation of the Gaussian noise on other actions."""
+    noise_spread: float = 0.0
+    """Exploration differs between simulations: from 1 - spread to 1 + spread times both."""
     final_exploration: float = 1.0
     """Share of `random_epsilon` and `noise_std` left at `total_steps`; both fall linearly in
     the last third of the run. 1 keeps them constant."""
@@ -133,8 +146,19 @@ class TrainConfig:
             if not lowest <= value <= highest:
                 raise ValueError(f'{name} {value}; allowed: {lowest:.6g} ... {highest:.6g}')
         goal_features(self.goal_features, spec)
+        self._refuse_what_has_no_effect(spec)
         if not self.hidden_sizes or min(self.hidden_sizes) < 1:
             raise ValueError(f'hidden_sizes {self.hidden_sizes}; allowed: one or more widths >= 1')
+
+    def _refuse_what_has_no_effect(self, spec: TaskSpec) -> None:
+        if self.goals:
+            parse_mixture(self.goals)
+            if self.strategy == 'none':
+                raise ValueError(f'goals {self.goals!r} excludes strategy none')
+        if self.ticks_after_drop >= 0 and spec.goal is not GoalKind.POSE:
+            raise ValueError(f'ticks_after_drop: {self.task} has no palm to drop an object from')
+        if self.reward_rotation != 1.0 and spec.rotation_threshold is None:
+            raise ValueError(f'reward_rotation: goals of {self.task} have no rotation')
 
 
 _CHOICES = {
@@ -143,6 +167,7 @@ _CHOICES = {
     'success_rule': ('gymnasium', 'paper'),
     'strategy': ('final', 'future', 'episode', 'random', 'futureactual', 'none'),
     'goal_features': GOAL_FEATURES,
+    'episode_weights': ('moved', 'energy'),
     'precision': ('auto', 'float32', 'bfloat16'),
     'device': ('auto', 'cpu', 'cuda'),
 }
@@ -151,7 +176,10 @@ _RANGES = (
     ('seed', 0, 2**31 - 1),
     ('hindsight_k', 1, 1000),
     ('reward_distance', 1e-3, 1000),
+    ('reward_rotation', 1e-3, 1000),
     ('moved_share', 0, 1),
+    ('ticks_after_drop', -1, _INFINITY),
+    ('noise_spread', 0, 1),
     ('critic_first', 0, _INFINITY),
     ('total_steps', 1, _INFINITY),
     ('time_limit', 0, _INFINITY),

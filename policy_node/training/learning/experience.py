@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msgs_spec.tasks import TaskSpec
 from policy_node.policies.actor import Actor
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.episode_weights import episode_weights, ticks_until_dropped
 from policy_node.training.learning.hindsight import (
     RewardFunction,
     Transitions,
     goal_mixture,
+    parse_mixture,
     sample_transitions,
 )
 from policy_node.training.learning.normalizer import RunningStatistics
@@ -54,6 +57,7 @@ class Experience:
             'observation_statistics': RunningStatistics(spec.observation_size),
             'goal_statistics': RunningStatistics(spec.goal.size),
         }
+        self._count_ticks = ticks_until_dropped(spec, config.ticks_after_drop)
         capacity = max(workers.share(config.replay_transitions) // spec.episode_ticks, 1)
         self.replay = EpisodeReplay(
             max(capacity, workers.share(config.num_envs)),
@@ -61,6 +65,8 @@ class Experience:
             spec.observation_size,
             spec.goal.size,
             spec.robot.action_size,
+            episode_weights(config.episode_weights, spec, config.control_hz),
+            self._count_ticks,
         )
         self._ticks = spec.episode_ticks
 
@@ -77,7 +83,8 @@ class Experience:
         observation, goal = episodes.observation[:, :-1], episodes.desired_goal
         if len(episodes):
             row = np.repeat(np.arange(len(episodes)), episodes.ticks)
-            goal = self._sample(episodes, row, env_steps).goal
+            valid = None if self._count_ticks is None else self._count_ticks(episodes)
+            goal = self._sample(episodes, row, env_steps, valid).goal
         for name, values, normalizer in (
             ('observation_statistics', observation, actor.observation_normalizer),
             ('goal_statistics', goal, actor.goal_normalizer),
@@ -88,13 +95,22 @@ class Experience:
     def batch(self, env_steps: int) -> Transitions:
         """Draws the transitions of one update, after `env_steps` environment steps."""
         row = self.replay.draw(self.batch_size, self._config.moved_share, self.generator)
-        return self._sample(self.replay.episodes, row, env_steps)
+        return self._sample(self.replay.episodes, row, env_steps, self.replay.valid_ticks)
 
     def _sample(
-        self, episodes: Episodes, row: np.ndarray[tuple[int], np.dtype[np.int64]], env_steps: int
+        self,
+        episodes: Episodes,
+        row: NDArray[np.int64],
+        env_steps: int,
+        valid_ticks: NDArray[np.int64] | None,
     ) -> Transitions:
+        mixture, reward = self._mixture(env_steps), self._compute_reward
+        return sample_transitions(episodes, row, mixture, reward, self.generator, valid_ticks)
+
+    def _mixture(self, env_steps: int) -> dict[str, float]:
         config = self._config
+        if config.goals:
+            return parse_mixture(config.goals)
         early = env_steps < config.future_only_steps
         strategy = 'future' if early and config.strategy == 'futureactual' else config.strategy
-        mixture = goal_mixture(strategy, config.hindsight_k)
-        return sample_transitions(episodes, row, mixture, self._compute_reward, self.generator)
+        return goal_mixture(strategy, config.hindsight_k)

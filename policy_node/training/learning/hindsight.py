@@ -17,8 +17,10 @@ from policy_node.training.learning.replay import Array, Episodes
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 # Where the goal of a transition comes from: the episode's own; a later achieved goal of the
-# episode; its last; any of it; any achieved goal of the replay; a desired goal of any episode.
-SOURCES = ('real', 'future', 'final', 'episode', 'random', 'actual')
+# episode; its last; any of it; any achieved goal of the replay; a desired goal of any episode; what
+# this very step achieved; what one of the next ten achieved.
+SOURCES = ('real', 'future', 'final', 'episode', 'random', 'actual', 'next', 'near')
+_NEAR_TICKS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +55,33 @@ def goal_mixture(strategy: str, k: int = 4) -> dict[str, float]:
     share = k / (k + 1)
     if strategy == 'futureactual':
         return {'future': share / 2, 'actual': share / 2, 'real': 1.0 - share}
-    if strategy not in SOURCES[1:-1]:
-        raise ValueError(f'strategy {strategy!r}; allowed: none, futureactual, {SOURCES[1:-1]}')
+    if strategy not in SOURCES[1:5]:
+        raise ValueError(f'strategy {strategy!r}; allowed: none, futureactual, {SOURCES[1:5]}')
     return {strategy: share, 'real': 1.0 - share}
+
+
+def parse_mixture(text: str) -> dict[str, float]:
+    """Parses `future=.4,actual=.4` into the probability of each goal source; the rest is real.
+
+    Raises:
+        ValueError: If a source is unknown or named twice, or shares are not in (0, 1] in all.
+    """
+    mixture: dict[str, float] = {}
+    for part in text.split(','):
+        source, _, share = part.strip().partition('=')
+        if source not in SOURCES or source in mixture:
+            raise ValueError(f'goals {text!r}: {source!r}; allowed, once each: {SOURCES}')
+        try:
+            mixture[source] = float(share)
+        except ValueError:
+            raise ValueError(f'goals {text!r}: {part!r} is not source=share') from None
+    total = sum(mixture.values())
+    if not (min(mixture.values()) > 0.0 and total <= 1.0 + 1e-9):
+        raise ValueError(f'goals {text!r}: shares above 0 that add up to at most 1 are allowed')
+    left = 1.0 - total
+    if left > 1e-9:
+        mixture['real'] = mixture.get('real', 0.0) + left
+    return mixture
 
 
 def sample_transitions(
@@ -64,6 +90,7 @@ def sample_transitions(
     mixture: dict[str, float],
     compute_reward: RewardFunction,
     generator: np.random.Generator,
+    valid_ticks: NDArray[np.int64] | None = None,
 ) -> Transitions:
     """Draws a transition of each chosen episode and relabels its goal.
 
@@ -73,10 +100,15 @@ def sample_transitions(
         mixture: Probability of each goal source; adds up to 1.
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
         generator: Source of all randomness.
+        valid_ticks: Ticks of each episode, from its first, that transitions and achieved goals are
+            drawn from; None is all.
     """
     ticks = episodes.ticks
-    tick = generator.integers(ticks, size=len(row))
-    goal = relabel(episodes, row, tick, mixture, generator)
+    if valid_ticks is None:
+        tick = generator.integers(ticks, size=len(row))
+    else:
+        tick = generator.integers(valid_ticks.take(row))
+    goal = relabel(episodes, row, tick, mixture, generator, valid_ticks)
     state = row * (ticks + 1) + tick
     observation = _flat(episodes.observation)
     achieved = _flat(episodes.achieved_goal).take(state + 1, axis=0)
@@ -96,6 +128,7 @@ def relabel(
     tick: NDArray[np.int64],
     mixture: dict[str, float],
     generator: np.random.Generator,
+    valid_ticks: NDArray[np.int64] | None = None,
 ) -> Array:
     """Returns goals (batch, goal_size) for transitions `tick` of episodes `row`.
 
@@ -108,7 +141,8 @@ def relabel(
     for index, source in enumerate(mixture):
         chosen = np.flatnonzero(choice == index)
         if source != 'real' and len(chosen):
-            goal[chosen] = _goals(episodes, source, row[chosen], tick[chosen], generator)
+            place = row[chosen], tick[chosen]
+            goal[chosen] = _goals(episodes, source, *place, generator, valid_ticks)
     return goal
 
 
@@ -118,19 +152,25 @@ def _goals(
     row: NDArray[np.int64],
     tick: NDArray[np.int64],
     generator: np.random.Generator,
+    valid_ticks: NDArray[np.int64] | None,
 ) -> Array:
     ticks = episodes.ticks
     if source == 'actual':
         other = generator.integers(len(episodes), size=len(row))
         return episodes.desired_goal.take(other, axis=0)
+    if source == 'random':
+        row = generator.integers(len(episodes), size=len(row))
+    last = np.full(len(row), ticks) if valid_ticks is None else valid_ticks.take(row)
     if source == 'future':
-        state = generator.integers(tick + 1, ticks + 1)
+        state = generator.integers(tick + 1, last + 1)
+    elif source == 'near':
+        state = generator.integers(tick + 1, np.minimum(tick + _NEAR_TICKS, last) + 1)
+    elif source == 'next':
+        state = tick + 1
     elif source == 'final':
-        state = np.full(len(row), ticks)
+        state = last
     else:
-        state = generator.integers(1, ticks + 1, size=len(row))
-        if source == 'random':
-            row = generator.integers(len(episodes), size=len(row))
+        state = generator.integers(1, last + 1)
     return _flat(episodes.achieved_goal).take(row * (ticks + 1) + state, axis=0)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
+Array64 = NDArray[np.float64]
 # An episode counts as moved when its achieved goal has left its start by this much: metres, and for
 # poses units of the quaternion, whose 0.01 is a rotation by 0.02 rad.
 MOVED_DISTANCE = 0.01
@@ -55,9 +57,27 @@ class EpisodeReplay:
     """Ring of the latest episodes in arrays allocated once."""
 
     def __init__(
-        self, capacity: int, ticks: int, observation_size: int, goal_size: int, action_size: int
+        self,
+        capacity: int,
+        ticks: int,
+        observation_size: int,
+        goal_size: int,
+        action_size: int,
+        weigh: Callable[[Episodes], NDArray[np.float64]] | None = None,
+        count_ticks: Callable[[Episodes], NDArray[np.int64]] | None = None,
     ) -> None:
-        """Allocates room for `capacity` episodes; the memory is touched as episodes arrive."""
+        """Allocates room for `capacity` episodes; the memory is touched as episodes arrive.
+
+        Args:
+            capacity: Episodes.
+            ticks: Steps per episode.
+            observation_size: Length of an observation.
+            goal_size: Length of a goal.
+            action_size: Length of an action.
+            weigh: Weights of episodes for `draw`; None is 1 where the achieved goal has moved.
+            count_ticks: How many ticks of an episode, from its first, are worth drawing; None is
+                all of them.
+        """
         if capacity < 1:
             raise ValueError(f'replay capacity {capacity} episodes; allowed: 1 or more')
         self._ring = Episodes(
@@ -66,8 +86,12 @@ class EpisodeReplay:
             desired_goal=np.zeros((capacity, goal_size), np.float32),
             action=np.zeros((capacity, ticks, action_size), np.float32),
         )
-        self._moved = np.zeros(capacity, np.bool_)
-        self._moved_rows = np.zeros(0, np.int64)
+        self._weigh = weigh or has_moved
+        self._count_ticks = count_ticks
+        self._weights = np.zeros(capacity)
+        self._valid = np.full(capacity, ticks)
+        # Sums over the rows up to each: of valid ticks, and of weights times these.
+        self._ticks_up_to, self._weight_up_to = np.zeros(0), np.zeros(0)
         self.capacity = capacity
         self._size = 0
         self._next = 0
@@ -115,30 +139,50 @@ class EpisodeReplay:
         self._ring.achieved_goal[rows] = episodes.achieved_goal
         self._ring.desired_goal[rows] = episodes.desired_goal
         self._ring.action[rows] = episodes.action
-        self._moved[rows] = has_moved(episodes)
-        self._moved_rows = np.flatnonzero(self._moved)
+        self._weights[rows] = self._weigh(episodes)
+        if self._count_ticks is not None:
+            self._valid[rows] = self._count_ticks(episodes)
         self._next = int((self._next + len(episodes)) % self.capacity)
         self._size = min(self._size + len(episodes), self.capacity)
+        valid = self._valid[: self._size] / self.ticks
+        self._ticks_up_to = np.cumsum(valid)
+        self._weight_up_to = np.cumsum(self._weights[: self._size] * valid)
+
+    @property
+    def valid_ticks(self) -> NDArray[np.int64] | None:
+        """Ticks of each episode that are worth drawing; None if all are."""
+        return None if self._count_ticks is None else self._valid[: self._size]
 
     def draw(
-        self, count: int, moved_share: float, generator: np.random.Generator
+        self, count: int, weighted_share: float, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draws episodes with replacement.
+        """Draws episodes with replacement, in proportion to their valid ticks.
 
         Args:
             count: How many.
-            moved_share: Share drawn from the episodes whose achieved goal has moved; the others
-                come from all. Where nothing has moved it has no effect.
+            weighted_share: Share drawn in proportion to weights as well. Where all weights are 0 it
+                has no effect.
             generator: Source of randomness.
 
         Returns:
             Rows of `episodes`, (count,).
         """
-        row = generator.integers(self._size, size=count)
-        chosen = np.flatnonzero(generator.random(count) < moved_share)
-        if len(self._moved_rows):
-            row[chosen] = generator.choice(self._moved_rows, size=len(chosen))
+        if self._count_ticks is None:
+            row = generator.integers(self._size, size=count)
+        else:
+            row = _draw_by(self._ticks_up_to, count, generator)
+        chosen = np.flatnonzero(generator.random(count) < weighted_share)
+        if len(chosen) and self._weight_up_to[-1] > 0.0:
+            row[chosen] = _draw_by(self._weight_up_to, len(chosen), generator)
         return row
+
+
+def _draw_by(sums: Array64, count: int, generator: np.random.Generator) -> NDArray[np.int64]:
+    """Draws rows in proportion to what each adds to `sums`."""
+    # A draw may round up to the last sum: the last row that adds something is meant.
+    last = np.searchsorted(sums, sums[-1])
+    row = np.searchsorted(sums, sums[-1] * generator.random(count), 'right')
+    return np.asarray(np.minimum(row, last))
 
 
 def has_moved(episodes: Episodes) -> NDArray[np.bool_]:

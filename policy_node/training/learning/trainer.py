@@ -123,13 +123,15 @@ class Trainer:
             [int(seed) % EVALUATION_SEED for seed in resets],
             config.noise_std,
             config.random_epsilon,
+            config.noise_spread,
         )
         return np.random.default_rng(sampler_seed)
 
     def _build_learner(self) -> None:
         config, spec = self.config, self.spec
         self.learner = DDPG(network_shape(config), config, self.device, self.workers)
-        compute_reward = scale_distance(self.simulation.metric, config.reward_distance).reward
+        shares = config.reward_distance, config.reward_rotation
+        compute_reward = scale_thresholds(self.simulation.metric, *shares).reward
         generator = self._seed(env_steps=0)
         self.experience = Experience(config, spec, self.workers, compute_reward, generator)
 
@@ -384,10 +386,12 @@ def _diagnostics(outcomes: EpisodeOutcomes | None) -> dict[str, float | None]:
     return {f'eval_{name}': value for name, value in found.items() if name != 'long_way_share'}
 
 
-def scale_distance(metric: GoalMetric, share: float) -> GoalMetric:
-    """A metric whose success distance is that of `metric` times `share`; rotations stay."""
-    distance = metric.spec.distance_threshold * share
-    return replace(metric, spec=replace(metric.spec, distance_threshold=distance))
+def scale_thresholds(metric: GoalMetric, distance: float, rotation: float) -> GoalMetric:
+    """A metric with these shares of the success distance and rotation of `metric`."""
+    spec = replace(metric.spec, distance_threshold=metric.spec.distance_threshold * distance)
+    if spec.rotation_threshold is not None:
+        spec = replace(spec, rotation_threshold=spec.rotation_threshold * rotation)
+    return replace(metric, spec=spec)
 
 
 def _run_now(function: Callable[..., Collected], *arguments: Any) -> Future[Collected]:

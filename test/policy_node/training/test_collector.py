@@ -75,6 +75,15 @@ def test_noise_has_the_spread_and_the_share_asked_for(epsilon: float) -> None:
     assert inside.std() == pytest.approx(0.1, abs=0.012)
 
 
+def test_exploration_may_differ_between_simulations() -> None:
+    simulation = Simulation('FetchReach', num_envs=5, num_threads=1)
+    collector = Collector(simulation, list(range(5)), 0.1, 0.0, noise_spread=1.0)
+    collector.exploration = 0.5
+    spread = [collector.collect(RestingPolicy(4))[0].action.std(axis=(1, 2)) for _ in range(4)]
+    expected = 0.05 * np.array([0.0, 0.5, 1.0, 1.5, 2.0])
+    assert np.mean(spread, axis=0) == pytest.approx(expected, rel=0.1)
+
+
 def test_random_actions_ignore_the_policy() -> None:
     episodes, _ = make_collector(0.0, 0.0).collect(RestingPolicy(4), random=True)
     assert episodes.action.std() == pytest.approx(1 / np.sqrt(3), abs=0.03)

@@ -90,6 +90,11 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ({'gamma': 1.0}, 'gamma 1.0; allowed: 0 ... 0.999999'),
         ({'batch_size': 0}, 'batch_size 0; allowed: 1'),
         ({'hidden_sizes': ()}, 'hidden_sizes'),
+        ({'goals': 'past=1'}, 'past'),
+        ({'goals': 'future=.5', 'strategy': 'none'}, 'excludes strategy none'),
+        ({'ticks_after_drop': 3}, 'FetchPush has no palm to drop an object from'),
+        ({'reward_rotation': 0.5}, 'goals of FetchPush have no rotation'),
+        ({'noise_spread': 1.5}, 'noise_spread 1.5; allowed: 0 ... 1'),
         ({'hidden_sizes': (0,)}, 'hidden_sizes'),
     ],
 )

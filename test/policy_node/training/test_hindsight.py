@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
-from policy_node.training.learning.hindsight import goal_mixture, relabel, sample_transitions
+from policy_node.training.learning.hindsight import (
+    goal_mixture,
+    parse_mixture,
+    relabel,
+    sample_transitions,
+)
 from policy_node.training.learning.replay import Episodes
 
 COUNT, TICKS = 6, 10
@@ -98,6 +105,70 @@ def test_futureactual_mixes_future_with_desired_goals_of_any_episode(episodes: E
     assert (goal[~is_desired, 1] > tick[~is_desired]).all()
     own = (goal[is_desired, 0] == 100 + row[is_desired]).mean()
     assert own == pytest.approx(1 / 3 + 2 / 3 / COUNT, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ('text', 'mixture'),
+    [
+        ('future=.4,actual=.4', {'future': 0.4, 'actual': 0.4, 'real': 0.2}),
+        ('near=1', {'near': 1.0}),
+        ('real=.5, next=.25', {'real': 0.75, 'next': 0.25}),
+    ],
+)
+def test_goal_sources_can_be_mixed(text: str, mixture: dict[str, float]) -> None:
+    assert parse_mixture(text) == pytest.approx(mixture)
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('past=.4', "'past'; allowed, once each: "),
+        ('future=.4,future=.4', "'future'; allowed, once each: "),
+        ('future', "'future' is not source=share"),
+        ('future=.8,actual=.3', 'add up to at most 1'),
+        ('future=-1', 'add up to at most 1'),
+        ('future=nan', 'add up to at most 1'),
+        ('', "''; allowed, once each: "),
+    ],
+)
+def test_a_bad_mixture_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        parse_mixture(text)
+
+
+def numbered(count: int, ticks: int) -> Episodes:
+    """Achieved goals are (episode, state)."""
+    row, state = np.meshgrid(np.arange(count), np.arange(ticks + 1), indexing='ij')
+    achieved = np.stack([row, state], axis=-1).astype(np.float32)
+    return Episodes(achieved, achieved, np.full((count, 2), -1, np.float32), achieved[:, :ticks])
+
+
+def test_next_and_near_goals_are_what_holding_needs() -> None:
+    episodes, generator = numbered(3, 40), np.random.default_rng(1)
+    row, tick = generator.integers(3, size=20_000), generator.integers(40, size=20_000)
+    goal = relabel(episodes, row, tick, {'next': 1.0}, generator)
+    assert (goal == np.stack([row, tick + 1], axis=-1)).all()
+    goal = relabel(episodes, row, tick, {'near': 1.0}, generator)
+    ahead = goal[:, 1] - tick
+    assert (goal[:, 0] == row).all() and set(ahead[tick < 30]) == set(range(1, 11))
+    assert (goal[:, 1] <= 40).all() and set(ahead[tick == 37]) == {1, 2, 3}
+
+
+@pytest.mark.parametrize('source', ['future', 'final', 'episode', 'random', 'next', 'near'])
+def test_nothing_is_drawn_from_after_the_last_valid_tick(source: str) -> None:
+    """Neither transitions nor goals: episode 0 is worth 5 ticks, 1 is worth 20, 2 all 40."""
+    episodes, valid = numbered(3, 40), np.array([5, 20, 40])
+    generator = np.random.default_rng(2)
+    row = generator.integers(3, size=20_000)
+    reward = lambda achieved, desired: np.zeros(len(achieved))  # noqa: E731
+    batch = sample_transitions(episodes, row, {source: 1.0}, reward, generator, valid)
+    for values, least in ((batch.observation, 0), (batch.goal, 1)):
+        episode, state = values[:, 0].astype(int), values[:, 1]
+        assert (state < valid[episode] + least).all()
+        if values is batch.observation:
+            assert all(set(state[episode == e]) == set(range(valid[e])) for e in range(3))
+    if source == 'final':
+        assert (batch.goal[:, 1] == valid[row]).all()
 
 
 def test_batches_are_consistent_transitions_with_recomputed_rewards(episodes: Episodes) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
@@ -21,7 +22,12 @@ from policy_node.training.learning.config import TrainConfig, recipe_config
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.logged_episodes import read_experience
 from policy_node.training.learning.run_log import read_progress
-from policy_node.training.learning.trainer import Collected, Trainer, TrainingError, scale_distance
+from policy_node.training.learning.trainer import (
+    Collected,
+    Trainer,
+    TrainingError,
+    scale_thresholds,
+)
 from policy_node.training.learning.training_state import read_state
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
@@ -202,9 +208,10 @@ def test_workers_share_logged_episodes_and_a_resumed_run_counts_them_once(
     resumed.resume(tmp_path / 'training_state.safetensors')
     resumed.workers = dataclasses.replace(resumed.workers, rank=1, world_size=3)
     resumed.add_experience(episodes)
-    assert len(resumed.experience.replay) == 4
-    held = resumed.experience.replay.episodes
-    np.testing.assert_array_equal(held.action, episodes.action[1::3])
+    # The eight of the run, which are kept beside its state, and a third of the twelve.
+    assert len(resumed.experience.replay) == 8 + 4
+    added = resumed.experience.replay.newest(4)
+    np.testing.assert_array_equal(added.action, episodes.action[1::3])
     after = resumed.experience.statistics['observation_statistics'].state()
     assert all(torch.equal(before[name], after[name]) for name in before)
 
@@ -228,7 +235,7 @@ def test_training_may_ask_for_less_distance_than_the_task(tmp_path: Path) -> Non
     goals = np.zeros((2, 3))
     achieved = np.array([[0.02, 0.0, 0.0], [0.03, 0.0, 0.0]])
     trainer = Trainer(small_config(reward_distance=0.5), tmp_path, Workers())
-    closer = scale_distance(trainer.simulation.metric, 0.5)
+    closer = scale_thresholds(trainer.simulation.metric, 0.5, 1.0)
     assert closer.reward(achieved, goals).tolist() == [0.0, -1.0]
     assert trainer.simulation.compute_reward(achieved, goals).tolist() == [0.0, 0.0]
     trainer.experience.replay.add(trainer.collector.collect(trainer.learner.actor)[0])
@@ -238,6 +245,39 @@ def test_training_may_ask_for_less_distance_than_the_task(tmp_path: Path) -> Non
     clear = np.abs(distance - 0.025) > 1e-4
     np.testing.assert_array_equal(batch.reward[clear] == 0.0, distance[clear] < 0.025)
     assert ((0.025 < distance) & (distance < 0.05)).any()
+
+
+def test_training_may_ask_for_less_rotation_than_the_task(tmp_path: Path) -> None:
+    """EggRotate succeeds within 0.1 rad; at 0.6 of it a goal 0.08 rad away is not reached."""
+    metric = Simulation('HandManipulateEggRotate', num_envs=1, num_threads=1).metric
+    angle = np.array([0.05, 0.08, 0.12])
+    goal = np.zeros((3, 7))
+    goal[:, 3] = 1.0
+    achieved = goal.copy()
+    achieved[:, 3], achieved[:, 4] = np.cos(angle / 2), np.sin(angle / 2)
+    assert metric.reward(achieved, goal).tolist() == [0.0, 0.0, -1.0]
+    tighter = scale_thresholds(metric, 1.0, 0.6)
+    assert tighter.reward(achieved, goal).tolist() == [0.0, -1.0, -1.0]
+
+
+def test_evaluation_sees_nothing_of_what_training_may_change(tmp_path: Path) -> None:
+    """The same actor gets the same evaluation, whatever the rewards and draws of training are."""
+    task, small = 'HandManipulatePenRotate', {'num_envs': 2, 'evaluation_episodes': 2}
+    changes = {'reward_rotation': 20.0, 'reward_distance': 0.1, 'noise_spread': 1.0, 'gamma': 0.5}
+    changes |= {'ticks_after_drop': 2, 'goals': 'next=1', 'episode_weights': 'energy'}
+    results = []
+    for extra in ({}, changes):
+        torch.manual_seed(0)
+        config = recipe_config(task, 'best', simulation_threads=1, **small, **extra)
+        trainer = Trainer(config, tmp_path, Workers())
+        actor = trainer.learner.evaluation_actor()
+        trainer.counters.updates = 1
+        actor, _, evaluated = trainer._request()
+        outcomes = trainer._collect(actor, True, evaluated).evaluation
+        assert outcomes is not None
+        results.append([getattr(outcomes, name) for name in outcomes.__slots__])
+    for first, second in zip(*results, strict=True):
+        np.testing.assert_array_equal(first, second)
 
 
 def test_an_unfitting_state_is_refused_in_one_line(tmp_path: Path) -> None:

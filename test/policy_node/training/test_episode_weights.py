@@ -1,0 +1,131 @@
+"""Weights of episodes and ticks that are worth drawing, on episodes whose answers are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from msgs_spec.tasks import GoalKind, task_spec
+from policy_node.training.learning.config import recipe_config
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.episode_weights import (
+    episode_energy,
+    episode_weights,
+    ticks_until_dropped,
+)
+from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.replay import EpisodeReplay, Episodes
+
+PEN = task_spec('HandManipulatePenRotate')
+TICKS = 10
+
+
+def episodes_of(achieved: np.ndarray) -> Episodes:
+    """Episodes with these achieved goals (episodes, T + 1, goal size)."""
+    achieved = np.asarray(achieved, np.float32)
+    count, states, _ = achieved.shape
+    return Episodes(
+        achieved, achieved, achieved[:, 0], np.zeros((count, states - 1, 1), np.float32)
+    )
+
+
+def poses(heights: np.ndarray) -> np.ndarray:
+    """Poses (episodes, T + 1, 7) at these heights, not turned."""
+    achieved = np.zeros((*heights.shape, 7))
+    achieved[..., 2], achieved[..., 3] = heights, 1.0
+    return achieved
+
+
+def test_energy_is_what_lifting_throwing_and_turning_give() -> None:
+    time = np.arange(TICKS + 1) / 25.0
+    lifted = poses(np.minimum(np.arange(TICKS + 1), 3)[None] * 0.01)
+    at_rest = poses(np.full((1, TICKS + 1), 0.2))
+    turned = at_rest.copy()
+    # At rest for three ticks, then turning at 1 rad/s: half a joule for unit inertia.
+    angle = np.maximum(time - time[3], 0.0)
+    turned[..., 3], turned[..., 4] = np.cos(angle / 2), np.sin(angle / 2)
+    everything = episodes_of(np.concatenate([lifted, at_rest, turned, -turned]))
+    energy = episode_energy(everything, GoalKind.POSE, 25.0)
+    # From 1 cm on, when it already moves: 2 cm higher is the last rise before it stops.
+    assert energy[0] == pytest.approx(9.81 * 0.02, abs=1e-3)
+    assert energy[1] == 0.0
+    assert energy[2:] == pytest.approx(0.5, abs=1e-3)
+    slide = np.zeros((1, TICKS + 1, 3))
+    # 0.5 m/s from the second tick on: an eighth of a joule.
+    slide[0, :, 0] = 0.5 * np.maximum(time - time[1], 0.0)
+    assert episode_energy(episodes_of(slide), GoalKind.POINT, 25.0) == pytest.approx(
+        0.125, abs=1e-4
+    )
+
+
+def test_the_clip_bounds_what_one_tick_may_add() -> None:
+    thrown = np.zeros((1, TICKS + 1, 3))
+    thrown[0, 5:, 0] = 1.0
+    assert episode_energy(episodes_of(thrown), GoalKind.POINT, 25.0) == pytest.approx(0.5)
+
+
+def test_ticks_count_until_some_after_the_drop() -> None:
+    heights = np.full((4, TICKS + 1), 0.2)
+    heights[1, 4:] = 0.03
+    heights[2, 10:] = 0.03
+    heights[3, 1:] = 0.03
+    episodes = episodes_of(poses(heights))
+    for more, expected in ((0, [10, 4, 10, 1]), (2, [10, 6, 10, 3]), (99, [10] * 4)):
+        count = ticks_until_dropped(PEN, more)
+        assert count is not None and count(episodes).tolist() == expected
+    assert ticks_until_dropped(PEN, -1) is None
+    assert ticks_until_dropped(task_spec('FetchPush'), 3) is None
+
+
+def test_every_valid_transition_is_as_likely_as_any_other() -> None:
+    heights = np.full((3, TICKS + 1), 0.2)
+    heights[0, 2:] = 0.0
+    replay = EpisodeReplay(8, TICKS, 7, 7, 1, count_ticks=ticks_until_dropped(PEN, 0))
+    replay.add(episodes_of(poses(heights)))
+    row = replay.draw(22_000, 0.0, np.random.default_rng(0))
+    assert np.bincount(row) / 22_000 == pytest.approx([2 / 22, 10 / 22, 10 / 22], abs=0.012)
+
+
+def test_weights_decide_their_share_of_a_draw() -> None:
+    def weigh(episodes: Episodes) -> np.ndarray:
+        return episodes.achieved_goal[:, 0, 0].astype(float)
+
+    replay, generator = EpisodeReplay(4, TICKS, 3, 3, 1, weigh=weigh), np.random.default_rng(0)
+    achieved = np.zeros((4, TICKS + 1, 3))
+    replay.add(episodes_of(achieved))
+    assert set(replay.draw(1000, 1.0, generator)) == {0, 1, 2, 3}, 'no weight has no effect'
+    achieved[:, :, 0] = np.array([0, 1, 3, 0])[:, None]
+    replay.add(episodes_of(achieved))
+    drawn = np.bincount(replay.draw(20_000, 1.0, generator), minlength=4) / 20_000
+    assert drawn == pytest.approx([0, 1 / 4, 3 / 4, 0], abs=0.012)
+    drawn = np.bincount(replay.draw(20_000, 0.5, generator), minlength=4) / 20_000
+    assert drawn == pytest.approx([1 / 8, 1 / 4, 1 / 2, 1 / 8], abs=0.012)
+
+
+def test_a_batch_follows_the_configuration() -> None:
+    """Energy alone draws the one episode that was lifted, and only until its drop."""
+    changes = {'moved_share': 1.0, 'episode_weights': 'energy', 'ticks_after_drop': 1}
+    config = recipe_config(
+        'HandManipulatePenRotate', 'best', batch_size=500, num_envs=3, goals='next=1', **changes
+    )
+    heights = np.full((3, PEN.episode_ticks + 1), 0.2)
+    heights[1, 3:] += 0.01 * np.arange(PEN.episode_ticks - 2)
+    heights[1, 20:] = 0.0
+    achieved = poses(heights)
+    achieved[..., 0] = np.arange(3)[:, None]
+    achieved[..., 1] = np.arange(PEN.episode_ticks + 1)
+    observation = np.zeros((3, PEN.episode_ticks + 1, PEN.observation_size))
+    observation[..., -7:] = achieved
+    episodes = Episodes(
+        *(values.astype(np.float32) for values in (observation, achieved, achieved[:, 0])),
+        np.zeros((3, PEN.episode_ticks, 20), np.float32),
+    )
+    reward = lambda achieved, desired: -np.ones(len(achieved))  # noqa: E731
+    experience = Experience(config, PEN, Workers(), reward, np.random.default_rng(0))
+    experience.replay.add(episodes)
+    batch = experience.batch(env_steps=0)
+    assert set(batch.observation[:, -7]) == {1.0}
+    assert set(batch.observation[:, -6]) == set(range(21))
+    assert (batch.goal == batch.next_observation[:, -7:]).all()
+    weights = episode_weights('moved', PEN, 25.0)(episodes)
+    assert weights.tolist() == [1.0, 1.0, 1.0], 'metres along y count as moved'
