@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 import fcntl
-import importlib.util
 import json
 import os
 import shlex
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
@@ -249,8 +249,10 @@ def test_an_unknown_arm_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert 'ddpg_sparse' in capsys.readouterr().err
 
 
-@pytest.mark.skipif(importlib.util.find_spec('ray') is not None, reason='Ray is installed')
-def test_a_missing_ray_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_ray_is_named(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, 'ray', None)
     assert main(['--ray']) == 2
     assert "pip install 'fetch_hand_sim[cluster]'" in capsys.readouterr().err
 
