@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -27,12 +28,16 @@ from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import EpisodeReadError, read_episode
 from msgs_spec.codecs import decode_status
+from msgs_spec.command_line import EXIT_SUCCESS, complain, require_extra, run_command
 from msgs_spec.ros import StopSignals, keep_discovery_local, rclpy_profile, ros_message_class
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
 
+_NAME = 'demo'
 _START_TIMEOUT = 60.0
+# What shells add to the number of the signal that ended a command.
+_SIGNALLED = 128
 _COLUMNS = '{:>7}  {:>5}  {:>5}  {:>7}  {:<7}  {}'
 
 
@@ -119,13 +124,16 @@ class Demo:
 
     def run(self, stop: StopSignals) -> int:
         """Runs the demo and returns the exit code."""
+        checkpoint = self._checkpoint()
         watcher = Watcher(self._spec)
         began = time.monotonic()
         with _logs() as logs:
-            policy = start_node('policy_node', [f'checkpoint:={self._checkpoint()}'], logs)
+            policy = start_node('policy_node', [f'checkpoint:={checkpoint}'], logs)
             sim = start_node('sim_node', self._sim_parameters(), logs)
             try:
                 self._watch(watcher, sim, policy, stop)
+                if stop:
+                    complain(_NAME, 'stopping')
             finally:
                 codes = [stop_node(process) for process in (sim, policy)]
                 watcher.close()
@@ -135,12 +143,13 @@ class Demo:
                 self._console.print(f'the nodes ended with exit codes {codes}')
                 return 1
         self._print_summary(time.monotonic() - began)
-        return 0
+        return _SIGNALLED + signal.Signals[stop.received] if stop.received else EXIT_SUCCESS
 
     def _checkpoint(self) -> str:
         if self._options.checkpoint:
             return str(self._options.checkpoint)
         if is_actor_shipped(self._spec.name):
+            require_extra('actors')
             return self._spec.name
         self._console.print(f'No actor is shipped for {self._spec.name} yet: commands are random.')
         return 'random'
@@ -162,7 +171,7 @@ class Demo:
         stop: StopSignals,
     ) -> None:
         columns = (TextColumn('{task.description}'), BarColumn(), TextColumn('{task.fields[note]}'))
-        print(_COLUMNS.format('episode', 'seed', 'steps', 'return', 'success', 'file'))
+        print(_COLUMNS.format('episode', 'seed', 'steps', 'return', 'success', 'file'), flush=True)
         deadline = time.monotonic() + _START_TIMEOUT
         with Progress(*columns, console=self._console, transient=True) as progress:
             bar = progress.add_task('starting', total=self._spec.episode_ticks, note='')
@@ -222,7 +231,7 @@ def _logs() -> Iterator[IO[str]]:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog='fetch_hand_sim.commands.demo', description=__doc__)
+    parser = argparse.ArgumentParser(prog='fetch_hand_sim demo', description=__doc__)
     parser.add_argument('--task', default='FetchReach', help='one of the thirteen tasks')
     parser.add_argument('--episodes', type=int, default=5, help='how many episodes')
     parser.add_argument('--seed', type=int, default=0, help='seed of the first episode')
@@ -243,6 +252,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the demo; returns the exit code."""
     options = _parse(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     keep_discovery_local()
     os.environ.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
     stop = StopSignals()
