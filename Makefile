@@ -34,7 +34,7 @@ help:
 	@echo 'make bench-lockstep  ticks per second of two nodes against the limit of the middleware'
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
 	@echo 'make torture    100,000 hostile messages per test, an hour of memory at 20x, 50 killed'
-	@echo '                robots and 10,000 damaged episode files'
+	@echo '                robots, 10,000 damaged and 2,000 crafted episode files'
 	@echo 'make test-release  build wheel and sdist, install them elsewhere, run the demo from there'
 	@echo 'make bench-episodes  what logging costs and how fast logs load'
 	@echo 'make env        only create $(VENV)'
@@ -95,7 +95,7 @@ torture: env
 	$(BIN)/python -m pytest --hostile-messages 100000 --soak-seconds 3600 --timeout 0 \
 		test/fetch_hand_sim/sim_node/test_receivers.py \
 		test/policy_node/node/test_responder.py test/nodes/test_nodes_hostile.py
-	EPISODE_KILLS=50 EPISODE_LIFE=3 EPISODE_MUTATIONS=10000 $(BIN)/python -m pytest --timeout 0 -s \
+	EPISODE_KILLS=50 EPISODE_LIFE=3 EPISODE_MUTATIONS=10000 EPISODE_CRAFTED=2000 $(BIN)/python -m pytest --timeout 0 -s \
 		test/fetch_hand_sim/episode_log/test_episode_endings.py \
 		test/fetch_hand_sim/episode_log/test_episode_untrusted.py
 

@@ -16,6 +16,7 @@ from fetch_hand_sim.episodes.export import ExportError, export_minari, export_pa
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
+    EXIT_USAGE,
     CommandError,
     UsageError,
     complain,
@@ -54,6 +55,8 @@ def _run(options: argparse.Namespace) -> int:
         raise UsageError(str(error)) from None
     for reason in skipped:
         complain(_NAME, f'skipped {reason}')
+    if not episodes and skipped:
+        return EXIT_USAGE
     if not episodes:
         raise UsageError(f'{options.path} holds no episode')
     by_task: dict[str, list[EpisodeArrays]] = {}

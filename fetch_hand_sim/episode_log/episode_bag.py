@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.bag_file import BagFile
 from fetch_hand_sim.episode_log.bag_metadata import metadata_record, metadata_yaml
+from fetch_hand_sim.episode_log.limits import MAX_METADATA_BYTES
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 
 # Names of the metadata records; of the two `rosbag2` ones readers take the last.
 EPISODE, EPISODE_RESULT, ROSBAG2 = 'episode', 'episode_result', 'rosbag2'
+
+
+def checked_strings(content: Mapping[str, str]) -> dict[str, str]:
+    """Returns a copy of the contents of a record, if they can be written and read back.
+
+    Raises:
+        ValueError: If they are no strings, on which MCAP would fail in the middle of the file, or
+            too long.
+    """
+    for key, value in content.items():
+        if not isinstance(key, str) or not isinstance(value, str):
+            raise ValueError(f'episode metadata are strings, not {key!r}: {value!r}')
+    size = sum(len(text.encode()) for item in content.items() for text in item)
+    if size > MAX_METADATA_BYTES:
+        raise ValueError(f'{size} bytes of episode metadata; allowed: {MAX_METADATA_BYTES}')
+    return dict(content)
 
 
 def begin_bag(

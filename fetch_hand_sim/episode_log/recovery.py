@@ -17,6 +17,7 @@ from fetch_hand_sim.episode_log.episode_bag import (
     EPISODE,
     EPISODE_RESULT,
     begin_bag,
+    checked_strings,
     end_bag,
     store_bag,
 )
@@ -195,7 +196,7 @@ def _replace(file: Path, remains: _Remains) -> None:
 
 def _write(stream: BinaryIO, file: Path, remains: _Remains) -> str:
     """Writes the file anew, as far as a writer would have gone; returns its description."""
-    metadata = remains.metadata[EPISODE]
+    metadata = checked_strings(remains.metadata[EPISODE])
     bag = begin_bag(stream, file.name, LogSettings(), metadata, remains.attachments)
     specs = {id: _channel_spec(remains, channel) for id, channel in remains.channels.items()}
     received = ReceivedAllowance()
@@ -204,7 +205,7 @@ def _write(stream: BinaryIO, file: Path, remains: _Remains) -> str:
         name = spec.topic.rpartition('/')[2]
         if name not in _RECEIVED or received.takes(name, len(message.data)):
             bag.write(spec, message.data, message.log_time)
-    return end_bag(bag, stream, metadata, remains.result)
+    return end_bag(bag, stream, metadata, checked_strings(remains.result))
 
 
 def _channel_spec(remains: _Remains, channel: records.Channel) -> ChannelSpec:

@@ -10,12 +10,11 @@ from pathlib import Path
 
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.bag_file import ChannelSpec
-from fetch_hand_sim.episode_log.episode_bag import begin_bag, end_bag, store_bag
+from fetch_hand_sim.episode_log.episode_bag import begin_bag, checked_strings, end_bag, store_bag
 from fetch_hand_sim.episode_log.errors import EpisodeLogError
 from fetch_hand_sim.episode_log.limits import (
     MAX_ATTACHMENT_BYTES,
     MAX_CHUNKS,
-    MAX_METADATA_BYTES,
     ReceivedAllowance,
 )
 from fetch_hand_sim.episode_log.log_times import log_time
@@ -23,17 +22,6 @@ from fetch_hand_sim.episode_log.offered_qos import offered_qos
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from msgs_spec.schemas import schema_text, type_hash
 from msgs_spec.topics import TopicSpec
-
-
-def _strings(content: Mapping[str, str]) -> dict[str, str]:
-    """A copy, after a check: MCAP would fail on anything else in the middle of the file."""
-    for key, value in content.items():
-        if not isinstance(key, str) or not isinstance(value, str):
-            raise ValueError(f'episode metadata are strings, not {key!r}: {value!r}')
-    size = sum(len(text.encode()) for item in content.items() for text in item)
-    if size > MAX_METADATA_BYTES:
-        raise ValueError(f'{size} bytes of episode metadata; allowed: {MAX_METADATA_BYTES}')
-    return dict(content)
 
 
 def _reason(error: OSError) -> str:
@@ -79,7 +67,7 @@ class EpisodeWriter:
         settings: LogSettings | None = None,
         namespace: str = '/',
     ) -> None:
-        self._metadata = {'episode_id': name, **_strings(metadata)}
+        self._metadata = {'episode_id': name, **checked_strings(metadata)}
         attached = sum(len(each.data) for each in attachments)
         if attached > MAX_ATTACHMENT_BYTES:
             raise ValueError(f'{attached} bytes attached; allowed: {MAX_ATTACHMENT_BYTES}')
@@ -276,7 +264,7 @@ class EpisodeWriter:
     def _end(self, result: dict[str, str]) -> bool:
         if self._received.omitted:
             result['received_not_logged'] = json.dumps(self._received.omitted)
-        record = _strings(result)
+        record = checked_strings(result)
         if not self._is_open:
             return False
         try:
