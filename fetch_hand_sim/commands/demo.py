@@ -26,7 +26,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
-from fetch_hand_sim.episode_log import EpisodeReadError, read_episode
+from fetch_hand_sim.episode_log import EpisodeReadError, EpisodeRecord, read_episode
 from msgs_spec.codecs import decode_status
 from msgs_spec.command_line import EXIT_SUCCESS, complain, require_extra, run_command
 from msgs_spec.ros import StopSignals, keep_discovery_local, rclpy_profile, ros_message_class
@@ -60,12 +60,13 @@ class Row:
             EpisodeReadError: If it is not a complete episode.
         """
         episode = read_episode(path)
+        record, outcome = EpisodeRecord.parse(episode.metadata), episode.outcome
         return cls(
-            episode=int(episode.metadata['episode']),
-            seed=int(episode.metadata['seed']),
-            steps=int(episode.result['steps']),
-            episode_return=float(episode.result['return']),
-            is_success=episode.result['success'] == 'true',
+            episode=record.episode,
+            seed=record.seed,
+            steps=outcome.steps or 0,
+            episode_return=outcome.episode_return or 0.0,
+            is_success=outcome.is_success is True,
             path=path,
         )
 

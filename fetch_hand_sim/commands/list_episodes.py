@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from fetch_hand_sim.episode_log import (
     find_leftovers,
     read_summary,
 )
+from fetch_hand_sim.episode_log.episode_record import integer_or_none
 from fetch_hand_sim.episode_log.summary import EpisodeSummary
 from msgs_spec.command_line import (
     EXIT_FAILURE,
@@ -59,11 +59,11 @@ class Filter:
 
     def accepts(self, episode: EpisodeSummary) -> bool:
         """Whether an episode is to be shown."""
-        is_success = episode.result.get('success') == 'true'
+        outcome = episode.outcome
         return (
             self.task in (None, episode.metadata.get('task'))
-            and self.success in (None, is_success)
-            and self.complete in (None, episode.is_complete)
+            and self.success in (None, outcome.is_success is True)
+            and self.complete in (None, outcome.is_complete)
         )
 
 
@@ -93,26 +93,23 @@ def make_table(episodes: Sequence[EpisodeSummary]) -> Table:
 
 
 def _cells(episode: EpisodeSummary) -> list[str]:
-    metadata, result = episode.metadata, episode.result
-    success = {'true': 'yes', 'false': 'no'}
+    metadata, outcome = episode.metadata, episode.outcome
+    success = {True: 'yes', False: 'no', None: '?'}
     return [
         episode.path.stem.removesuffix('_0'),
         metadata.get('task', '?'),
         metadata.get('seed', '?'),
-        result.get('steps', '?'),
-        _short(result.get('return', '?')),
-        success.get(result.get('success', ''), '?'),
+        _known(outcome.steps),
+        _known(outcome.episode_return),
+        success[outcome.is_success],
         f'{episode.duration_s:.2f}',
         f'{episode.size_bytes / 1024:.0f}',
-        'complete' if episode.is_complete else f'interrupted: {result.get("reason", "?")}',
+        'complete' if outcome.is_complete else f'interrupted: {outcome.reason or "?"}',
     ]
 
 
-def _short(number: str) -> str:
-    try:
-        return f'{float(number):g}'
-    except ValueError:
-        return number
+def _known(number: float | None) -> str:
+    return '?' if number is None else f'{number:g}'
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -152,7 +149,7 @@ def _run(options: argparse.Namespace) -> int:
         print(json.dumps([_as_json(episode) for episode in shown], indent=2))
     else:
         _print_table(shown)
-        successes = sum(episode.result.get('success') == 'true' for episode in shown)
+        successes = sum(episode.outcome.is_success is True for episode in shown)
         filtered = len(episodes) - len(shown)
         print(f'{len(shown)} episodes, {successes} successes; {filtered} filtered')
     for leftover in leftovers:
@@ -173,27 +170,19 @@ def _print_table(episodes: Sequence[EpisodeSummary]) -> None:
 
 def _as_json(episode: EpisodeSummary) -> dict[str, Any]:
     """The row of an episode with values in their own types, None where the file says nothing."""
-    metadata, result = episode.metadata, episode.result
+    metadata, outcome = episode.metadata, episode.outcome
     return {
         'path': str(episode.path),
         'task': metadata.get('task'),
-        'seed': _number(metadata.get('seed'), int),
-        'steps': _number(result.get('steps'), int),
-        'return': _number(result.get('return'), float),
-        'success': {'true': True, 'false': False}.get(result.get('success', '')),
+        'seed': integer_or_none(metadata, 'seed'),
+        'steps': outcome.steps,
+        'return': outcome.episode_return,
+        'success': outcome.is_success,
         'seconds': episode.duration_s,
         'bytes': episode.size_bytes,
-        'complete': episode.is_complete,
-        'reason': None if episode.is_complete else result.get('reason'),
+        'complete': outcome.is_complete,
+        'reason': outcome.reason,
     }
-
-
-def _number(text: str | None, kind: type[int] | type[float]) -> float | None:
-    try:
-        value = kind(text or '')
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
 
 
 if __name__ == '__main__':

@@ -2,6 +2,7 @@
 
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episodes
 from fetch_hand_sim.episode_log.episode_metadata import episode_metadata
+from fetch_hand_sim.episode_log.episode_record import EpisodeOutcome, EpisodeRecord
 from fetch_hand_sim.episode_log.episodes import EpisodeDirectory, episode_name
 from fetch_hand_sim.episode_log.errors import EpisodeExistsError, EpisodeLogError, EpisodeReadError
 from fetch_hand_sim.episode_log.leftovers import Leftover, find_leftovers
@@ -24,7 +25,9 @@ __all__ = [
     'EpisodeDirectory',
     'EpisodeExistsError',
     'EpisodeLogError',
+    'EpisodeOutcome',
     'EpisodeReadError',
+    'EpisodeRecord',
     'EpisodeSummary',
     'EpisodeWriter',
     'Leftover',

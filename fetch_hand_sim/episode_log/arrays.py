@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
+from fetch_hand_sim.episode_log.episode_record import EpisodeOutcome, EpisodeRecord, HasOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.messages import MessageFile, MessageRows, read_messages
 from fetch_hand_sim.episode_log.summary import expand_episodes
 from msgs_spec.actions import action_from_command
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.observations import ObservationAssembler
-from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.topics import topic
 
@@ -26,7 +26,7 @@ Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class EpisodeArrays:
+class EpisodeArrays(HasOutcome):
     """One episode of N steps.
 
     Step k leads from observation k to observation k + 1.
@@ -43,8 +43,9 @@ class EpisodeArrays:
         truncated: (N,): True at the last step, where time, divergence or an interruption ended it.
         success: (N + 1,): whether the goal was reached.
         stamps: (N + 1,) simulated time, nanoseconds.
-        metadata: The record `episode`.
-        result: The record `episode_result`.
+        metadata: The record `episode`, and
+        record: the same, typed.
+        result: The record `episode_result`; `outcome` is the same, typed.
     """
 
     path: Path
@@ -58,6 +59,7 @@ class EpisodeArrays:
     success: Flags
     stamps: NDArray[np.int64]
     metadata: dict[str, str]
+    record: EpisodeRecord
     result: dict[str, str]
 
     def __len__(self) -> int:
@@ -67,11 +69,6 @@ class EpisodeArrays:
     def goals(self) -> Array:
         """Desired goals, (N + 1, goal size); they change where somebody set another."""
         return self.observations['desired_goal']
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the episode ran to its end; False if it was interrupted."""
-        return self.result.get('complete') == 'true'
 
 
 def load_episodes(
@@ -127,10 +124,10 @@ class _Decoder:
     """Decodes the topics of one file and joins them by tick."""
 
     def __init__(self, file: MessageFile) -> None:
-        metadata = file.metadata[EPISODE]
         self._file = file
-        self._task = task_spec(metadata['task'], metadata.get('joint_prefix', JOINT_PREFIX))
-        self._assembler = _assembler(self._task, float(metadata['control_hz']))
+        self._record = EpisodeRecord.parse(file.metadata[EPISODE])
+        self._task = self._record.task
+        self._assembler = _assembler(self._task, self._record.control_hz)
         self._resolved = {name.rpartition('/')[2]: name for name in file.offsets}
 
     def decode(self) -> EpisodeArrays:
@@ -144,8 +141,9 @@ class _Decoder:
         rewards = self._steps('reward', stamps)[:, 0]
         commands = self._steps('applied_command', stamps)
         steps = ticks - 1
-        if result.get('steps', str(steps)) != str(steps) and result.get('complete') == 'true':
-            raise ValueError(f'it says {result["steps"]} steps and holds {steps}')
+        outcome = EpisodeOutcome.parse(result)
+        if outcome.is_complete and outcome.steps not in (None, steps):
+            raise ValueError(f'it says {outcome.steps} steps and holds {steps}')
         return EpisodeArrays(
             path=self._file.path,
             spec=task_spec(self._task.name),
@@ -158,6 +156,7 @@ class _Decoder:
             success=self._decoded('is_success', success, stamps, first=0)[:, 0] != 0.0,
             stamps=stamps,
             metadata=metadata,
+            record=self._record,
             result=result,
         )
 

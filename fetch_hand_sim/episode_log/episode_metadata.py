@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 
@@ -79,12 +78,3 @@ def episode_metadata(
         **{f'{package}_version': _version(package) for package in _PACKAGES},
     }
     return {key: value for key, value in known.items() if value is not None}
-
-
-def interface_version(metadata: Mapping[str, str]) -> int:
-    """Returns the `INTERFACE_VERSION` an episode was written with.
-
-    Raises:
-        ValueError: If it is no number.
-    """
-    return int(metadata.get('interface_version', '1'))

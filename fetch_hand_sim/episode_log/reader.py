@@ -15,6 +15,7 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metadata, Schema
 
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
+from fetch_hand_sim.episode_log.episode_record import HasOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeReadError, one_line
 from fetch_hand_sim.episode_log.limits import MAX_SUMMARY_BYTES
 from fetch_hand_sim.episode_log.untrusted import read_records, require_size
@@ -70,7 +71,7 @@ class LoggedTopic:
 
 
 @dataclass(frozen=True, slots=True)
-class Episode:
+class Episode(HasOutcome):
     """What a file says.
 
     Attributes:
@@ -86,11 +87,6 @@ class Episode:
     metadata: dict[str, str]
     result: dict[str, str]
     attachments: dict[str, bytes]
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the episode ran to its end; False if it was interrupted."""
-        return self.result.get('complete') == 'true'
 
 
 def read_episode(path: Path | str) -> Episode:

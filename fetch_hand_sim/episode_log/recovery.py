@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,6 +21,7 @@ from fetch_hand_sim.episode_log.episode_bag import (
     end_bag,
     store_bag,
 )
+from fetch_hand_sim.episode_log.episode_record import EpisodeOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeLogError, one_line
 from fetch_hand_sim.episode_log.leftovers import inspect_leftover
 from fetch_hand_sim.episode_log.limits import ReceivedAllowance
@@ -77,20 +78,22 @@ class _Remains:
         """How the episode ended; only a file that is whole knows."""
         if self.is_whole and EPISODE_RESULT in self.metadata:
             return self.metadata[EPISODE_RESULT]
-        return {**self._outcome(), 'complete': 'false', 'reason': 'cut off, recovered later'}
+        return self._outcome().to_strings()
 
-    def _outcome(self) -> dict[str, str]:
+    def _outcome(self) -> EpisodeOutcome:
         """Steps, return and success up to the last whole tick."""
+        cut_off = EpisodeOutcome(is_complete=False, reason='cut off, recovered later')
         # Of the topics with a number per tick, `applied_command` comes last.
         steps = len(self._values('applied_command'))
         rewards, successes = self._values('reward'), self._values('is_success')
         if len(rewards) < steps or len(successes) <= steps:
-            return {}
-        return {
-            'steps': str(steps),
-            'return': repr(float(sum(rewards[:steps]))),
-            'success': str(bool(successes[steps])).lower(),
-        }
+            return cut_off
+        return replace(
+            cut_off,
+            steps=steps,
+            episode_return=float(sum(rewards[:steps])),
+            is_success=bool(successes[steps]),
+        )
 
     def _values(self, name: str) -> list[Any]:
         """The `data` of all messages of a topic of std_msgs."""

@@ -15,6 +15,7 @@ from mcap.stream_reader import read_magic
 
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
+from fetch_hand_sim.episode_log.episode_record import HasOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.reader import check_summary, mcap_file, one_line_errors
 from fetch_hand_sim.episode_log.untrusted import BoundedStream, Records
@@ -27,7 +28,7 @@ _AT_THE_END = frozenset({Opcode.FOOTER, Opcode.STATISTICS, Opcode.METADATA_INDEX
 
 
 @dataclass(frozen=True, slots=True)
-class EpisodeSummary:
+class EpisodeSummary(HasOutcome):
     """An episode without its messages.
 
     Attributes:
@@ -45,11 +46,6 @@ class EpisodeSummary:
     message_count: int
     duration_s: float
     size_bytes: int
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the episode ran to its end; False if it was interrupted."""
-        return self.result.get('complete') == 'true'
 
 
 def read_summary(path: Path | str) -> EpisodeSummary:

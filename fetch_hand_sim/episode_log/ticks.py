@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from fetch_hand_sim.episode_log.episode_record import parse_task
 from fetch_hand_sim.episode_log.errors import EpisodeReadError, one_line
 from fetch_hand_sim.episode_log.reader import Episode
 from msgs_spec.codecs import message_stamp
-from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.schemas import deserialize
-from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import TopicSpec, topics
 
 _CLOCK = '/clock'
@@ -56,8 +56,7 @@ def episode_task(episode: Episode) -> TaskSpec:
         EpisodeReadError: If it is unknown.
     """
     try:
-        prefix = episode.metadata.get('joint_prefix', JOINT_PREFIX)
-        return task_spec(episode.metadata.get('task', ''), prefix)
+        return parse_task(episode.metadata)
     except ValueError as error:
         raise EpisodeReadError(f'{episode.path}: {error}') from error
 

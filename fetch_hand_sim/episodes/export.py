@@ -118,16 +118,17 @@ def _vectors(pyarrow: Any, values: NDArray[np.float64], rows: int) -> Any:
 
 
 def _episode_row(index: int, episode: EpisodeArrays) -> dict[str, Any]:
+    record, outcome = episode.record, episode.outcome
     return {
         'episode_index': index,
         'path': printable(str(episode.path)),
         'task': episode.spec.name,
-        'seed': int(episode.metadata['seed']),
+        'seed': record.seed,
         'steps': len(episode),
         'return': float(episode.rewards.sum()),
         'success': bool(episode.success[-1]),
-        'complete': episode.is_complete,
-        'control_hz': float(episode.metadata['control_hz']),
+        'complete': outcome.is_complete,
+        'control_hz': record.control_hz,
         'metadata': json.dumps(episode.metadata),
         'result': json.dumps(episode.result),
     }
@@ -163,7 +164,7 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
     buffers = [
         collector.EpisodeBuffer(
             id=index,
-            seed=int(episode.metadata['seed']),
+            seed=episode.record.seed,
             observations=dict(episode.observations),
             actions=episode.actions,
             rewards=episode.rewards.tolist(),
@@ -202,9 +203,8 @@ def _environment(episode: EpisodeArrays) -> Any:
     """The Gymnasium environment the episode could have come from, for `recover_environment`."""
     register_environments()
     spec = copy.deepcopy(gymnasium.spec(environment_id(episode.spec.name)))
-    for name in ('reward_type', 'success_rule'):
-        spec.kwargs[name] = episode.metadata[name]
-    spec.kwargs['control_hz'] = float(episode.metadata['control_hz'])
+    for name in ('reward_type', 'success_rule', 'control_hz'):
+        spec.kwargs[name] = getattr(episode.record, name)
     return spec
 
 

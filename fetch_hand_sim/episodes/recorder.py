@@ -15,7 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Semaphore, Thread
 
-from fetch_hand_sim.episode_log import Attachment, EpisodeDirectory, EpisodeLogError, EpisodeWriter
+from fetch_hand_sim.episode_log import (
+    Attachment,
+    EpisodeDirectory,
+    EpisodeLogError,
+    EpisodeOutcome,
+    EpisodeWriter,
+)
 from fetch_hand_sim.episodes.backlog import Backlog, StalledError
 from msgs_spec.tick import EpisodeStatus, Tick
 from msgs_spec.topics import TopicSpec
@@ -279,8 +285,8 @@ class _EpisodeFiles:
 
 def episode_result(status: EpisodeStatus) -> dict[str, str]:
     """What the metadata record `episode_result` says of an episode, from its last status."""
-    return {
-        'steps': str(status.tick),
-        'return': repr(status.episode_return),
-        'success': str(status.is_success).lower(),
-    }
+    return EpisodeOutcome(
+        steps=status.tick,
+        episode_return=status.episode_return,
+        is_success=status.is_success,
+    ).to_strings()

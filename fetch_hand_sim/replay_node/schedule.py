@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fetch_hand_sim.episode_log import Episode, EpisodeReadError, read_episode
+from fetch_hand_sim.episode_log.episode_record import parse_control_hz
 from fetch_hand_sim.episode_log.ticks import logged_topics
 from msgs_spec.schemas import deserialize
 from msgs_spec.topics import TopicSpec
@@ -106,9 +107,9 @@ def _wanted(specs: dict[str, TopicSpec], names: list[str], with_inputs: bool) ->
 
 def _period_ns(episode: Episode) -> int:
     try:
-        return round(1e9 / float(episode.metadata['control_hz']))
-    except (KeyError, ValueError, OverflowError, ZeroDivisionError) as error:
-        raise EpisodeReadError(f'{episode.path}: its control_hz cannot be read') from error
+        return round(1e9 / parse_control_hz(episode.metadata))
+    except ValueError as error:
+        raise EpisodeReadError(f'{episode.path}: {error}') from error
 
 
 def _require_readable(path: Path, spec: TopicSpec, message: ReplayMessage) -> None:

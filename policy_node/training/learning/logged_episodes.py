@@ -48,8 +48,8 @@ def why_unusable(episode: EpisodeArrays, task: TaskSpec, control_hz: float) -> s
     """Returns why the trainer cannot take an episode, '' if it can."""
     if episode.spec.name != task.name:
         return f'{episode.spec.name}, not {task.name}'
-    if float(episode.metadata['control_hz']) != control_hz:
-        return f'{episode.metadata["control_hz"]} Hz, not {control_hz:g} Hz'
+    if episode.record.control_hz != control_hz:
+        return f'{episode.record.control_hz} Hz, not {control_hz:g} Hz'
     if not episode.is_complete or len(episode) != task.episode_ticks:
         return f'{len(episode)} of {task.episode_ticks} steps'
     if (episode.goals != episode.goals[0]).any():
