@@ -11,7 +11,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from fetch_hand_sim.episode_log import EpisodeArrays, EpisodeReadError, load_episodes
+from fetch_hand_sim.episode_log import (
+    EpisodeArrays,
+    EpisodeReadError,
+    expand_episodes,
+    load_episodes,
+)
 from fetch_hand_sim.episodes.export import ExportError, export_minari, export_parquet
 from msgs_spec.command_line import (
     EXIT_FAILURE,
@@ -49,8 +54,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     require_extra('data')
     skipped: list[EpisodeReadError] = []
+    episodes: list[EpisodeArrays] = []
     try:
-        episodes = load_episodes(options.path, on_skip=skipped.append)
+        paths = expand_episodes(options.path)
+        with progress('episodes', len(paths)) as advance:
+            for path in paths:
+                episodes += load_episodes(path, on_skip=skipped.append)
+                advance(1)
     except EpisodeReadError as error:
         raise UsageError(str(error)) from None
     for reason in skipped:
@@ -62,14 +72,12 @@ def _run(options: argparse.Namespace) -> int:
     by_task: dict[str, list[EpisodeArrays]] = {}
     for episode in episodes:
         by_task.setdefault(episode.spec.name, []).append(episode)
-    with progress('episodes', len(episodes)) as advance:
-        for task, group in by_task.items():
-            try:
-                done = f'{len(group)} episodes of {task}: {_export(options, group)}'
-                print(printable(done), flush=True)
-            except ExportError as error:
-                raise CommandError(str(error)) from None
-            advance(len(group))
+    for task, group in by_task.items():
+        try:
+            done = f'{len(group)} episodes of {task}: {_export(options, group)}'
+        except ExportError as error:
+            raise CommandError(str(error)) from None
+        print(printable(done), flush=True)
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
 
 
