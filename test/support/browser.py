@@ -20,7 +20,7 @@ from PIL import Image
 from websockets.sync.client import connect
 
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
-SIZE = (1200, 800)
+SIZE = (960, 640)
 # WebGL 2 without a GPU; nothing of its own on the network.
 OPTIONS = (
     '--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader '

@@ -1,0 +1,241 @@
+"""A task's robot as URDF, generated from its compiled model.
+
+Links are MuJoCo's bodies with their frames; joints have the names and the zero of `joint_states`.
+A body with several joints, or a joint beside the body's origin, takes links without mass between.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fetch_hand_sim.simulation.models import load_spec
+from fetch_hand_sim.simulation.tasks import task_asset
+from fetch_hand_sim.simulation.urdf_shapes import add_shapes, numbers
+from msgs_spec.rotations import (
+    quaternion_conjugate,
+    quaternion_from_axis_angle,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
+from msgs_spec.tasks import task_spec
+
+Array = NDArray[np.float64]
+JointType = Literal['fixed', 'revolute', 'continuous', 'prismatic']
+
+ROOT = 'world'
+_PREFIX = 'robot0:'
+_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+# URDF demands limits of what MuJoCo leaves unlimited: m or rad, N or N m, and per second.
+_FAR, _STRONG, _FAST = 1000.0, 1000.0, 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where a frame is in another one: position (3,) m and quaternion (4,) wxyz."""
+
+    position: Array
+    quaternion: Array
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """The pose of a frame that is at `other` in this one."""
+        rotated = quaternion_to_matrix(self.quaternion) @ other.position
+        turned = quaternion_multiply(self.quaternion, other.quaternion)
+        return Pose(self.position + rotated, turned / np.linalg.norm(turned))
+
+    def inverse(self) -> Pose:
+        """The pose of the other frame in this one."""
+        back = quaternion_conjugate(self.quaternion)
+        return Pose(-quaternion_to_matrix(back) @ self.position, back)
+
+
+@dataclass(frozen=True, slots=True)
+class UrdfJoint:
+    """What connects two links.
+
+    Attributes:
+        name: That of `joint_states`, or of the child link for fixed ones.
+        kind: Its type in URDF.
+        parent: Link it hangs on.
+        child: Link it moves.
+        origin: Of the joint in the parent, at position 0.
+        axis: (3,) in the child.
+        lower: Limit, rad or m.
+        upper: Limit, rad or m.
+    """
+
+    name: str
+    kind: JointType
+    parent: str
+    child: str
+    origin: Pose
+    axis: Array
+    lower: float = 0.0
+    upper: float = 0.0
+
+    def pose(self, position: float = 0.0) -> Pose:
+        """Returns the pose of the child link in the parent.
+
+        Args:
+            position: rad or m; fixed joints have none.
+        """
+        if self.kind == 'fixed':
+            return self.origin
+        if self.kind == 'prismatic':
+            return self.origin @ Pose(position * self.axis, _IDENTITY)
+        turn = quaternion_from_axis_angle(self.axis, position)
+        return self.origin @ Pose(np.zeros(3), turn)
+
+
+class RobotDescription:
+    """The robot of a task, link by link.
+
+    Attributes:
+        joints: From the root outwards: parents come before their children.
+    """
+
+    def __init__(self, task: str) -> None:
+        """Compiles the model.
+
+        Raises:
+            ValueError: If there is no such task.
+        """
+        self._spec = task_spec(task)
+        self._mjcf = load_spec(task_asset(task))
+        self._model = self._mjcf.compile()
+        bodies = range(1, self._model.nbody)
+        self._bodies = [body for body in bodies if self._belongs(body)]
+        self.joints = [joint for body in self._bodies for joint in self._joints_of(body)]
+
+    @property
+    def links(self) -> list[str]:
+        """Names of all links, the root first."""
+        return [ROOT, *(joint.child for joint in self.joints)]
+
+    def poses(self, positions: Mapping[str, float]) -> dict[str, Pose]:
+        """Forward kinematics: where every link is in the root.
+
+        Args:
+            positions: By name of the joint, rad or m.
+        """
+        found = {ROOT: Pose(np.zeros(3), _IDENTITY)}
+        for joint in self.joints:
+            found[joint.child] = found[joint.parent] @ joint.pose(positions.get(joint.name, 0.0))
+        return found
+
+    def to_xml(self, frame_prefix: str = '') -> str:
+        """Returns the URDF.
+
+        Args:
+            frame_prefix: Before the names of all links but the root, such as `left/`.
+        """
+        robot = ElementTree.Element('robot', name=self._spec.robot.name)
+        ElementTree.SubElement(robot, 'link', name=ROOT)
+        names = {self._model.body(body).name: body for body in self._bodies}
+        for joint in self.joints:
+            link = ElementTree.SubElement(robot, 'link', name=frame_prefix + joint.child)
+            if joint.child in names:
+                self._fill_link(link, names[joint.child])
+            self._add_joint(robot, joint, frame_prefix)
+        ElementTree.indent(robot)
+        return ElementTree.tostring(robot, encoding='unicode')
+
+    def _belongs(self, body: int) -> bool:
+        """Whether a body is a part of the robot: mocap bodies and cameras of the room are not."""
+        model = self._model
+        name = model.body(body).name
+        is_mocap = int(model.body_mocapid[body]) >= 0
+        return name.startswith(_PREFIX) and not is_mocap and 'external_camera' not in name
+
+    def _joints_of(self, body: int) -> Iterator[UrdfJoint]:
+        """The chain of joints from a body's parent to the body."""
+        model = self._model
+        name = model.body(body).name
+        parent_body = int(model.body_parentid[body])
+        parent = model.body(parent_body).name if parent_body else ROOT
+        origin = Pose(model.body_pos[body].copy(), model.body_quat[body].copy())
+        first = int(model.body_jntadr[body])
+        moving = range(first, first + int(model.body_jntnum[body])) if first >= 0 else range(0)
+        for index in moving:
+            anchor = Pose(model.jnt_pos[index].copy(), _IDENTITY)
+            # Only a hinge turns about its anchor; what slides may as well start from the origin.
+            is_hinge = int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_HINGE.value
+            start = origin @ anchor if is_hinge else origin
+            is_last = index == moving[-1] and not (is_hinge and anchor.position.any())
+            child = name if is_last else f'{model.joint(index).name}/moved'
+            yield self._moving_joint(index, parent, child, start)
+            if is_last:
+                return
+            parent = child
+            origin = anchor.inverse() if is_hinge else Pose(np.zeros(3), _IDENTITY)
+        yield UrdfJoint(f'{name}/fixed', 'fixed', parent, name, origin, np.zeros(3))
+
+    def _moving_joint(self, index: int, parent: str, child: str, start: Pose) -> UrdfJoint:
+        model = self._model
+        joint = model.joint(index)
+        axis = np.array(model.jnt_axis[index])
+        zero = float(model.qpos0[model.jnt_qposadr[index]])
+        is_hinge = int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_HINGE.value
+        back = (
+            Pose(np.zeros(3), quaternion_from_axis_angle(axis, -zero))
+            if is_hinge
+            else Pose(-zero * axis, _IDENTITY)
+        )
+        lower, upper = model.jnt_range[index] if model.jnt_limited[index] else (-_FAR, _FAR)
+        kind: JointType = 'revolute' if is_hinge else 'prismatic'
+        if is_hinge and not model.jnt_limited[index]:
+            kind = 'continuous'
+        return UrdfJoint(
+            joint.name, kind, parent, child, start @ back, axis, float(lower), float(upper)
+        )
+
+    def _fill_link(self, link: ElementTree.Element, body: int) -> None:
+        model = self._model
+        mass = float(model.body_mass[body])
+        if mass > 0.0:
+            inertial = ElementTree.SubElement(link, 'inertial')
+            add_origin(inertial, model.body_ipos[body], model.body_iquat[body])
+            ElementTree.SubElement(inertial, 'mass', value=f'{mass:.12g}')
+            ixx, iyy, izz = (f'{value:.12g}' for value in model.body_inertia[body])
+            ElementTree.SubElement(
+                inertial, 'inertia', ixx=ixx, iyy=iyy, izz=izz, ixy='0', ixz='0', iyz='0'
+            )
+        add_shapes(link, self._mjcf, model, body)
+
+    def _add_joint(self, robot: ElementTree.Element, joint: UrdfJoint, frame_prefix: str) -> None:
+        parent = joint.parent if joint.parent == ROOT else frame_prefix + joint.parent
+        element = ElementTree.SubElement(robot, 'joint', name=joint.name, type=joint.kind)
+        ElementTree.SubElement(element, 'parent', link=parent)
+        ElementTree.SubElement(element, 'child', link=frame_prefix + joint.child)
+        add_origin(element, joint.origin.position, joint.origin.quaternion)
+        if joint.kind == 'fixed':
+            return
+        ElementTree.SubElement(element, 'axis', xyz=numbers(joint.axis))
+        limit = {'effort': f'{_STRONG:g}', 'velocity': f'{_FAST:g}'}
+        if joint.kind != 'continuous':
+            limit |= {'lower': f'{joint.lower:.9g}', 'upper': f'{joint.upper:.9g}'}
+        ElementTree.SubElement(element, 'limit', limit)
+
+
+def add_origin(element: ElementTree.Element, position: ArrayLike, quaternion: ArrayLike) -> None:
+    """Adds an `origin` with URDF's roll, pitch and yaw."""
+    ElementTree.SubElement(
+        element, 'origin', xyz=numbers(position), rpy=numbers(roll_pitch_yaw(quaternion))
+    )
+
+
+def roll_pitch_yaw(quaternion: ArrayLike) -> Array:
+    """URDF's angles (3,), radians, of a unit quaternion wxyz: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    m = quaternion_to_matrix(quaternion)
+    cosine = np.hypot(m[0, 0], m[1, 0])
+    if cosine > 1e-9:
+        roll, yaw = np.arctan2(m[2, 1], m[2, 2]), np.arctan2(m[1, 0], m[0, 0])
+    else:
+        roll, yaw = np.arctan2(-m[1, 2], m[1, 1]), 0.0
+    return np.array([roll, np.arctan2(-m[2, 0], cosine), yaw])

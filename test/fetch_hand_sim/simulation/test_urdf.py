@@ -1,0 +1,165 @@
+"""The URDF is the model: same kinematics, masses, limits, meshes where they are."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from io import StringIO
+from urllib.parse import unquote, urlsplit
+
+import mujoco
+import numpy as np
+import pytest
+
+from fetch_hand_sim.simulation.scene import Scene
+from fetch_hand_sim.simulation.urdf import ROOT, RobotDescription, roll_pitch_yaw
+from msgs_spec.rotations import quaternion_to_matrix
+from msgs_spec.tasks import TASKS
+
+TASKS_OF_ROBOTS = ['FetchReach', 'HandReach']
+CONFIGURATIONS = 100
+
+
+@pytest.fixture(scope='module', params=TASKS_OF_ROBOTS)
+def robot(request):
+    return RobotDescription(request.param), Scene(request.param)
+
+
+def configurations(scene):
+    """Random joint positions within limits, by name, and the model's data posed likewise."""
+    rng = np.random.default_rng(0)
+    model, data = scene.model, scene.data
+    for _ in range(CONFIGURATIONS):
+        positions = {}
+        for name in scene.spec.robot.joints:
+            joint = model.joint(name)
+            lower, upper = joint.range if model.jnt_limited[joint.id] else (-1.0, 1.0)
+            positions[name] = rng.uniform(lower, upper)
+            data.qpos[joint.qposadr[0]] = positions[name]
+        mujoco.mj_kinematics(model, data)
+        yield positions, data
+
+
+def bodies(description, scene):
+    names = {scene.model.body(index).name for index in range(scene.model.nbody)}
+    return [link for link in description.links if link in names and link != ROOT]
+
+
+def test_a_library_finds_every_body_where_mujoco_has_it(robot):
+    yourdfpy = pytest.importorskip('yourdfpy')
+    description, scene = robot
+    urdf = yourdfpy.URDF.load(
+        StringIO(description.to_xml()), load_meshes=False, build_scene_graph=True
+    )
+    assert set(urdf.actuated_joint_names) == set(scene.spec.robot.joints)
+    names = bodies(description, scene)
+    assert len(names) > 15
+    for positions, data in configurations(scene):
+        urdf.update_cfg(positions)
+        for name in names:
+            found = urdf.get_transform(name, ROOT)
+            body = data.body(name)
+            np.testing.assert_allclose(found[:3, 3], body.xpos, atol=1e-6)
+            np.testing.assert_allclose(found[:3, :3].ravel(), body.xmat, atol=1e-6)
+
+
+def test_our_own_kinematics_are_the_same(robot):
+    description, scene = robot
+    names = bodies(description, scene)
+    for positions, data in configurations(scene):
+        poses = description.poses(positions)
+        for name in names:
+            np.testing.assert_allclose(poses[name].position, data.body(name).xpos, atol=1e-9)
+            found = quaternion_to_matrix(poses[name].quaternion).ravel()
+            np.testing.assert_allclose(found, data.body(name).xmat, atol=1e-9)
+
+
+def test_masses_and_limits_are_those_of_the_model(robot):
+    description, scene = robot
+    root = ElementTree.fromstring(description.to_xml())
+    names = bodies(description, scene)
+    masses = {link.get('name'): link.find('inertial/mass') for link in root.findall('link')}
+    for name in names:
+        expected = float(scene.model.body(name).mass[0])
+        found = masses[name]
+        assert (0.0 if found is None else float(found.get('value'))) == pytest.approx(expected)
+    for joint in root.findall('joint'):
+        if joint.get('type') in ('revolute', 'prismatic'):
+            known = scene.model.joint(joint.get('name'))
+            if scene.model.jnt_limited[known.id]:
+                limit = joint.find('limit')
+                found = [float(limit.get('lower')), float(limit.get('upper'))]
+                np.testing.assert_allclose(found, known.range, atol=1e-7)
+
+
+def test_meshes_are_the_installed_files(robot):
+    description, _ = robot
+    files = {
+        mesh.get('filename') for mesh in ElementTree.fromstring(description.to_xml()).iter('mesh')
+    }
+    assert files
+    from pathlib import Path
+
+    for file in files:
+        assert file.startswith('file:///') and 'gymnasium_robotics' in file
+        assert Path(unquote(urlsplit(file).path)).is_file()
+
+
+def test_a_mesh_is_drawn_where_mujoco_draws_it():
+    """Corners of the palm's mesh, read from its file, against the compiled vertices."""
+    trimesh = pytest.importorskip('trimesh')
+    description, scene = RobotDescription('HandReach'), Scene('HandReach')
+    root = ElementTree.fromstring(description.to_xml())
+    (visual,) = root.findall("link[@name='robot0:palm']/visual")
+    mesh, origin = visual.find('geometry/mesh'), visual.find('origin')
+    corners = trimesh.load(unquote(urlsplit(mesh.get('filename')).path)).bounds
+    scale = np.array([float(value) for value in mesh.get('scale').split()])
+    xyz = np.array([float(value) for value in origin.get('xyz').split()])
+    roll, pitch, yaw = (float(value) for value in origin.get('rpy').split())
+    turn = rotation('z', yaw) @ rotation('y', pitch) @ rotation('x', roll)
+    model = scene.model
+    geom = next(
+        index
+        for index in range(model.ngeom)
+        if model.geom_bodyid[index] == model.body('robot0:palm').id
+        and model.geom_dataid[index] >= 0
+    )
+    start, count = (
+        int(array[model.geom_dataid[geom]]) for array in (model.mesh_vertadr, model.mesh_vertnum)
+    )
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
+    compiled = model.mesh_vert[start : start + count] @ matrix.reshape(3, 3).T
+    compiled = compiled + model.geom_pos[geom]
+    in_file = (compiled - xyz) @ turn
+    np.testing.assert_allclose(in_file.min(axis=0), scale * corners[0], atol=1e-6)
+    np.testing.assert_allclose(in_file.max(axis=0), scale * corners[1], atol=1e-6)
+
+
+def rotation(axis, angle):
+    cosine, sine = np.cos(angle), np.sin(angle)
+    index = 'xyz'.index(axis)
+    others = [(index + 1) % 3, (index + 2) % 3]
+    matrix = np.eye(3)
+    matrix[np.ix_(others, others)] = [[cosine, -sine], [sine, cosine]]
+    return matrix
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_angles_give_the_rotation_back(seed):
+    quaternion = np.random.default_rng(seed).normal(size=4)
+    if seed < 2:
+        quaternion = np.array([1.0, 0.0, 1.0 - 2.0 * seed, 0.0])
+    quaternion /= np.linalg.norm(quaternion)
+    roll, pitch, yaw = roll_pitch_yaw(quaternion)
+    turn = rotation('z', yaw) @ rotation('y', pitch) @ rotation('x', roll)
+    np.testing.assert_allclose(turn, quaternion_to_matrix(quaternion), atol=1e-7)
+
+
+def test_frames_of_several_robots_have_a_prefix():
+    description = RobotDescription('HandReach')
+    root = ElementTree.fromstring(description.to_xml('left/'))
+    names = [link.get('name') for link in root.findall('link')]
+    assert names[0] == ROOT and all(name.startswith('left/') for name in names[1:])
+    assert {joint.get('name') for joint in root.findall('joint')} >= set(
+        TASKS['HandReach'].robot.joints
+    )
