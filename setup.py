@@ -40,6 +40,7 @@ TEST = [
     'pytest',
     'pytest-timeout',
     'setuptools',
+    'yourdfpy',
 ]
 
 setup(
@@ -80,7 +81,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}/launch', glob('launch/*.launch.xml')),
-        (f'share/{PACKAGE}/config', glob('config/*.yaml')),
+        (f'share/{PACKAGE}/config', glob('config/*.*')),
     ],
     zip_safe=True,
     # Without rclpy and the messages: in a ROS workspace pip must not replace those of ROS. No `~=`:
@@ -115,6 +116,7 @@ setup(
             'train_her = policy_node.training.commands:train_her',
             'evaluate_policy = policy_node.training.commands:evaluate_policy',
             'view = fetch_hand_sim.view:main',
+            'visualization_node = fetch_hand_sim.visualization_node:main',
             'render_episode = fetch_hand_sim.commands.render_episode:main',
             'replay_node = fetch_hand_sim.replay_node:main',
             'list_episodes = fetch_hand_sim.commands.list_episodes:main',

@@ -202,7 +202,25 @@ REPLAY_NODE = (
     ),
 )
 
-NODES = {'sim_node': SIM_NODE, 'policy_node': POLICY_NODE, 'replay_node': REPLAY_NODE}
+VISUALIZATION_NODE = (
+    ParameterSpec('camera_width', 'integer', 640, 'Pixels.', lower=16, upper=4096),
+    ParameterSpec('camera_height', 'integer', 480, 'Pixels.', lower=16, upper=4096),
+    ParameterSpec(
+        'camera_hz',
+        'double',
+        10.0,
+        'Pictures per second while somebody subscribes; 0 for none.',
+        lower=0.0,
+        upper=60.0,
+    ),
+)
+
+NODES = {
+    'sim_node': SIM_NODE,
+    'policy_node': POLICY_NODE,
+    'replay_node': REPLAY_NODE,
+    'visualization_node': VISUALIZATION_NODE,
+}
 
 
 def validate(spec: ParameterSpec, value: object) -> None:

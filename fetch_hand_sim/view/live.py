@@ -70,6 +70,7 @@ class LiveRobot:
         self._sim_name = f'{node.get_namespace().rstrip("/")}/sim_node'
         self._status: EpisodeStatus | None = None
         self._values: dict[str, Array] = {}
+        self._stamp_ns = 0
         self._facts = Facts(may_command=may_command)
         self._commander = ''
         self._trail: deque[Array] = deque(maxlen=_TRAIL_TICKS)
@@ -159,7 +160,7 @@ class LiveRobot:
             except ValueError:
                 return
             if source.name == 'joint_states':
-                self._values['stamp'] = np.array(stamp * 1e-9)
+                self._stamp_ns = stamp
 
         return collect
 
@@ -192,13 +193,14 @@ class LiveRobot:
         curves, values = self._curves, self._values
         if curves is not None:
             reward = float(values['reward'][0]) if 'reward' in values else None
-            curves.add(float(values['stamp']), frame, reward, values.get('applied_command'))
+            curves.add(self._stamp_ns * 1e-9, frame, reward, values.get('applied_command'))
 
     def _make_picture(self, spec: TaskSpec, frame: Frame) -> Picture:
         curves = self._curves
         return Picture(
             task=spec.name,
             frame=frame,
+            stamp_ns=self._stamp_ns,
             trail=tuple(self._trail),
             distance=curves.distance if curves else None,
             rotation=curves.rotation if curves else None,

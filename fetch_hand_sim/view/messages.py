@@ -95,6 +95,7 @@ class Picture(messages.Snapshot):
     Attributes:
         task: Name of the task.
         frame: Robot, object and goals; None before the first tick.
+        stamp_ns: Simulated time of the frame, nanoseconds.
         trail: Where the object or gripper was before.
         facts: In words.
         distance: Distance to the goal, m, as a curve.
@@ -108,6 +109,7 @@ class Picture(messages.Snapshot):
 
     task: str
     frame: Frame | None = None
+    stamp_ns: int = 0
     trail: tuple[Array, ...] = ()
     facts: Facts = field(default_factory=Facts)
     distance: Series | None = None

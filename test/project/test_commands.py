@@ -15,13 +15,14 @@ import pytest
 from fetch_hand_sim.commands.executables import executable, find_executable
 from msgs_spec.command_line import EXTRAS
 
-NODES = {'sim_node', 'policy_node', 'replay_node'}
+NODES = {'sim_node', 'policy_node', 'replay_node', 'visualization_node'}
 # What each executable needs beyond the base installation.
 NEEDS = {
     'sim_node': ['rclpy'],
     'policy_node': ['rclpy'],
     'replay_node': ['rclpy'],
     'view': ['rclpy'],
+    'visualization_node': ['rclpy'],
     'render_episode': [],
     'evaluate_policy': ['torch', 'safetensors'],
     'generate_episodes': ['torch', 'safetensors'],

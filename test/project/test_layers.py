@@ -33,6 +33,8 @@ NODES = (
     'fetch_hand_sim.view.live',
     'fetch_hand_sim.view.live_session',
     'fetch_hand_sim.view.remote_node',
+    'fetch_hand_sim.visualization_node.messages',
+    'fetch_hand_sim.visualization_node.node',
     'policy_node.node',
 )
 ROS = (
@@ -45,6 +47,8 @@ ROS = (
     'sensor_msgs',
     'std_msgs',
     'std_srvs',
+    'tf2_msgs',
+    'visualization_msgs',
 )
 
 

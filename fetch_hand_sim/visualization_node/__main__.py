@@ -1,0 +1,7 @@
+"""`python -m fetch_hand_sim.visualization_node`."""
+
+import sys
+
+from fetch_hand_sim.visualization_node import main
+
+sys.exit(main())

@@ -1,0 +1,119 @@
+"""Messages of standard tools: transforms, markers, pictures with their camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import mujoco
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Quaternion, TransformStamped, Vector3
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from fetch_hand_sim.simulation.scene import Marker as Shape
+from fetch_hand_sim.simulation.urdf import ROOT
+from fetch_hand_sim.visualization_node.transforms import Transform
+
+Array = NDArray[np.float64]
+
+_GEOM = mujoco.mjtGeom
+_SHAPES = {
+    _GEOM.mjGEOM_SPHERE.value: Marker.SPHERE,
+    _GEOM.mjGEOM_ELLIPSOID.value: Marker.SPHERE,
+    _GEOM.mjGEOM_BOX.value: Marker.CUBE,
+    # There is no capsule.
+    _GEOM.mjGEOM_CAPSULE.value: Marker.CYLINDER,
+}
+
+
+def stamp(nanoseconds: int) -> Time:
+    """Returns a time."""
+    seconds, rest = divmod(nanoseconds, 10**9)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def transform_messages(transforms: Iterable[Transform], stamp_ns: int) -> list[TransformStamped]:
+    """Returns the messages of transforms, all of one stamp."""
+    time = stamp(stamp_ns)
+    messages = []
+    for each in transforms:
+        message = TransformStamped(
+            header=Header(stamp=time, frame_id=each.parent), child_frame_id=each.child
+        )
+        x, y, z = each.pose.position.tolist()
+        message.transform.translation = Vector3(x=x, y=y, z=z)
+        message.transform.rotation = _quaternion(each.pose.quaternion)
+        messages.append(message)
+    return messages
+
+
+def marker_array(shapes: Sequence[Shape], stamp_ns: int) -> MarkerArray:
+    """Returns shapes as markers; those of earlier messages are removed."""
+    header = Header(stamp=stamp(stamp_ns), frame_id=ROOT)
+    first = Marker(header=header, action=Marker.DELETEALL)
+    markers = [first]
+    for number, shape in enumerate(shapes, start=1):
+        marker = Marker(header=header, ns='goal', id=number, type=_SHAPES[shape.shape])
+        x, y, z = shape.position.tolist()
+        marker.pose.position = Point(x=x, y=y, z=z)
+        marker.pose.orientation = _quaternion(shape.quaternion)
+        marker.scale = _scale(shape)
+        red, green, blue, opacity = map(float, shape.color)
+        marker.color = ColorRGBA(r=red, g=green, b=blue, a=opacity)
+        markers.append(marker)
+    return MarkerArray(markers=markers)
+
+
+def image_message(picture: NDArray[np.uint8], frame_id: str, stamp_ns: int) -> Image:
+    """Returns a picture (height, width, 3), red first."""
+    height, width = picture.shape[:2]
+    message = Image(
+        header=Header(stamp=stamp(stamp_ns), frame_id=frame_id),
+        height=height,
+        width=width,
+        encoding='rgb8',
+        step=3 * width,
+    )
+    message.data.frombytes(np.ascontiguousarray(picture).tobytes())
+    return message
+
+
+def camera_info(width: int, height: int, fovy: float, frame_id: str, stamp_ns: int) -> CameraInfo:
+    """Returns the calibration of a camera without distortion.
+
+    Args:
+        width: Pixels.
+        height: Pixels.
+        fovy: Vertical field of view, degrees.
+        frame_id: Its optical frame.
+        stamp_ns: Of its picture.
+    """
+    focal = height / 2.0 / np.tan(np.radians(fovy) / 2.0)
+    x, y = width / 2.0, height / 2.0
+    return CameraInfo(
+        header=Header(stamp=stamp(stamp_ns), frame_id=frame_id),
+        height=height,
+        width=width,
+        distortion_model='plumb_bob',
+        d=[0.0] * 5,
+        k=[focal, 0.0, x, 0.0, focal, y, 0.0, 0.0, 1.0],
+        r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        p=[focal, 0.0, x, 0.0, 0.0, focal, y, 0.0, 0.0, 0.0, 1.0, 0.0],
+    )
+
+
+def _quaternion(wxyz: Array) -> Quaternion:
+    w, x, y, z = wxyz.tolist()
+    return Quaternion(x=x, y=y, z=z, w=w)
+
+
+def _scale(shape: Shape) -> Vector3:
+    """Full lengths, where MuJoCo has radii and half lengths."""
+    size = shape.size
+    if shape.shape == _GEOM.mjGEOM_CAPSULE.value:
+        size = np.array([size[0], size[0], size[1]])
+    x, y, z = (2.0 * size).tolist()
+    return Vector3(x=x, y=y, z=z)

@@ -1,0 +1,102 @@
+"""Where every frame of a robot is: links of its URDF, its object, its goal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.scene import Frame, View
+from fetch_hand_sim.simulation.urdf import ROOT, Pose, RobotDescription
+from msgs_spec.robots import FINGERTIPS
+from msgs_spec.tasks import GoalKind, task_spec
+
+Array = NDArray[np.float64]
+
+_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """Where a frame is in its parent."""
+
+    parent: str
+    child: str
+    pose: Pose
+
+
+class Transforms:
+    """The tree of frames of one robot."""
+
+    def __init__(self, task: str, prefix: str = '') -> None:
+        """Compiles the robot's description.
+
+        Args:
+            task: Name of the task.
+            prefix: Before all frames but `world`, such as `left/`.
+
+        Raises:
+            ValueError: If there is no such task.
+        """
+        self.description = RobotDescription(task)
+        self._spec = task_spec(task)
+        self._prefix = prefix
+        self._index = {name: number for number, name in enumerate(self._spec.robot.joints)}
+
+    def fixed(self) -> list[Transform]:
+        """Those that never change."""
+        joints = (joint for joint in self.description.joints if joint.kind == 'fixed')
+        return [self._between(joint.parent, joint.child, joint.pose()) for joint in joints]
+
+    def moving(self, frame: Frame) -> list[Transform]:
+        """Those of one tick: joints, object, goal."""
+        found = [
+            self._between(
+                joint.parent,
+                joint.child,
+                joint.pose(float(frame.joint_position[self._index[joint.name]])),
+            )
+            for joint in self.description.joints
+            if joint.kind != 'fixed'
+        ]
+        if frame.object_pose is not None and self._spec.object_name is not None:
+            found.append(self._pose(self._spec.object_name, frame.object_pose))
+        return [*found, *self._goal(frame.desired_goal)]
+
+    def _goal(self, goal: Array) -> list[Transform]:
+        if self._spec.goal is GoalKind.POSE:
+            return [self._pose('goal', goal)]
+        if self._spec.goal is GoalKind.POINT:
+            return [self._pose('goal', np.concatenate([goal, _IDENTITY]))]
+        points = zip(FINGERTIPS, goal.reshape(-1, 3), strict=True)
+        return [
+            self._pose(f'goal_{name}', np.concatenate([point, _IDENTITY])) for name, point in points
+        ]
+
+    def _pose(self, name: str, pose: Array) -> Transform:
+        return self._between(ROOT, name, Pose(pose[:3], pose[3:]))
+
+    def _between(self, parent: str, child: str, pose: Pose) -> Transform:
+        known = parent if parent == ROOT else self._prefix + parent
+        return Transform(known, self._prefix + child, pose)
+
+
+def frame_prefix(namespace: str) -> str:
+    """The prefix of the frames of a robot in a namespace: `left/` for `/left`, empty for `/`."""
+    name = namespace.strip('/')
+    return f'{name}/' if name else ''
+
+
+def view_transform(view: View, name: str) -> Transform:
+    """The optical frame of a camera: z ahead, x to the right, y down."""
+    azimuth, elevation = np.radians(view.azimuth), np.radians(view.elevation)
+    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    ahead = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
+    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    matrix = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, matrix.ravel())
+    position = np.array(view.lookat) - view.distance * ahead
+    return Transform(ROOT, name, Pose(position, quaternion))

@@ -1,0 +1,133 @@
+"""What standard tools are told is where MuJoCo has it."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Image
+from visualization_msgs.msg import Marker, MarkerArray
+
+from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.rendering import simulation_frame
+from fetch_hand_sim.simulation.scene import Scene
+from fetch_hand_sim.simulation.urdf import ROOT, Pose
+from fetch_hand_sim.view.ray import mouse_ray
+from fetch_hand_sim.visualization_node.camera import Camera
+from fetch_hand_sim.visualization_node.messages import (
+    camera_info,
+    image_message,
+    marker_array,
+    transform_messages,
+)
+from fetch_hand_sim.visualization_node.transforms import Transforms, frame_prefix, view_transform
+from msgs_spec.rotations import quaternion_to_matrix
+from msgs_spec.tasks import TASKS
+
+STAMP = 3_000_000_007
+
+
+def moved_frame(task):
+    """A frame after a few random steps."""
+    simulation = Simulation(task, num_threads=1)
+    simulation.reset(seed=4)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        simulation.step(rng.uniform(-1, 1, (1, simulation.spec.robot.action_size)))
+    return simulation_frame(simulation)
+
+
+def tree(messages):
+    """Where every frame is in the root, from messages alone."""
+    poses = {ROOT: Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))}
+    waiting = list(messages)
+    while waiting:
+        known = [each for each in waiting if each.header.frame_id in poses]
+        assert known, [each.child_frame_id for each in waiting]
+        for each in known:
+            assert each.child_frame_id not in poses, 'two parents'
+            t, r = each.transform.translation, each.transform.rotation
+            pose = Pose(np.array([t.x, t.y, t.z]), np.array([r.w, r.x, r.y, r.z]))
+            poses[each.child_frame_id] = poses[each.header.frame_id] @ pose
+        waiting = [each for each in waiting if each not in known]
+    return poses
+
+
+@pytest.mark.parametrize('task', ['FetchReach', 'FetchPush', 'HandReach', 'HandManipulateEggFull'])
+@pytest.mark.parametrize('namespace', ['/', '/left'])
+def test_transforms_put_every_frame_where_mujoco_has_it(task, namespace):
+    prefix = frame_prefix(namespace)
+    frame, transforms, scene = moved_frame(task), Transforms(task, prefix), Scene(task)
+    messages = transform_messages([*transforms.fixed(), *transforms.moving(frame)], STAMP)
+    assert all(each.header.stamp == Time(sec=3, nanosec=7) for each in messages)
+    poses = tree(messages)
+    scene.show(frame)
+    mujoco.mj_kinematics(scene.model, scene.data)
+    bodies = [scene.model.body(index).name for index in range(1, scene.model.nbody)]
+    checked = [name for name in bodies if prefix + name in poses]
+    assert len(checked) > 15
+    for name in checked:
+        pose, body = poses[prefix + name], scene.data.body(name)
+        np.testing.assert_allclose(pose.position, body.xpos, atol=1e-6)
+        matrix = quaternion_to_matrix(pose.quaternion)
+        np.testing.assert_allclose(matrix.ravel(), body.xmat, atol=1e-6)
+    goals = [name for name in poses if name.startswith(f'{prefix}goal')]
+    assert len(goals) == (5 if task == 'HandReach' else 1)
+    if TASKS[task].has_object:
+        np.testing.assert_allclose(
+            poses[prefix + TASKS[task].object_name].position, frame.object_pose[:3]
+        )
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_markers_are_the_shapes_of_the_scene(task):
+    scene, frame = Scene(task), moved_frame(task)
+    shapes = scene.markers(frame)
+    array = deserialize_message(serialize_message(marker_array(shapes, STAMP)), MarkerArray)
+    assert array.markers[0].action == Marker.DELETEALL
+    assert len(array.markers) == len(shapes) + 1 > 1
+    for marker, shape in zip(array.markers[1:], shapes, strict=True):
+        assert marker.header.frame_id == ROOT
+        p = marker.pose.position
+        np.testing.assert_allclose([p.x, p.y, p.z], shape.position)
+        assert min(marker.scale.x, marker.scale.y, marker.scale.z) > 0.0
+    assert len({marker.id for marker in array.markers[1:]}) == len(shapes)
+
+
+def test_an_image_keeps_its_pixels():
+    picture = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    message = deserialize_message(serialize_message(image_message(picture, 'camera', STAMP)), Image)
+    assert (message.height, message.width, message.step) == (6, 8, 24)
+    np.testing.assert_array_equal(np.array(message.data).reshape(6, 8, 3), picture)
+
+
+def test_the_camera_says_where_a_point_is_seen():
+    """Projection by camera_info and transform against the ray of that pixel."""
+    view = Scene('FetchReach').view
+    width, height, point = 640, 480, np.array([1.3, 0.7, 0.5])
+    info = camera_info(width, height, 45.0, 'camera', STAMP)
+    pose = view_transform(view, 'camera').pose
+    x, y, z = quaternion_to_matrix(pose.quaternion).T @ (point - pose.position)
+    u, v = info.k[0] * x / z + info.k[2], info.k[4] * y / z + info.k[5]
+    camera = (np.array(view.lookat), view.distance, view.azimuth, view.elevation)
+    ray = mouse_ray(camera, 45.0, (u / width, v / height), width / height)
+    assert ray.distance_to(point) < 1e-6
+
+
+@pytest.mark.parametrize(('hz', 'due'), [(10.0, [True, False, True]), (0.0, [False] * 3)])
+def test_the_camera_has_a_rate_of_its_own(hz, due, monkeypatch):
+    now = [0.0]
+    camera = Camera(8, 8, hz, lambda: now[0])
+    monkeypatch.setattr(
+        'fetch_hand_sim.visualization_node.camera.SceneRenderer',
+        lambda *_: type('R', (), {'render': lambda self, frame: None, 'close': lambda self: 0})(),
+    )
+    seen = []
+    for at in (0.0, 0.05, 0.1):
+        now[0] = at
+        seen.append(bool(camera.is_due))
+        if camera.is_due:
+            camera.render(None, None)
+    assert seen == due

@@ -1,0 +1,168 @@
+"""Viewers beside a running robot: they see it, act on it, and it does not notice them."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import rclpy
+
+from fetch_hand_sim.simulation.opengl import prepare_opengl
+from fetch_hand_sim.view.live import LiveRobot
+from fetch_hand_sim.view.messages import Reset, SetGoal, SetPaused, StepOnce
+from msgs_spec.codecs import decode
+from msgs_spec.tasks import task_spec
+from msgs_spec.topics import topic
+from support.graph import SIM_NODE, client, ros_args
+
+Start = Callable[..., subprocess.Popen[str]]
+REACH = task_spec('FetchReach')
+VIEW = (sys.executable, '-m', 'fetch_hand_sim.view', '--no-browser')
+VISUALIZATION = (sys.executable, '-m', 'fetch_hand_sim.visualization_node')
+
+
+class Follower:
+    """A `LiveRobot` with the latest of its pictures."""
+
+    def __init__(self, connection, may_command=True):
+        self.connection = connection
+        self.robot = LiveRobot(connection.node, may_command)
+        self.picture = None
+
+    def until(self, condition, what):
+        def look():
+            self.picture = self.robot.picture() or self.picture
+            return self.picture is not None and condition(self.picture)
+
+        self.connection.spin_until(look, what)
+
+
+def test_what_the_page_asks_for_happens(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    with client(REACH) as connection:
+        connection.subscribe('desired_goal')
+        follower = Follower(connection)
+        follower.until(lambda p: p.frame is not None and p.facts.rate > 20.0, 'picture')
+        assert follower.picture.facts.missed_ticks == 0 or follower.picture.facts.rate > 0
+        assert follower.picture.distance.values[-1] > 0.0
+        goal = np.array([1.3, 0.8, 0.6])
+        follower.robot.perform(SetGoal(goal))
+        desired = topic(REACH, 'desired_goal')
+        connection.spin_until(
+            lambda: np.allclose(decode(desired, connection.received['desired_goal'][-1]), goal),
+            'the goal',
+        )
+        follower.robot.perform(Reset(seed=77))
+        follower.until(lambda p: p.facts.seed == 77, 'episode of that seed')
+        # New episodes keep the goal of the page.
+        follower.until(lambda p: np.allclose(p.frame.desired_goal, goal), 'goal in the new episode')
+        follower.robot.perform(SetPaused(True))
+        follower.until(lambda p: 'paused at' in p.facts.notice, 'answer')
+        connection.spin(0.3)
+        before = follower.picture.stamp_ns
+        follower.robot.picture()
+        follower.robot.perform(StepOnce())
+        follower.until(lambda p: p.stamp_ns > before or '1 run' in p.facts.notice, 'a step')
+
+
+def test_who_may_only_watch_changes_nothing(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    with client(REACH) as connection:
+        follower = Follower(connection, may_command=False)
+        follower.until(lambda p: p.frame is not None, 'picture')
+        before = follower.picture.frame.desired_goal
+        follower.robot.perform(SetGoal(np.array([1.3, 0.8, 0.6])))
+        follower.robot.perform(SetPaused(True))
+        assert 'only watch' in follower.robot.picture().facts.notice
+        stamp = follower.picture.stamp_ns
+        follower.until(lambda p: p.stamp_ns > stamp, 'another tick')
+        assert not np.allclose(follower.picture.frame.desired_goal, [1.3, 0.8, 0.6])
+        assert before.shape == (3,)
+        assert not connection.node.get_publishers_info_by_topic('/set_goal')
+
+
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP])
+def test_a_viewer_that_dies_or_hangs_is_not_noticed(start_process: Start, number: int) -> None:
+    start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    with client(REACH) as connection:
+        connection.subscribe('achieved_goal')
+        connection.spin_until(lambda: connection.received['achieved_goal'], 'tick')
+        view = start_process(*VIEW)
+        assert re.search(r'http://127.0.0.1:\d+/', view.stdout.readline())
+        connection.spin(0.5)
+        os.kill(view.pid, number)
+        count, began = len(connection.received['achieved_goal']), connection.received_at
+        connection.spin(2.0)
+        assert len(connection.received['achieved_goal']) - count >= 40, began.keys()
+
+
+def test_standard_tools_get_what_they_need(start_process: Start) -> None:
+    from sensor_msgs.msg import CameraInfo, Image
+    from std_msgs.msg import String
+    from visualization_msgs.msg import MarkerArray
+
+    from msgs_spec.qos import LATCHED, STATE, rclpy_profile
+
+    start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    parameters = ros_args(camera_width=64, camera_height=48, camera_hz=5.0)
+    node = start_process(*VISUALIZATION, *parameters)
+    with client(REACH) as connection:
+        received = {}
+
+        def subscribe(kind, name, qos):
+            def keep(message):
+                received[name] = message
+
+            return connection.node.create_subscription(kind, name, keep, rclpy_profile(qos))
+
+        subscribe(String, 'robot_description', LATCHED)
+        subscribe(MarkerArray, 'goal_markers', STATE)
+        connection.spin_until(lambda: len(received) == 2, 'description and markers')
+        root = ElementTree.fromstring(received['robot_description'].data)
+        names = {joint.get('name') for joint in root.findall('joint')}
+        assert set(REACH.robot.joints) <= names
+        assert len(received['goal_markers'].markers) > 2
+        assert connection.node.count_publishers('camera/image_raw') == 1
+        try:
+            prepare_opengl()
+        except RuntimeError as error:
+            pytest.skip(str(error))
+        subscribe(Image, 'camera/image_raw', STATE)
+        subscribe(CameraInfo, 'camera/camera_info', STATE)
+        connection.spin_until(lambda: 'camera/image_raw' in received, 'picture')
+        picture = np.array(received['camera/image_raw'].data).reshape(48, 64, 3)
+        assert picture.std() > 10.0
+    node.send_signal(signal.SIGINT)
+    assert node.wait(10) == 0
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'code', 'line'),
+    [
+        (['--wait', '0.2', '--robot', 'nosuch'], 1, 'no robot in namespace /nosuch'),
+        (['--wait', '0.2'], 1, 'start sim_node'),
+        (['--host', '203.0.113.1'], 1, 'cannot listen on 203.0.113.1'),
+        (['--task', 'FetchReach', '--checkpoint', 'nosuch'], 1, 'a node ended'),
+        (['--port', '99999'], 2, '--port 99999; allowed: 0 ... 65535'),
+        (['--task', 'FetchWalk'], 2, 'FetchWalk'),
+        (['episodes', '--task', 'FetchReach'], 2, 'exclude each other'),
+    ],
+)
+def test_what_cannot_be_shown_is_one_line(
+    start_process: Start, arguments: list[str], code: int, line: str
+) -> None:
+    process = start_process(*VIEW, *arguments)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == code, error
+    assert line in error and 'Traceback' not in error
+
+
+def test_rclpy_is_left_as_it_was() -> None:
+    assert not rclpy.ok()

@@ -1,0 +1,58 @@
+"""Layouts for rviz2 and Foxglove show topics that there are."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import yaml
+
+from msgs_spec.tasks import TASKS
+from msgs_spec.topics import MONITORING, topics
+from support import ROOT
+
+NODE = (ROOT / 'fetch_hand_sim/visualization_node/node.py').read_text()
+PUBLISHED = {f'/{name.strip("/")}' for name in re.findall(r"'([\w/]+)', (?:latched|state)", NODE)}
+ROBOT = {
+    f'/{spec.name.strip("/")}' for task in TASKS.values() for spec in (*topics(task), *MONITORING)
+}
+
+
+def values(tree, key):
+    """All values of a key at any depth."""
+    if isinstance(tree, dict):
+        found = [tree[key]] if key in tree else []
+        return found + [each for part in tree.values() for each in values(part, key)]
+    return [each for part in tree for each in values(part, key)] if isinstance(tree, list) else []
+
+
+def test_the_node_publishes_what_tools_expect():
+    assert PUBLISHED == {
+        '/robot_description',
+        '/goal_markers',
+        '/camera/image_raw',
+        '/camera/camera_info',
+    }
+
+
+def test_rviz_shows_topics_of_the_node():
+    layout = yaml.safe_load((ROOT / 'config/view.rviz').read_text())
+    shown = {each for each in values(layout, 'Value') if isinstance(each, str)}
+    assert shown and shown <= PUBLISHED
+    displays = layout['Visualization Manager']['Displays']
+    classes = {each['Class'].partition('/')[2] for each in displays}
+    assert {'RobotModel', 'TF', 'MarkerArray'} <= classes
+    assert layout['Visualization Manager']['Global Options']['Fixed Frame'] == 'world'
+
+
+def test_foxglove_shows_topics_that_there_are():
+    layout = json.loads((ROOT / 'config/foxglove_layout.json').read_text())
+    panels = layout['configById']
+    paths = {path['value'].partition('.')[0] for plots in values(panels, 'paths') for path in plots}
+    shown = paths | {panels['3D!robot']['layers']['robot']['topic']}
+    shown |= set(panels['3D!robot']['topics']) | {
+        panels['DiagnosticSummary!health']['topicToRender']
+    }
+    assert shown <= ROBOT | PUBLISHED
+    placed = set(re.findall(r'"(\w+!\w+)"', json.dumps(layout['layout'])))
+    assert placed == set(panels)
