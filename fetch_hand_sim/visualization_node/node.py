@@ -24,8 +24,14 @@ from fetch_hand_sim.visualization_node.messages import (
 )
 from fetch_hand_sim.visualization_node.transforms import Transforms, frame_prefix, view_transform
 from msgs_spec.parameters import VISUALIZATION_NODE
-from msgs_spec.qos import LATCHED, STATE, rclpy_profile
-from msgs_spec.ros import BEAT, EventLoop, StopSignals, declare_parameters
+from msgs_spec.ros import (
+    BEAT,
+    EventLoop,
+    StopSignals,
+    declare_parameters,
+    rclpy_profile,
+)
+from msgs_spec.topics import LATCHED, STATE
 
 _CAMERA_FRAME = 'camera'
 

@@ -108,7 +108,8 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
     from std_msgs.msg import String
     from visualization_msgs.msg import MarkerArray
 
-    from msgs_spec.qos import LATCHED, STATE, rclpy_profile
+    from msgs_spec.ros import rclpy_profile
+    from msgs_spec.topics import LATCHED, STATE
 
     start_process(*SIM_NODE, *ros_args(task='FetchReach'))
     parameters = ros_args(camera_width=64, camera_height=48, camera_hz=5.0)
