@@ -8,6 +8,7 @@ from pathlib import Path
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
@@ -95,6 +96,32 @@ def test_bytes_are_equal_between_runs_in_real_time_and_without_ros(
             break
     assert paced == first[0]
     end(policy)
+
+
+def test_resets_leave_a_policy_no_tick_behind(start_process: Start, tmp_path: Path) -> None:
+    """A command on its way at a reset answers the state before it, and is not applied after it."""
+    policy = start_process(*POLICY_NODE)
+    arguments = ros_args(
+        mode='lockstep', seed=SEED, episodes=60, wait_for_commands=True, episode_dir=tmp_path
+    )
+    sim = start_process(*SIM_NODE, *arguments, '-p', 'log_compiled_model:=false')
+    with client(REACH) as robot:
+        robot.subscribe('reward')
+        for _ in range(4):
+            count = len(robot.received['reward'])
+            robot.spin_until(lambda: len(robot.received['reward']) > count + 70, 'ticks')  # noqa: B023
+            assert robot.call(Trigger, 'sim_node/reset').success
+        sim.send_signal(signal.SIGINT)
+        assert finish(sim)[0] == 0
+    end(policy)
+    undisturbed = batch_run(REACH, 60)
+    episodes = {int(e.metadata['episode']): e for e in episodes_in(tmp_path)}
+    cut = [number for number, episode in episodes.items() if not episode.is_complete]
+    assert len(cut) > 1
+    for number in episodes.keys() - cut:
+        for name in ('/commands', '/reward'):
+            messages = episodes[number].topics[name].messages
+            assert [message.data for message in messages] == undisturbed[number][name], number
 
 
 def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
