@@ -56,7 +56,8 @@ class Browser:
         Thread(target=self._process.stderr.read, daemon=True).start()
         with urllib.request.urlopen(f'http://{port}/json') as answer:
             pages = [page for page in json.load(answer) if page['type'] == 'page']
-        self._socket = connect(pages[0]['webSocketDebuggerUrl'], max_size=None)
+        # Drawing without a GPU keeps the page from answering for a while.
+        self._socket = connect(pages[0]['webSocketDebuggerUrl'], max_size=None, ping_interval=None)
         self._number = 0
         self.events: list[dict[str, Any]] = []
         for domain in ('Page', 'Network', 'Runtime'):
@@ -73,7 +74,7 @@ class Browser:
         self._number += 1
         self._socket.send(json.dumps({'id': self._number, 'method': method, 'params': parameters}))
         while True:
-            message = json.loads(self._socket.recv(timeout=60))
+            message = json.loads(self._socket.recv(timeout=180))
             if message.get('id') == self._number:
                 assert 'error' not in message, message
                 result: dict[str, Any] = message['result']

@@ -32,7 +32,7 @@ pytestmark = [
         'VIEW_BROWSER' not in os.environ, reason='a browser is slow: make test-browser'
     ),
     pytest.mark.skipif(find_browser() is None, reason='no Chromium: apt install chromium'),
-    pytest.mark.timeout(300),
+    pytest.mark.timeout(600),
 ]
 
 VIEW = (sys.executable, '-m', 'fetch_hand_sim.view')
@@ -68,7 +68,7 @@ def wait_for_scene(browser: Browser, seconds: float = 60.0) -> np.ndarray:
     while time.monotonic() < end:
         browser.wait(1.0)
         picture = browser.screenshot()
-        if picture[200:600, 380:820].std() > 12.0:
+        if picture[150:500, 380:560].std() > 12.0:
             browser.wait(2.0)
             return browser.screenshot()
     raise AssertionError('nothing is drawn')
@@ -120,13 +120,13 @@ def test_a_file_is_played_and_the_timeline_moves_it(browser, start_process, tmp_
     assert hosts == {urlsplit(url).netloc}
     # The slider pauses at the frame that was clicked.
     y = SIZE[1] - BAR - 38.0
-    scene = np.s_[150:650, 350:850]
+    scene = np.s_[120:500, 350:600]
     browser.click(60.0, y)
     browser.wait(2.0)
     early = browser.screenshot()
     browser.wait(1.0)
     np.testing.assert_allclose(browser.screenshot()[scene], early[scene], atol=8)
-    browser.click(1100.0, y)
+    browser.click(880.0, y)
     browser.wait(2.0)
     assert np.abs(browser.screenshot()[scene].astype(int) - early[scene]).max() > 60
 
@@ -177,8 +177,8 @@ def test_pages_come_and_go_while_the_robot_runs(browser, start_process, robot):
     second = Browser()
     second.open(url)
     picture = wait_for_scene(second)
-    # A visitor who only watches has no panel in the upper left corner.
-    assert browser.screenshot()[20, 20].std() != picture[20, 20].std() or True
+    # Who only watches sees the robot where the other does, without panels.
+    assert picture[150:500, 380:560].std() > 12.0
     second.close()
     browser.close()
     count = len(robot.received['achieved_goal'])
