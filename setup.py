@@ -12,8 +12,8 @@ if sys.version_info < (3, 11):  # noqa: UP036
 
 PACKAGE = 'fetch_hand_sim'
 
-# To run and train actors.
-ACTORS = ['safetensors>=0.4', 'torch>=2.6']
+# To train actors, and to have them as modules; to run them takes NumPy alone.
+ACTORS = ['torch>=2.6']
 # What a command needs beyond the base installation; it says so itself where it is missing.
 EXTRAS = {
     # ROS 2 Jazzy itself, for a machine without it.
@@ -96,6 +96,7 @@ setup(
         'PyYAML>=6',
         'rich>=13',
         'rosbags>=0.10',
+        'safetensors>=0.4',
         'shtab>=1.7',
         'zstandard>=0.20',
     ],

@@ -157,7 +157,7 @@ class Limit:
         return ticks / elapsed
 
 
-def measure_nodes(spec: TaskSpec, checkpoint: str, seconds: float) -> float:
+def measure_nodes(spec: TaskSpec, policy: str, seconds: float) -> float:
     """Ticks per second of the two nodes, from the tick counter they publish."""
     node = rclpy.create_node('watcher')
     loop = EventLoop(node)
@@ -175,10 +175,10 @@ def measure_nodes(spec: TaskSpec, checkpoint: str, seconds: float) -> float:
         rclpy_profile(DIAGNOSTICS.qos),
     )
     sim = ['-p', f'task:={spec.name}', '-p', 'mode:=lockstep', '-p', 'wait_for_commands:=true']
-    policy = ['--ros-args', '-p', f'checkpoint:={checkpoint}'] if checkpoint else []
+    arguments = ['--ros-args', '-p', f'policy:={policy}'] if policy else []
     processes = [
         start('-m', 'fetch_hand_sim.sim_node', '--ros-args', *sim),
-        start('-m', 'policy_node.node', *policy),
+        start('-m', 'policy_node.node', *arguments),
     ]
     try:
         wait_until(loop, lambda: counts and counts[-1][1] > 100, 'ticks')
@@ -201,7 +201,7 @@ def main() -> int:
     """Measures in turns and prints the medians."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--task', default='FetchPush', choices=tuple(TASKS))
-    parser.add_argument('--checkpoint', default='', help="actor, 'random'; default: the shipped")
+    parser.add_argument('--policy', default='', help="actor, 'random'; default: the shipped")
     parser.add_argument('--seconds', type=float, default=5.0, help='per measurement')
     parser.add_argument('--turns', type=int, default=3)
     parser.add_argument('--echo', action='store_true', help=argparse.SUPPRESS)
@@ -216,12 +216,12 @@ def main() -> int:
     nodes, limits = [], []
     for _ in range(options.turns):
         limits.append(limit.measure(options.seconds))
-        nodes.append(measure_nodes(spec, options.checkpoint, options.seconds))
+        nodes.append(measure_nodes(spec, options.policy, options.seconds))
         print(f'nodes {nodes[-1]:.0f}, limit {limits[-1]:.0f} ticks per second', flush=True)
     rclpy.shutdown()
     ours, bare = statistics.median(nodes), statistics.median(limits)
     print(
-        f'{spec.name}, {options.checkpoint or "shipped actor"}: {ours:.0f} ticks per second, '
+        f'{spec.name}, {options.policy or "shipped actor"}: {ours:.0f} ticks per second, '
         f'{ours / 25.0:.1f} x real time, {ours / bare:.0%} of the limit {bare:.0f} '
         f'(goals: 12 x, 70 %); {platform.machine()}, {os.cpu_count()} CPUs, '
         f'load average {load:.1f} before'

@@ -5,6 +5,7 @@ Here, because commands of both packages use it and neither package knows the oth
 
 from __future__ import annotations
 
+import argparse
 import os
 import signal
 import sys
@@ -14,6 +15,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from types import FrameType
+from typing import Any
 
 # Done; done, and something is wrong; not begun, because of what was given.
 EXIT_SUCCESS, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
@@ -23,8 +25,8 @@ EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 130, 141
 # Modules by which an extra of this package is recognised, since ROS brings its own by apt.
 EXTRAS = {
     'ros': ('rclpy',),
-    'actors': ('torch', 'safetensors'),
-    'train': ('torch', 'safetensors', 'matplotlib', 'tensorboard'),
+    'actors': ('torch',),
+    'train': ('torch', 'matplotlib', 'tensorboard'),
     'data': ('pyarrow', 'minari'),
     'sb3': ('stable_baselines3',),
     'onnx': ('onnx', 'onnxruntime', 'onnxscript'),
@@ -43,6 +45,21 @@ class UsageError(CommandError):
     """The user asked for what is not possible; the message is one line that says what is."""
 
     exit_code = EXIT_USAGE
+
+
+class FormerOption(argparse.Action):
+    """An option under its former name: it still works, and says what it is called now."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Says so and sets the option."""
+        complain(parser.prog, f'{option_string} is now called --{self.dest}')
+        setattr(namespace, self.dest, values)
 
 
 def printable(text: str) -> str:

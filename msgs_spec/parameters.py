@@ -30,6 +30,7 @@ class ParameterSpec:
         or_zero: Whether 0 is allowed too, below the smallest number, to switch something off.
         read_only: Whether it is fixed once the node runs.
         check: Raises ValueError for what type and limits cannot tell.
+        former: What it was called; still taken, with a warning.
     """
 
     name: str
@@ -42,6 +43,7 @@ class ParameterSpec:
     or_zero: bool = False
     read_only: bool = True
     check: Callable[[float], object] | None = None
+    former: str = ''
 
     @property
     def allowed(self) -> str:
@@ -160,10 +162,18 @@ SIM_NODE = (
 
 POLICY_NODE = (
     ParameterSpec(
-        'checkpoint',
+        'policy',
         'string',
         '',
-        'Actor file (.safetensors, .onnx, .zip), random or resting; empty takes the shipped actor.',
+        'Shipped actor, file (.safetensors, .onnx, .zip), random or resting; empty takes the '
+        'shipped actor of the task.',
+        former='checkpoint',
+    ),
+    ParameterSpec(
+        'trust',
+        'bool',
+        False,
+        'Whether to load a .zip, which runs the code in it.',
     ),
     ParameterSpec(
         'task',
@@ -254,7 +264,7 @@ def unknown_parameter(specs: Sequence[ParameterSpec], name: str) -> str | None:
     None if the parameter belongs to another node of this project or to ROS: files of parameters
     are often written for several nodes.
     """
-    is_known = any(name == spec.name for node in NODES.values() for spec in node)
+    is_known = any(name in (spec.name, spec.former) for node in NODES.values() for spec in node)
     if is_known or name == 'use_sim_time' or name.startswith('qos_overrides.'):
         return None
     hint = _suggestion(name, [spec.name for spec in specs])

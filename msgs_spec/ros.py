@@ -111,19 +111,29 @@ def _make_executor() -> tuple[Executor, bool]:
 def declare_parameters(node: Node, specs: Sequence[ParameterSpec]) -> dict[str, Any]:
     """Declares parameters with description and range and returns their values.
 
-    Parameters that it was given and does not have are named in a warning.
+    Parameters that it was given and does not have, or that have a new name, are named in a warning.
 
     Raises:
         UsageError: If a value given at the start is not allowed.
     """
     # rclpy has no public way to see what was given before it is declared.
     given: dict[str, Parameter] = node._parameter_overrides
+    for spec in specs:
+        if spec.former in given:
+            node.get_logger().warning(f'parameter {spec.former} is now called {spec.name}')
+            given.setdefault(spec.name, _renamed(given[spec.former], spec.name))
     values = {spec.name: _declare(node, spec, given.get(spec.name)) for spec in specs}
     for other in sorted(given):
         line = None if node.has_parameter(other) else unknown_parameter(specs, other)
         if line is not None:
             node.get_logger().warning(line)
     return values
+
+
+def _renamed(parameter: Parameter, name: str) -> Parameter:
+    from rclpy.parameter import Parameter
+
+    return Parameter(name, parameter.type_, parameter.value)
 
 
 def _declare(node: Node, spec: ParameterSpec, given: Parameter | None) -> Any:

@@ -8,14 +8,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from policy_node.policies.actor import Actor, load_actor
+    from policy_node.policies.actor import Actor
+    from policy_node.policies.loading import load_actor, load_policy
 
-__all__ = ['Actor', 'load_actor']
+__all__ = ['Actor', 'load_actor', 'load_policy']
 
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
-        from policy_node.policies import actor
+        from importlib import import_module
 
-        return getattr(actor, name)
+        module = 'actor' if name == 'Actor' else 'loading'
+        return getattr(import_module(f'policy_node.policies.{module}'), name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

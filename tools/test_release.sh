@@ -41,7 +41,7 @@ mkdir "$work/elsewhere"
 cd "$work/elsewhere"
 "$work/base/bin/fetch_hand_sim" --version
 "$work/base/bin/python" "$root/tools/try_environment.py"
-for command in sim policy replay train evaluate benchmark; do
+for command in sim policy replay train benchmark; do
     if "$work/base/bin/fetch_hand_sim" $command >"$work/out" 2>&1; then exit 1; fi
     grep -q "pip install 'fetch_hand_sim\[" "$work/out" && [ "$(wc -l <"$work/out")" -eq 1 ] ||
         { cat "$work/out"; exit 1; }
@@ -51,5 +51,5 @@ say 'with ROS and actors: the demo'
 pip_install base "$wheel[ros,actors]"
 "$work/base/bin/fetch_hand_sim" demo --episodes 2
 "$work/base/bin/fetch_hand_sim" episodes check episodes
-"$work/base/bin/fetch_hand_sim" evaluate --actor FetchReach --episodes 20
+"$work/base/bin/fetch_hand_sim" evaluate --policy FetchReach --episodes 20
 say 'done'

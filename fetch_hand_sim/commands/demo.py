@@ -28,7 +28,7 @@ from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import EpisodeReadError, EpisodeRecord, read_episode
 from msgs_spec.codecs import decode_status
-from msgs_spec.command_line import EXIT_SUCCESS, complain, require_extra, run_command
+from msgs_spec.command_line import EXIT_SUCCESS, FormerOption, complain, run_command
 from msgs_spec.ros import StopSignals, keep_discovery_local, rclpy_profile, ros_message_class
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
@@ -125,11 +125,11 @@ class Demo:
 
     def run(self, stop: StopSignals) -> int:
         """Runs the demo and returns the exit code."""
-        checkpoint = self._checkpoint()
+        commander = self._policy()
         watcher = Watcher(self._spec)
         began = time.monotonic()
         with _logs() as logs:
-            policy = start_node('policy_node', [f'checkpoint:={checkpoint}'], logs)
+            policy = start_node('policy_node', [f'policy:={commander}'], logs)
             sim = start_node('sim_node', self._sim_parameters(), logs)
             try:
                 self._watch(watcher, sim, policy, stop)
@@ -146,11 +146,10 @@ class Demo:
         self._print_summary(time.monotonic() - began)
         return _SIGNALLED + signal.Signals[stop.received] if stop.received else EXIT_SUCCESS
 
-    def _checkpoint(self) -> str:
-        if self._options.checkpoint:
-            return str(self._options.checkpoint)
+    def _policy(self) -> str:
+        if self._options.policy:
+            return str(self._options.policy)
         if is_actor_shipped(self._spec.name):
-            require_extra('actors')
             return self._spec.name
         self._console.print(f'No actor is shipped for {self._spec.name} yet: commands are random.')
         return 'random'
@@ -237,7 +236,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument('--episodes', type=int, default=5, help='how many episodes')
     parser.add_argument('--seed', type=int, default=0, help='seed of the first episode')
     parser.add_argument('--episode-dir', default='episodes', help='where episodes are logged')
-    parser.add_argument('--checkpoint', default='', help="actor file, 'random' or 'resting'")
+    parser.add_argument('--policy', default='', help="actor file, 'random' or 'resting'")
+    parser.add_argument('--checkpoint', dest='policy', action=FormerOption, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     try:
         task_spec(options.task)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 from datetime import UTC, datetime
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from fetch_hand_sim.episode_log import Attachment, episode_metadata
@@ -58,19 +59,19 @@ class RecordingContext:
 
 
 @cache
-def source_revision() -> str | None:
-    """Git revision of this source tree, or None for an installed copy or without git."""
+def source_revision() -> str:
+    """Commit of this source tree, with `-dirty` where files differ, or the installed version."""
     root = Path(__file__).resolve().parents[2]
-    if not (root / '.git').exists():
-        return None
+    describe = ('describe', '--always', '--dirty', '--abbrev=40', '--exclude=*')
+    # Only its own: an installed copy may lie in somebody else's repository.
+    if (root / '.git').exists():
+        try:
+            command = ['git', '-C', str(root), *describe]
+            found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5.0)
+            return found.stdout.strip()
+        except (OSError, subprocess.SubprocessError):
+            pass
     try:
-        revision = subprocess.run(
-            ['git', '-C', str(root), 'rev-parse', 'HEAD'],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=5.0,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return revision.stdout.strip()
+        return f'fetch_hand_sim {version("fetch_hand_sim")}'
+    except PackageNotFoundError:
+        return 'unknown'

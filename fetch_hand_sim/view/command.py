@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from msgs_spec.command_line import require_extra, run_command
+from msgs_spec.command_line import FormerOption, require_extra, run_command
 from msgs_spec.tasks import TASKS
 
 _LOOPBACK = '127.0.0.1'
@@ -31,7 +31,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='one of the tasks')
     parser.add_argument('--robot', default='', help='namespace of the robot')
-    parser.add_argument('--checkpoint', default='', help='actor to start with --task')
+    parser.add_argument('--policy', default='', help='policy to start with --task')
+    parser.add_argument('--checkpoint', dest='policy', action=FormerOption, help=argparse.SUPPRESS)
     parser.add_argument('--episode-dir', default='', help='log episodes of --task here')
     parser.add_argument('--port', type=int, default=0, help='default: the first free from 8080')
     parser.add_argument(

@@ -277,7 +277,7 @@ class LiveRobot:
         self._facts = dataclasses.replace(self._facts, speed=request.factor)
 
     def _choose_actor(self, request: ChooseActor) -> None:
-        self._policy.set_parameter('checkpoint', request.name)
+        self._policy.set_parameter('policy', request.name)
 
     def _set_goal(self, request: SetGoal) -> None:
         self._kept_goal = request.values if request.is_kept else None

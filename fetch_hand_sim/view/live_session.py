@@ -106,15 +106,15 @@ def _nobody(node: Node, namespace: str) -> str:
 
 
 def _start(options: argparse.Namespace, log: IO[str]) -> list[subprocess.Popen[str]]:
-    checkpoint = options.checkpoint or options.task
-    if not options.checkpoint and not is_actor_shipped(options.task):
+    policy = options.policy or options.task
+    if not options.policy and not is_actor_shipped(options.task):
         print(f'No actor is shipped for {options.task} yet: commands are random.', flush=True)
-        checkpoint = 'random'
+        policy = 'random'
     settings = [f'task:={options.task}', 'wait_for_commands:=true']
     if options.episode_dir:
         settings.append(f'episode_dir:={Path(options.episode_dir)}')
     return [
-        start_node('policy_node', [f'checkpoint:={checkpoint}'], log, options.robot),
+        start_node('policy_node', [f'policy:={policy}'], log, options.robot),
         start_node('sim_node', settings, log, options.robot),
     ]
 

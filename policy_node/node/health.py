@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 from msgs_spec.diagnostics import Increase, Report
 from msgs_spec.tick import EpisodeStatus
+from policy_node.node.commander import Commander
 from policy_node.node.responder import Responder
-from policy_node.policies.commander import Commander
 
-# Seconds without a complete observation after which the report says so.
-_SILENCE = 1.0
+# Seconds without a complete observation after which the report says so. A robot that is paused
+# says that once a second.
+_SILENCE = 2.0
+
+
+def read_pause(message: Any, namespace: str) -> bool | None:
+    """Whether the robot of a namespace is paused, from a message on `/diagnostics`.
+
+    Returns:
+        None if the message is none of that robot's.
+    """
+    for status in message.status:
+        if status.name.rpartition('/')[0] == namespace.rstrip('/'):
+            for pair in status.values:
+                if pair.key == 'paused':
+                    return bool(pair.value == 'True')
+    return None
 
 
 class Health:
@@ -32,18 +50,32 @@ class Health:
         """Takes the robot that was found."""
         self._commander, self._responder = commander, responder
         self._tick_duration = 1.0 / status.control_hz
+        self._answered, self._dropped, self._unusable = Increase(), Increase(), Increase()
 
-    def report(self, now: float, robots: int) -> Report:
+    def stop(self) -> None:
+        """Waits for a robot again."""
+        self._commander = self._responder = None
+
+    def report(
+        self, now: float, robots: int, is_paused: bool = False, elsewhere: Sequence[str] = ()
+    ) -> Report:
         """Closes a period and reports on it.
 
         Args:
             now: Seconds of the responder's clock.
             robots: How many publish `episode_status`.
+            is_paused: Whether the robot says that it is paused.
+            elsewhere: Namespaces of other robots, told where there is none here.
         """
         if self._commander is None or self._responder is None:
             report = Report(self._name, '', {'robots': str(robots)}, 'waits for a robot')
         else:
-            report = self._report(self._commander, self._responder, now, robots)
+            report = self._report(self._commander, self._responder, now, robots, is_paused)
+        if robots == 0 and elsewhere:
+            report.warn(
+                f'no robot here: there is one in {", ".join(elsewhere)}; join it with '
+                f'--ros-args -r __ns:={elsewhere[0]}'
+            )
         if robots > 1:
             report.warn(f'{robots} robots publish here; give each a namespace')
         return report
@@ -56,7 +88,12 @@ class Health:
         return fresh
 
     def _report(
-        self, commander: Commander, responder: Responder, now: float, robots: int
+        self,
+        commander: Commander,
+        responder: Responder,
+        now: float,
+        robots: int,
+        is_paused: bool,
     ) -> Report:
         seconds = now - self._then if self._then is not None else 0.0
         self._then = now
@@ -76,7 +113,8 @@ class Health:
             'observation age (s)': '-' if age is None else f'{age:.3f}',
         }
         task = commander.spec.name
-        report = Report(self._name, task, values, f'{task}: {rate:.1f} commands per second')
+        pace = 'the robot is paused' if is_paused else f'{rate:.1f} commands per second'
+        report = Report(self._name, task, values, f'{task}: {pace}')
         dropped = self._dropped.since(responder.join.dropped)
         if dropped:
             report.warn(f'incomplete ticks: {dropped:.0f} dropped')
@@ -90,6 +128,6 @@ class Health:
             )
         if robots == 0:
             report.warn('no robot publishes episode_status')
-        elif age is not None and age > _SILENCE:
+        elif age is not None and age > _SILENCE and not is_paused:
             report.warn(f'no state: the last one is {age:.0f} s old')
         return report

@@ -8,6 +8,7 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
 
 from msgs_spec.codecs import build_status, decode_status
 from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports
@@ -17,6 +18,7 @@ from msgs_spec.ros import (
     EventLoop,
     NodeFailure,
     StopSignals,
+    UsageError,
     declare_parameters,
     rclpy_profile,
     ros_message_class,
@@ -24,55 +26,65 @@ from msgs_spec.ros import (
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import DIAGNOSTICS, STATE, TopicSpec, topic
+from msgs_spec.topics import DIAGNOSTICS, STATE, QosSpec, TopicSpec, topic
 from policy_node.node import NODE_NAME
-from policy_node.node.health import Health
+from policy_node.node.commander import Commander
+from policy_node.node.health import Health, read_pause
 from policy_node.node.responder import Responder
-from policy_node.policies.commander import Commander, make_commander
+from policy_node.policies.loading import TaskMissing, load_policy
+from policy_node.policies.policy import LoadedPolicy
 
 _WARN_PERIOD = 1.0
+# Seconds a robot may take to appear before others are named; discovery takes a moment.
+_PATIENCE = 3.0
+_SERVED_AT_ONCE = 1000
 _ANY_TASK = next(iter(TASKS.values()))
 
 
 class PolicyNode(Node):
-    """Waits for a robot, checks that the actor fits it, then answers every tick with a command."""
+    """Waits for a robot, checks that the policy fits it, then answers every tick with a command.
+
+    A robot that comes back with another task or rate is a new robot.
+    """
 
     def __init__(self) -> None:
-        """Declares parameters and listens for a robot.
+        """Declares parameters, loads the policy if they say which, and listens for a robot.
 
         Raises:
-            UsageError: If a parameter is not allowed.
+            UsageError: If a parameter is not allowed or there is no such policy.
         """
         super().__init__(NODE_NAME)
         self._settings = declare_parameters(self, POLICY_NODE)
+        self._loaded = self._load_ahead()
         self._status: EpisodeStatus | None = None
         self._responder: Responder | None = None
+        self._answered_status: EpisodeStatus | None = None
         self._commands: Publisher | None = None
-        self._failure: str | None = None
+        self._of_robot: list[Publisher | Subscription] = []
+        self._is_paused = False
         self._health = Health(self.get_fully_qualified_name())
         self._diagnostics = self._publisher(DIAGNOSTICS)
         self._report_due = time.monotonic() + REPORT_PERIOD
-        status_topic = topic(_ANY_TASK, 'episode_status')
-        self.create_subscription(
-            ros_message_class(status_topic.type_name),
-            status_topic.name,
-            self._on_status,
-            rclpy_profile(status_topic.qos),
-        )
+        self._elsewhere_from = time.monotonic() + _PATIENCE
+        self._status_name = self.resolve_topic_name('episode_status')
+        self._subscribe(topic(_ANY_TASK, 'episode_status'), self._on_status)
+        self._subscribe(DIAGNOSTICS, self._on_diagnostics)
 
     def run(self, stop: StopSignals) -> None:
         """Serves until told to stop.
 
         Raises:
-            NodeFailure: If the actor does not fit the robot.
+            NodeFailure: If the policy does not fit the robot.
         """
         loop = EventLoop(self)
-        self.get_logger().info('waiting for a robot on episode_status')
+        self.get_logger().info(f'waiting for a robot on {self._status_name}')
         try:
             while not stop:
                 loop.wait(BEAT)
-                if self._failure:
-                    raise NodeFailure(self._failure)
+                if self._has_robot_changed():
+                    self._leave()
+                    # Only then the middleware lets go of topics that the next robot may type anew.
+                    loop.serve_pending(_SERVED_AT_ONCE)
                 if self._responder is not None:
                     self._responder.send_unsent()
                 elif self._status is not None:
@@ -81,41 +93,100 @@ class PolicyNode(Node):
         finally:
             loop.close()
 
-    def _start(self, status: EpisodeStatus, loop: EventLoop, stop: StopSignals) -> None:
-        """Loads the actor for the robot that was found and begins to answer."""
+    def _load_ahead(self) -> LoadedPolicy | None:
+        """Loads what can be loaded before a robot says its task: mistakes show at once."""
+        settings = self._settings
         try:
-            self._check_task(status)
-            commander = make_commander(self._settings['checkpoint'], status)
+            return load_policy(
+                settings['policy'], settings['task'] or None, trust=settings['trust']
+            )
+        except TaskMissing:
+            return None
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+
+    def _start(self, status: EpisodeStatus, loop: EventLoop, stop: StopSignals) -> None:
+        """Begins to answer the robot that was found."""
+        try:
+            commander = Commander(self._load_for(status), status.control_hz)
         except ValueError as error:
             raise NodeFailure(str(error)) from None
         self._responder = responder = Responder(commander, status, self._send)
+        self._answered_status = status
         for source in responder.topics:
-            self.create_subscription(
-                ros_message_class(source.type_name),
-                source.name,
-                self._receiver(responder, source.name),
-                rclpy_profile(STATE),
-                raw=True,
-            )
+            receive = self._receiver(responder, source.name)
+            self._of_robot.append(self._subscribe(source, receive, STATE, raw=True))
         while not stop and not all(self.count_publishers(s.name) for s in responder.topics):
             loop.wait(BEAT)
+            if self._has_robot_changed():
+                return
         self._announce(commander)
         # Last of all: its appearance tells the robot that everything before it is in place.
         self._commands = self._publisher(topic(commander.spec, 'commands'))
+        self._of_robot.append(self._commands)
         self._health.start(commander, responder, status)
         self.get_logger().info(f'{commander.spec.name}: commands come from {commander.description}')
 
-    def _check_task(self, status: EpisodeStatus) -> None:
-        wanted = self._settings['task']
+    def _load_for(self, status: EpisodeStatus) -> LoadedPolicy:
+        """Returns the policy for a robot.
+
+        Raises:
+            ValueError: If there is none or it does not fit; one line says why.
+        """
+        wanted, name = self._settings['task'], self._settings['policy']
         if wanted and wanted != status.task:
             raise ValueError(f'the robot does {status.task}, not {wanted}')
+        if self._loaded is None or self._loaded.task != status.task:
+            self._loaded = load_policy(name, status.task, trust=self._settings['trust'])
+        return self._loaded
+
+    def _has_robot_changed(self) -> bool:
+        before, now = self._answered_status, self._status
+        if before is None or now is None:
+            return False
+        return (now.task, now.control_hz) != (before.task, before.control_hz)
+
+    def _leave(self) -> None:
+        """Lets go of the robot that was answered."""
+        assert self._answered_status is not None and self._status is not None
+        before, now = self._answered_status, self._status
+        self.get_logger().info(
+            f'the robot changed from {before.task} at {before.control_hz:g} Hz to {now.task} at '
+            f'{now.control_hz:g} Hz'
+        )
+        for each in self._of_robot:
+            if isinstance(each, Publisher):
+                self.destroy_publisher(each)
+            else:
+                self.destroy_subscription(each)
+        self._of_robot.clear()
+        self._commands = self._responder = self._answered_status = None
+        self._health.stop()
 
     def _announce(self, commander: Commander) -> None:
         """Tells the robot's log who commands."""
         status = topic(commander.spec, 'policy_status')
         values = {'commander': commander.description, 'checkpoint_sha256': commander.sha256}
         message = build_status(status, 0, NODE_NAME, values)
-        self._publisher(status).publish(serialize(status.type_name, message))
+        publisher = self._publisher(status)
+        self._of_robot.append(publisher)
+        publisher.publish(serialize(status.type_name, message))
+
+    def _subscribe(
+        self,
+        spec: TopicSpec,
+        callback: Callable[[Any], None],
+        qos: QosSpec | None = None,
+        *,
+        raw: bool = False,
+    ) -> Subscription:
+        return self.create_subscription(
+            ros_message_class(spec.type_name),
+            spec.name,
+            callback,
+            rclpy_profile(qos or spec.qos),
+            raw=raw,
+        )
 
     def _publisher(self, spec: TopicSpec) -> Publisher:
         return self.create_publisher(
@@ -146,25 +217,34 @@ class PolicyNode(Node):
         except ValueError as error:
             self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=_WARN_PERIOD)
             return
-        if self._responder is not None and self._status is not None:
-            self._check_same_robot(self._status, status)
-            if status.phase == 'waiting':
-                self._responder.forget()
+        if self._responder is not None and status.phase == 'waiting':
+            self._responder.forget()
         self._status = status
 
-    def _check_same_robot(self, before: EpisodeStatus, now: EpisodeStatus) -> None:
-        if (now.task, now.control_hz) != (before.task, before.control_hz):
-            self._failure = (
-                f'the robot changed from {before.task} at {before.control_hz:g} Hz to {now.task} '
-                f'at {now.control_hz:g} Hz; start policy_node again for it'
-            )
+    def _on_diagnostics(self, message: Any) -> None:
+        is_paused = read_pause(message, self.get_namespace())
+        if is_paused is not None:
+            self._is_paused = is_paused
 
     def _report_when_due(self) -> None:
         now = time.monotonic()
         if now < self._report_due:
             return
         self._report_due = max(self._report_due + REPORT_PERIOD, now)
-        report = self._health.report(now, self.count_publishers('episode_status'))
-        self._diagnostics.publish(encode_reports(self.get_clock().now().nanoseconds, [report]))
+        robots = self.count_publishers(self._status_name)
+        elsewhere = [] if robots or now < self._elsewhere_from else self._robots_elsewhere()
+        report = self._health.report(now, robots, self._is_paused, elsewhere)
+        # REP 107: wall time, also where the clock of the node is simulated.
+        self._diagnostics.publish(encode_reports(time.time_ns(), [report]))
         for line in self._health.news(report):
             self.get_logger().warning(line)
+
+    def _robots_elsewhere(self) -> list[str]:
+        """Namespaces in which somebody publishes `episode_status`."""
+        wanted = topic(_ANY_TASK, 'episode_status')
+        found = []
+        for name, types in self.get_topic_names_and_types():
+            namespace, _, last = name.rpartition('/')
+            if last == wanted.name and wanted.type_name in types and self.count_publishers(name):
+                found.append(namespace or '/')
+        return sorted(found)

@@ -14,8 +14,8 @@ from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
+from policy_node.node.commander import Commander
 from policy_node.node.stamp_join import StampJoin
-from policy_node.policies.commander import Commander
 
 
 class Responder:

@@ -1,10 +1,8 @@
-"""The actor: normalised observation and goal in, action in [-1, 1] out."""
+"""The actor as it learns, a torch module: normalised observation and goal in, action out."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,40 +10,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from policy_node.policies.goal_features import GoalFeatures
-from policy_node.policies.shipped import shipped_actors
-
-# Plappert et al. 2018, appendix B.
-INPUT_CLIP = 200.0
-NORMALIZED_CLIP = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class NetworkShape:
-    """Sizes of an actor, and of the critic trained with it.
-
-    Attributes:
-        observation_size: Length of `observation`.
-        goal_size: Length of `desired_goal`.
-        action_size: Length of the action.
-        hidden_sizes: Width of each hidden layer.
-        layer_norm: Whether a LayerNorm precedes each activation.
-        goal_features: How observation and goal become inputs; None for both as they are.
-    """
-
-    observation_size: int
-    goal_size: int
-    action_size: int
-    hidden_sizes: tuple[int, ...] = (256, 256, 256)
-    layer_norm: bool = False
-    goal_features: GoalFeatures | None = None
-
-    @property
-    def feature_size(self) -> int:
-        """Length of the network input."""
-        if self.goal_features is None:
-            return self.observation_size + self.goal_size
-        return self.goal_features.size(self.observation_size, self.goal_size)
+from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
+from policy_node.policies.policy import observation_part
 
 
 class MLP(nn.Module):
@@ -113,12 +79,20 @@ class Actor(nn.Module):
         self.goal_normalizer = Normalizer(shape.goal_size)
         self.network = MLP(shape.feature_size, shape.action_size, shape)
 
+    @classmethod
+    def from_arrays(cls, shape: NetworkShape, arrays: Mapping[str, NDArray[np.float32]]) -> Actor:
+        """Returns an actor that acts and no longer learns, with the tensors of a checkpoint."""
+        actor = cls(shape)
+        actor.load_state_dict({name: torch.tensor(value) for name, value in arrays.items()})
+        return actor.eval().requires_grad_(False)
+
     def features(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Normalised network input (..., feature_size)."""
         normalized = self.observation_normalizer(observation), self.goal_normalizer(goal)
         if self.shape.goal_features is None:
             return torch.cat(normalized, dim=-1)
-        return self.shape.goal_features.inputs(observation, goal, *normalized)
+        inputs: Tensor = self.shape.goal_features.inputs(observation, goal, *normalized)
+        return inputs
 
     def forward(self, features: Tensor) -> Tensor:
         """Actions (..., action_size) in [-1, 1] for `features`."""
@@ -156,43 +130,5 @@ class Actor(nn.Module):
         return action.cpu().numpy(), None
 
     def _input(self, observation: Mapping[str, ArrayLike], key: str, size: int) -> Tensor:
-        if key not in observation:
-            raise ValueError(f'observation has no {key!r}; given: {", ".join(observation)}')
-        values = np.asarray(observation[key], dtype=np.float32)
-        if values.ndim == 0 or values.shape[-1] != size:
-            raise ValueError(f'{key} has shape {values.shape}; allowed: (..., {size})')
-        return torch.from_numpy(np.ascontiguousarray(values)).to(self.goal_normalizer.mean.device)
-
-
-def actor_path(name_or_path: str | Path) -> Path:
-    """Returns the checkpoint called `name_or_path`: the name of a shipped actor, or a file.
-
-    Raises:
-        ValueError: If there is neither; the message lists the shipped actors.
-    """
-    shipped = shipped_actors()
-    if str(name_or_path) in shipped:
-        return shipped[str(name_or_path)]
-    path = Path(name_or_path)
-    if path.is_file():
-        return path
-    names = ', '.join(shipped) or 'none'
-    raise ValueError(
-        f'no actor {str(name_or_path)!r}; shipped: {names}; or the path of a checkpoint'
-    )
-
-
-def load_actor(name_or_path: str | Path, task: str | None = None) -> Actor:
-    """Loads an actor, ready to `predict` on the CPU.
-
-    Args:
-        name_or_path: Task name of a shipped actor (`FetchReach`), or a checkpoint file.
-        task: Refuse a checkpoint of any other task.
-
-    Raises:
-        ValueError: If there is no such actor or it does not fit; one line says why.
-    """
-    from policy_node.policies import checkpoint
-
-    actor, _ = checkpoint.load(actor_path(name_or_path), task)
-    return actor
+        values = np.ascontiguousarray(observation_part(observation, key, size))
+        return torch.from_numpy(values).to(self.goal_normalizer.mean.device)

@@ -1,22 +1,34 @@
-"""Actor checkpoints: safetensors files whose metadata say what the weights fit. Never pickle."""
+"""Actor checkpoints: safetensors files whose metadata say what the weights fit. Never pickle.
+
+What a file declares is compared with its task and its tensors before anything is made of it, so a
+damaged or crafted one costs no more than its size.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
-import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save as to_bytes
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
-from msgs_spec.tasks import TASKS, TaskSpec, task_spec
-from policy_node.policies.actor import Actor, NetworkShape
+from msgs_spec.tasks import TASKS, TaskSpec, substeps_per_tick, task_spec
+from policy_node.policies.files import one_line, read_file, sha256
 from policy_node.policies.goal_features import goal_features
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.policies.tensor_file import (
+    TensorHeader,
+    parse_header,
+    parse_tensors,
+    write_tensors,
+)
+
+if TYPE_CHECKING:
+    from policy_node.policies.actor import Actor
 
 FORMAT = 'fetch_hand_actor'
 FORMAT_VERSION = 1
@@ -74,6 +86,21 @@ class ActorInfo:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """The contents of a file, checked.
+
+    Attributes:
+        info: What it says about its actor.
+        tensors: Weights and normalisers by their names in `Actor`, float32, all finite.
+        sha256: Fingerprint of the file.
+    """
+
+    info: ActorInfo
+    tensors: dict[str, NDArray[np.float32]]
+    sha256: str
+
+
 def observation_layout(spec: TaskSpec) -> tuple[tuple[str, int], ...]:
     """(name, size) of each part of a task's observation, in order."""
     return tuple((part.name, part.size) for part in spec.observation)
@@ -84,37 +111,38 @@ def save(path: str | Path, actor: Actor, info: ActorInfo) -> None:
     if actor.shape != info.shape:
         raise ValueError(f'actor has shape {actor.shape}, its metadata say {info.shape}')
     tensors = {name: value.detach().cpu() for name, value in actor.state_dict().items()}
+    write_tensors(path, tensors, to_metadata(info))
+
+
+def to_metadata(info: ActorInfo) -> dict[str, str]:
+    """Returns the metadata of an actor's file, whatever its format."""
     metadata = {'format': FORMAT, 'format_version': str(FORMAT_VERSION)}
     for name, value in dataclasses.asdict(info).items():
         metadata[name] = json.dumps(value)
-    write_tensors(path, tensors, metadata)
+    return metadata
 
 
-def write_tensors(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
-    """Writes a safetensors file under a temporary name and moves it into place."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f'.{path.name}.partial')
-    contents = to_bytes({name: value.contiguous() for name, value in tensors.items()}, metadata)
-    try:
-        partial.write_bytes(contents)
-        os.replace(partial, path)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
+def read(path: str | Path, task: str | None = None) -> Checkpoint:
+    """Reads a checkpoint.
 
-
-def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Reads tensors and metadata of a safetensors file.
+    Args:
+        path: Checkpoint file.
+        task: Refuse a checkpoint of any other task.
 
     Raises:
-        ValueError: If it cannot be read or is not one.
+        ValueError: If the file is no checkpoint, of an unknown version, of another task, its sizes
+            do not fit the task, or a weight is not finite; one line names what was found and what
+            is allowed.
     """
-    try:
-        with safe_open(path, framework='pt') as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}
-    except (OSError, SafetensorError) as error:
-        raise ValueError(f'{path} is not a readable safetensors file: {error}') from None
+    data = read_file(Path(path))
+    header = parse_header(data, path)
+    info = parse_metadata(header.metadata, path)
+    if task is not None and info.task != task:
+        raise ValueError(f'{path} was trained on {info.task}, not on {task}')
+    _check_tensors(path, header, info.shape)
+    tensors = parse_tensors(data, path)
+    _check_values(path, tensors)
+    return Checkpoint(info, tensors, sha256(data))
 
 
 def read_info(path: str | Path) -> ActorInfo:
@@ -123,79 +151,157 @@ def read_info(path: str | Path) -> ActorInfo:
     Raises:
         ValueError: If it is no actor checkpoint of this version.
     """
-    return _info(path, read_tensors(path)[1])
+    return parse_metadata(parse_header(read_file(Path(path)), path).metadata, path)
 
 
 def load(path: str | Path, task: str | None = None) -> tuple[Actor, ActorInfo]:
-    """Loads an actor and what is known about it.
-
-    Args:
-        path: Checkpoint file.
-        task: Refuse a checkpoint of any other task.
+    """Loads an actor as a torch module, and what is known about it.
 
     Raises:
-        ValueError: If the file is no checkpoint, of an unknown version, of another task, or its
-            sizes do not fit the task; one line names what was found and what is expected.
+        ValueError: As `read`.
     """
-    tensors, metadata = read_tensors(path)
-    info = _info(path, metadata)
-    if task is not None and info.task != task:
-        raise ValueError(f'{path} was trained on {info.task}, not on {task}')
-    _check_sizes(path, info)
-    actor = Actor(info.shape)
-    _check_tensors(path, tensors, actor)
-    actor.load_state_dict(tensors)
-    return actor.eval().requires_grad_(False), info
+    from policy_node.policies.actor import Actor
+
+    checkpoint = read(path, task)
+    return Actor.from_arrays(checkpoint.info.shape, checkpoint.tensors), checkpoint.info
 
 
 def checkpoint_hash(path: str | Path) -> str:
     """SHA-256 of the file, hexadecimal."""
-    with open(path, 'rb') as file:
-        return hashlib.file_digest(file, 'sha256').hexdigest()
+    return sha256(read_file(Path(path)))
 
 
-def _info(path: str | Path, metadata: dict[str, str]) -> ActorInfo:
-    if metadata.get('format') != FORMAT:
-        raise ValueError(f'{path} is no actor checkpoint (format {metadata.get("format")!r})')
-    version = metadata.get('format_version')
-    if version != str(FORMAT_VERSION):
-        raise ValueError(f'{path} has format version {version}; supported: {FORMAT_VERSION}')
+def parse_metadata(metadata: dict[str, str], path: str | Path) -> ActorInfo:
+    """Returns what the metadata of an actor's file say, whatever its format.
+
+    Raises:
+        ValueError: If they are none of this version or do not fit a task; `path` names the file.
+    """
+    _check_format(path, metadata)
     # Files from before there were goal features have plain ones, and started from nothing.
     metadata = {'goal_features': '"plain"', 'init_from': '{}', **metadata}
-    names = [item.name for item in dataclasses.fields(ActorInfo)]
-    missing = [name for name in names if name not in metadata]
+    missing = [name for name in _READERS if name not in metadata]
     if missing:
         raise ValueError(f'{path} lacks metadata: {", ".join(missing)}')
-    try:
-        values = {name: json.loads(metadata[name]) for name in names}
-        values['observation_layout'] = tuple(
-            (str(name), int(size)) for name, size in values['observation_layout']
+    values = {}
+    for name, read_value in _READERS.items():
+        try:
+            values[name] = read_value(json.loads(metadata[name]))
+        except (ArithmeticError, RecursionError, TypeError, ValueError) as error:
+            line = one_line(error)
+            raise ValueError(f'{path} has unreadable metadata: {name}: {line}') from None
+    info = ActorInfo(**values)
+    _check_sizes(path, info)
+    return info
+
+
+def _check_format(path: str | Path, metadata: dict[str, str]) -> None:
+    if metadata.get('format') != FORMAT:
+        raise ValueError(f'{path} is no actor checkpoint (format {metadata.get("format")!r:.80})')
+    version = metadata.get('format_version')
+    if version != str(FORMAT_VERSION):
+        raise ValueError(
+            f'{path} has format version {one_line(version, 20)}; supported: {FORMAT_VERSION}'
         )
-        values['hidden_sizes'] = tuple(int(width) for width in values['hidden_sizes'])
-    except (ValueError, TypeError) as error:
-        raise ValueError(f'{path} has unreadable metadata: {error}') from None
-    return ActorInfo(**values)
 
 
 def _check_sizes(path: str | Path, info: ActorInfo) -> None:
     if info.task not in TASKS:
-        raise ValueError(f'{path} was trained on unknown task {info.task!r}')
+        raise ValueError(f'{path} was trained on unknown task {info.task!r:.80}')
     spec = TASKS[info.task]
     try:
         goal_features(info.goal_features, spec)
     except ValueError as error:
-        raise ValueError(f'{path}: {error}') from None
+        raise ValueError(f'{path} has {one_line(error)}') from None
     expected = (observation_layout(spec), spec.goal.size, spec.robot.action_size)
     found = (info.observation_layout, info.goal_size, info.action_size)
     for name, given, wanted in zip(('observation', 'goal', 'action'), found, expected, strict=True):
         if given != wanted:
-            raise ValueError(f'{path} has {name} {given}; {info.task} has {wanted}')
+            raise ValueError(f'{path} has {name} {given!s:.200}; {info.task} has {wanted}')
 
 
-def _check_tensors(path: str | Path, tensors: dict[str, Tensor], actor: Actor) -> None:
-    wanted = {name: tuple(value.shape) for name, value in actor.state_dict().items()}
-    found = {name: tuple(value.shape) for name, value in tensors.items()}
+def _check_tensors(path: str | Path, header: TensorHeader, shape: NetworkShape) -> None:
+    wanted, found = shape.tensor_shapes(), header.shapes
     for name in sorted(wanted.keys() | found.keys()):
         if found.get(name) != wanted.get(name):
             given, allowed = found.get(name, 'none'), wanted.get(name, 'none')
-            raise ValueError(f'{path} has tensor {name} {given}; its metadata ask for {allowed}')
+            raise ValueError(
+                f'{path} has tensor {one_line(name, 80)} {given!s:.80}; '
+                f'its metadata ask for {allowed}'
+            )
+        if header.types[name] != 'F32':
+            raise ValueError(f'{path} has tensor {name} of {header.types[name]:.8}; allowed: F32')
+
+
+def _check_values(path: str | Path, tensors: dict[str, NDArray[np.float32]]) -> None:
+    for name, values in tensors.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f'{path} has tensor {name} with a value that is not finite')
+        if name.endswith('_normalizer.std') and not (values > 0).all():
+            raise ValueError(f'{path} has tensor {name} with a value that is not above 0')
+
+
+# What a value of the metadata may be.
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f'{value!r:.80} is no text')
+    return value
+
+
+def _whole(value: object) -> int:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise TypeError(f'{value!r:.80} is no whole number')
+    return value
+
+
+def _flag(value: object) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError(f'{value!r:.80} is neither true nor false')
+    return value
+
+
+def _object(value: object) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise TypeError(f'{value!r:.80} is no object')
+    return value
+
+
+def _rate(value: object) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise TypeError(f'{value!r:.80} is no number')
+    substeps_per_tick(float(value))
+    return float(value)
+
+
+def _widths(value: object) -> tuple[int, ...]:
+    if not isinstance(value, list):
+        raise TypeError(f'{value!r:.80} is no list')
+    widths = tuple(_whole(width) for width in value)
+    if any(width < 1 for width in widths):
+        raise ValueError(f'{value!r:.80}; allowed: widths of 1 or more')
+    return widths
+
+
+def _layout(value: Any) -> tuple[tuple[str, int], ...]:
+    return tuple((_text(name), _whole(size)) for name, size in value)
+
+
+_READERS: dict[str, Callable[[Any], Any]] = {
+    'task': _text,
+    'observation_layout': _layout,
+    'goal_size': _whole,
+    'action_size': _whole,
+    'hidden_sizes': _widths,
+    'layer_norm': _flag,
+    'control_hz': _rate,
+    'seed': _whole,
+    'command': _text,
+    'source_revision': _text,
+    'env_steps': _whole,
+    'config': _object,
+    'success': _object,
+    'goal_features': _text,
+    'init_from': _object,
+}

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import json
 import logging
 import os
 import sys
@@ -19,8 +17,9 @@ from torch import Tensor, nn
 
 from msgs_spec.command_line import EXIT_SUCCESS, CommandError, UsageError, run_command
 from policy_node.policies import checkpoint
-from policy_node.policies.actor import Actor, actor_path
-from policy_node.policies.onnx import FORMAT, INPUTS, OUTPUT, OnnxActor
+from policy_node.policies.actor import Actor
+from policy_node.policies.onnx import INPUTS, OUTPUT, OnnxActor
+from policy_node.policies.shipped import actor_path
 
 _NAME = 'export_actor'
 # Largest difference between the actions of both, in [-1, 1]; float32 sums differ in order.
@@ -47,7 +46,8 @@ def export(source: Path, target: Path) -> float:
         The largest difference between the actions of both on random observations.
 
     Raises:
-        ValueError: If the checkpoint or what is needed for ONNX is missing, or actions differ.
+        ValueError: If the checkpoint cannot be used, or what is needed for ONNX is missing.
+        CommandError: If actions differ.
     """
     try:
         import onnx
@@ -75,12 +75,11 @@ def export(source: Path, target: Path) -> float:
                 verbose=False,
             )
         model = onnx.load(partial)
-        values = {name: json.dumps(value) for name, value in dataclasses.asdict(info).items()}
-        onnx.helper.set_model_props(model, {'format': FORMAT, **values})
+        onnx.helper.set_model_props(model, checkpoint.to_metadata(info))
         onnx.save(model, partial)
-        difference = _largest_difference(actor, OnnxActor(partial))
+        difference = _largest_difference(actor, OnnxActor(partial.read_bytes(), partial))
         if difference > _TOLERANCE:
-            raise ValueError(f'actions of {target} differ by {difference:g}; nothing is written')
+            raise CommandError(f'actions of {target} differ by {difference:g}; nothing is written')
         os.replace(partial, target)
     return difference
 
@@ -93,14 +92,14 @@ def _largest_difference(actor: Actor, exported: OnnxActor) -> float:
     for _ in range(_TRIALS):
         vectors = (generator.normal(m, 2.0 * s) for m, s in zip(mean, std, strict=True))
         observation = dict(zip(INPUTS, vectors, strict=True))
-        differences.append(exported.predict(observation) - actor.predict(observation)[0])
+        differences.append(exported.predict(observation)[0] - actor.predict(observation)[0])
     return float(np.abs(differences).max())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Writes the file; returns the exit code."""
     parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
-    parser.add_argument('actor', help='name of a shipped actor, or a checkpoint')
+    parser.add_argument('actor', help='name of a shipped actor, or its .safetensors file')
     parser.add_argument('target', type=Path, help='file to write, <name>.onnx')
     options = parser.parse_args(arguments)
     return run_command(_NAME, lambda: _run(options))
@@ -110,12 +109,10 @@ def _run(options: argparse.Namespace) -> int:
     if options.target.suffix != '.onnx':
         raise UsageError(f'target {str(options.target)!r}; allowed: a name that ends in .onnx')
     try:
-        source = actor_path(options.actor)
+        difference = export(actor_path(options.actor), options.target)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    try:
-        difference = export(source, options.target)
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise CommandError(str(error)) from None
     print(f'{options.target}: actions within {difference:.1e} of the checkpoint')
     return EXIT_SUCCESS

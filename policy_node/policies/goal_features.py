@@ -1,7 +1,9 @@
 """Inputs of actor and critic that know geometry: how far the goal is, how the object is symmetric.
 
 They are functions of observation and goal alone, so an actor with them sees no more than one
-without them; it only need not learn to multiply quaternions, nor that a cube has no front.
+without them; it only need not learn to multiply quaternions, nor that a cube has no front. They are
+the same functions for NumPy arrays, with which actors run, and for torch tensors, with which they
+learn.
 """
 
 from __future__ import annotations
@@ -9,12 +11,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
-from typing import Protocol
+from types import ModuleType
+from typing import Any, Protocol
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from msgs_spec.tasks import GoalKind, TaskSpec
+
+# A NumPy array or a torch tensor; functions return what they are given.
+Array = Any
 
 GOAL_FEATURES = ('plain', 'relative', 'symmetric')
 
@@ -36,11 +41,11 @@ class GoalFeatures(Protocol):
 
     def inputs(
         self,
-        observation: Tensor,
-        goal: Tensor,
-        normalized_observation: Tensor,
-        normalized_goal: Tensor,
-    ) -> Tensor:
+        observation: Array,
+        goal: Array,
+        normalized_observation: Array,
+        normalized_goal: Array,
+    ) -> Array:
         """Inputs (..., size), from both in the units of the task and both normalised."""
         ...
 
@@ -80,29 +85,29 @@ class RelativeGoal:
 
     def inputs(
         self,
-        observation: Tensor,
-        goal: Tensor,
-        normalized_observation: Tensor,
-        normalized_goal: Tensor,
-    ) -> Tensor:
+        observation: Array,
+        goal: Array,
+        normalized_observation: Array,
+        normalized_goal: Array,
+    ) -> Array:
         """Normalised observation and goal, then the difference."""
         difference = self.difference(observation, goal)
-        return torch.cat([normalized_observation, normalized_goal, difference], -1)
+        return _concatenate(normalized_observation, normalized_goal, difference)
 
-    def difference(self, observation: Tensor, goal: Tensor) -> Tensor:
+    def difference(self, observation: Array, goal: Array) -> Array:
         """The difference (..., difference_size) of both in the units of the task."""
         achieved = observation[..., self.start : self.start + self.goal.size]
         scale = _POSITION_SCALES[self.goal]
         if self.goal is not GoalKind.POSE:
             difference = goal - achieved
-            near = (scale * difference).clamp(-_CLIP, _CLIP)
-            return torch.cat([difference, near], -1) if self.goal is GoalKind.POINT else near
+            near = (scale * difference).clip(-_CLIP, _CLIP)
+            return _concatenate(difference, near) if self.goal is GoalKind.POINT else near
         difference = goal[..., :3] - achieved[..., :3]
-        position = (scale * difference).clamp(-_CLIP, _CLIP) * float(self.position_counts)
+        position = (scale * difference).clip(-_CLIP, _CLIP) * float(self.position_counts)
         rotation = _axis_turn if self.ignores_z_rotation else _relative_quaternion
         scalar, vector = rotation(achieved[..., 3:], goal[..., 3:])
-        near = (_ROTATION_SCALE * vector).clamp(-_CLIP, _CLIP)
-        return torch.cat([scalar, vector, near, position], -1)
+        near = (_ROTATION_SCALE * vector).clip(-_CLIP, _CLIP)
+        return _concatenate(scalar, vector, near, position)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,26 +137,23 @@ class SymmetricObject:
 
     def inputs(
         self,
-        observation: Tensor,
-        goal: Tensor,
-        normalized_observation: Tensor,
-        normalized_goal: Tensor,
-    ) -> Tensor:
+        observation: Array,
+        goal: Array,
+        normalized_observation: Array,
+        normalized_goal: Array,
+    ) -> Array:
         """Inputs (..., size); the object's velocity must precede its pose in the observation."""
         del normalized_goal
         start = self.relative.start
         rotation = _rotation_matrix(observation[..., start + 3 : start + 7])
         angular_velocity = (rotation @ observation[..., start - 3 : start, None]).squeeze(-1)
         shape = _cube_shape(rotation) if self.symmetry == 'cube' else _axis_shape(rotation)
-        return torch.cat(
-            [
-                normalized_observation[..., : start - 3],
-                normalized_observation[..., start : start + 3],
-                (_ANGULAR_VELOCITY_SCALE * angular_velocity).clamp(-_CLIP, _CLIP),
-                shape,
-                self.relative.difference(observation, goal),
-            ],
-            -1,
+        return _concatenate(
+            normalized_observation[..., : start - 3],
+            normalized_observation[..., start : start + 3],
+            (_ANGULAR_VELOCITY_SCALE * angular_velocity).clip(-_CLIP, _CLIP),
+            shape,
+            self.relative.difference(observation, goal),
         )
 
 
@@ -175,57 +177,88 @@ def goal_features(kind: str, spec: TaskSpec) -> GoalFeatures | None:
     return SymmetricObject(relative, spec.object_symmetry)
 
 
-def _rotation_matrix(quaternion: Tensor) -> Tensor:
+def _rotation_matrix(quaternion: Array) -> Array:
     """Matrices (..., 3, 3) of unit quaternions wxyz."""
-    w, x, y, z = quaternion.unbind(-1)
+    w, x, y, z = _parts(quaternion)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    stack = _library(quaternion).stack
+    return stack([stack(row, -1) for row in rows], -2)
 
 
-def _cube_shape(rotation: Tensor) -> Tensor:
+def _cube_shape(rotation: Array) -> Array:
     """Sum over the axes a of the products a_i a_j a_k a_l, (..., 15), centred and about +-1."""
     second = _second_powers(rotation)
-    xx, xy, xz, yy, yz, zz = second.unbind(-2)
+    xx, xy, xz, yy, yz, zz = (second[..., i, :] for i in range(6))
     products = [xx * second[..., i, :] for i in range(6)]
     products += [yy * part for part in (xy, xz, yy, yz, zz)]
     products += [zz * part for part in (xy, xz, yz, zz)]
-    sums = torch.stack([reduce(add, product.unbind(-1)) for product in products], -1)
+    sums = _library(rotation).stack([reduce(add, _parts(product)) for product in products], -1)
     # Means over all rotations: 3/5 of fourth powers, 3/15 of products of two squares.
-    means = sums.new_tensor([0.6, 0, 0, 0.2, 0, 0.2, 0, 0, 0.6, 0, 0.2, 0, 0, 0, 0.6])
+    means = _like(sums, [0.6, 0, 0, 0.2, 0, 0.2, 0, 0, 0.6, 0, 0.2, 0, 0, 0, 0.6])
     return 3.0 * (sums - means)
 
 
-def _axis_shape(rotation: Tensor) -> Tensor:
+def _axis_shape(rotation: Array) -> Array:
     """Products a_i a_j of the z axis a, (..., 6), centred and about +-1."""
     second = _second_powers(rotation[..., 2:]).squeeze(-1)
-    return 1.5 * (second - second.new_tensor([1 / 3, 0, 0, 1 / 3, 0, 1 / 3]))
+    return 1.5 * (second - _like(second, [1 / 3, 0, 0, 1 / 3, 0, 1 / 3]))
 
 
-def _second_powers(axes: Tensor) -> Tensor:
+def _second_powers(axes: Array) -> Array:
     """Products xx, xy, xz, yy, yz, zz (..., 6, n) of the columns of (..., 3, n)."""
-    x, y, z = axes.unbind(-2)
-    return torch.stack([x * x, x * y, x * z, y * y, y * z, z * z], -2)
+    x, y, z = (axes[..., i, :] for i in range(3))
+    return _library(axes).stack([x * x, x * y, x * z, y * y, y * z, z * z], -2)
 
 
-def _relative_quaternion(achieved: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+def _relative_quaternion(achieved: Array, goal: Array) -> tuple[Array, Array]:
     """Real part (..., 1) and vector part (..., 3) of goal times conjugate of achieved, wxyz."""
     real, vector = achieved[..., :1], achieved[..., 1:]
     goal_real, goal_vector = goal[..., :1], goal[..., 1:]
-    scalar = (achieved * goal).sum(-1, keepdim=True)
-    cross = torch.linalg.cross(goal_vector, vector)
-    return scalar, real * goal_vector - goal_real * vector - cross
+    scalar = (achieved * goal).sum(-1)[..., None]
+    return scalar, real * goal_vector - goal_real * vector - _cross(goal_vector, vector)
 
 
-def _axis_turn(achieved: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+def _axis_turn(achieved: Array, goal: Array) -> tuple[Array, Array]:
     """Dot (..., 1) and cross product (..., 3) of the z axes of two quaternions wxyz."""
     first, second = _z_axis(achieved), _z_axis(goal)
-    return (first * second).sum(-1, keepdim=True), torch.linalg.cross(first, second)
+    return (first * second).sum(-1)[..., None], _cross(first, second)
 
 
-def _z_axis(quaternion: Tensor) -> Tensor:
-    w, x, y, z = quaternion.unbind(-1)
-    return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
+def _z_axis(quaternion: Array) -> Array:
+    w, x, y, z = _parts(quaternion)
+    axis = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
+    return _library(quaternion).stack(axis, -1)
+
+
+def _library(array: Array) -> ModuleType:
+    """NumPy or torch, whichever the array belongs to: the names used here are theirs alike."""
+    if isinstance(array, np.ndarray):
+        return np
+    import torch
+
+    return torch
+
+
+def _concatenate(*parts: Array) -> Array:
+    """The parts one after the other along the last axis."""
+    return _library(parts[0]).concatenate(parts, -1)
+
+
+def _like(array: Array, values: list[float]) -> Array:
+    """The values as an array of the same kind."""
+    return np.asarray(values) if isinstance(array, np.ndarray) else array.new_tensor(values)
+
+
+def _parts(array: Array) -> list[Array]:
+    """What lies along the last axis, one by one."""
+    return [array[..., i] for i in range(array.shape[-1])]
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """Cross product of vectors (..., 3)."""
+    library = _library(first)
+    return np.cross(first, second) if library is np else library.linalg.cross(first, second)

@@ -2,111 +2,171 @@
 
 The graph takes `observation` (n, observation size) and `desired_goal` (n, goal size), float32, in
 the units of the task, normalisation included, and returns `action` (n, action size) in [-1, 1]. The
-file's metadata say what it was trained on.
+file's metadata are those of a checkpoint.
+
+A few hundred bytes of ONNX can ask for gigabytes, so a file is first loaded and run once in a
+process of its own, whose memory and time are limited: `python -m policy_node.policies.onnx`. That
+bounds what it costs to load a file and to answer one observation; only a graph that was made to
+cost more for other observations is not found out.
 """
 
 from __future__ import annotations
 
-import json
+import os
+import resource
+import subprocess
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.actions import command_from_action
-from msgs_spec.tasks import TASKS, TaskSpec, task_spec
+from policy_node.policies.checkpoint import ActorInfo, parse_metadata
+from policy_node.policies.files import one_line, read_file, sha256
+from policy_node.policies.policy import LoadedPolicy, Observation, observation_part
 
-if TYPE_CHECKING:
-    from policy_node.policies.commander import Observation
-
-FORMAT = 'fetch_hand_actor'
 INPUTS = ('observation', 'desired_goal')
 OUTPUT = 'action'
 
+# Of the trial: 100 MiB and .1 s go to onnxruntime itself.
+_TRIAL_MEMORY = 400 * 2**20
+_TRIAL_CPU_SECONDS = 2
+_TRIAL_TIMEOUT = 30.0
+
 
 class OnnxActor:
-    """Runs an ONNX file on one thread.
+    """Runs the bytes of an ONNX file on one thread.
+
+    Args:
+        data: The file.
+        path: Its name, for errors.
 
     Attributes:
-        task: The task it was trained on.
-        control_hz: The action frequency it was trained at.
+        info: What its metadata say about the actor.
+
+    Raises:
+        ValueError: If onnxruntime is missing, or the file is no actor of this project or does not
+            fit its task; one line says why.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Loads a file.
-
-        Raises:
-            ValueError: If onnxruntime is missing, or the file is none of this project or does not
-                fit its task; one line says why.
-        """
-        try:
-            import onnxruntime
-        except ImportError:
-            raise ValueError(f'{path.name} needs onnxruntime: pip install onnxruntime') from None
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4
-        try:
-            self._session = onnxruntime.InferenceSession(
-                path, options, providers=['CPUExecutionProvider']
-            )
-        except Exception as error:
-            # onnxruntime raises a type of its own for each kind of damage.
-            line = ' '.join(str(error).split())[:200]
-            raise ValueError(f'{path} is not a readable ONNX file: {line}') from None
+    def __init__(self, data: bytes, path: Path) -> None:
+        self._session = _session(data, path)
         metadata = self._session.get_modelmeta().custom_metadata_map
-        if metadata.get('format') != FORMAT:
-            raise ValueError(f'{path} is no actor of this project; export_actor writes them')
-        self.task, self.control_hz = _read_metadata(path, metadata)
-        self._check_sizes(path, task_spec(self.task))
+        # Files from before the version was written are of the first.
+        self.info: ActorInfo = parse_metadata({'format_version': '1', **metadata}, path)
+        self._check_sizes(path)
 
-    def predict(self, observation: Observation) -> NDArray[np.float32]:
-        """Returns the action (action size,) in [-1, 1] for one observation."""
-        inputs = {name: np.asarray(observation[name], np.float32)[None] for name in INPUTS}
-        (action,) = self._session.run([OUTPUT], inputs)
-        return np.asarray(action[0], np.float32)
+    def predict(
+        self, observation: Observation, *, deterministic: bool = True
+    ) -> tuple[NDArray[np.float32], None]:
+        """Returns the action (..., action size) in [-1, 1] for one observation or a batch."""
+        del deterministic
+        sizes = (self.info.shape.observation_size, self.info.goal_size)
+        pairs = zip(INPUTS, sizes, strict=True)
+        parts = {name: observation_part(observation, name, size) for name, size in pairs}
+        leading = parts['observation'].shape[:-1]
+        flat = {name: part.reshape(-1, part.shape[-1]) for name, part in parts.items()}
+        (action,) = self._session.run([OUTPUT], flat)
+        return np.asarray(action, np.float32).reshape(*leading, -1), None
 
-    def _check_sizes(self, path: Path, spec: TaskSpec) -> None:
+    def _check_sizes(self, path: Path) -> None:
         places = (*self._session.get_inputs(), *self._session.get_outputs())
-        found = {place.name: place.shape[-1] for place in places}
+        found = {place.name: place.shape[-1] if place.shape else None for place in places}
         wanted = {
-            'observation': spec.observation_size,
-            'desired_goal': spec.goal.size,
-            OUTPUT: spec.robot.action_size,
+            'observation': self.info.shape.observation_size,
+            'desired_goal': self.info.goal_size,
+            OUTPUT: self.info.action_size,
         }
         if found != wanted:
-            raise ValueError(f'{path} has sizes {found}; {spec.name} has {wanted}')
+            raise ValueError(f'{path} has sizes {one_line(found)}; {self.info.task} has {wanted}')
 
 
-def _read_metadata(path: Path, metadata: dict[str, str]) -> tuple[str, float]:
+def load_onnx(path: Path, task: str | None = None) -> LoadedPolicy:
+    """Loads an ONNX file to act with.
+
+    Raises:
+        ValueError: If it cannot be used, costs too much, or was trained on another task.
+    """
+    data = read_file(path)
+    _require_onnxruntime(path)
+    _try_out(data, path)
+    actor = OnnxActor(data, path)
+    if task is not None and actor.info.task != task:
+        raise ValueError(f'{path} was trained on {actor.info.task}, not on {task}')
+    return LoadedPolicy(
+        policy=actor,
+        task=actor.info.task,
+        description=f'actor {path.name}',
+        control_hz=actor.info.control_hz,
+        sha256=sha256(data),
+    )
+
+
+def _require_onnxruntime(path: Path) -> Any:
     try:
-        task, control_hz = json.loads(metadata['task']), float(json.loads(metadata['control_hz']))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f'{path} has unreadable metadata: {error}') from None
-    if task not in TASKS:
-        raise ValueError(f'{path} was trained on unknown task {task!r}')
-    return task, control_hz
+        import onnxruntime
+    except ImportError:
+        raise ValueError(f'{path.name} needs onnxruntime: pip install onnxruntime') from None
+    return onnxruntime
 
 
-class OnnxCommander:
-    """An ONNX actor that fits the robot."""
+def _session(data: bytes, path: Path) -> Any:
+    onnxruntime = _require_onnxruntime(path)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=['CPUExecutionProvider'])
+    except Exception as error:
+        # onnxruntime raises a type of its own for each kind of damage.
+        raise ValueError(f'{path} is not a readable ONNX file: {one_line(error)}') from None
 
-    def __init__(self, path: Path, spec: TaskSpec, sha256: str) -> None:
-        """Loads the file.
 
-        Raises:
-            ValueError: If it cannot be used.
-        """
-        self._actor = OnnxActor(path)
-        if self._actor.task != spec.name:
-            raise ValueError(f'{path.name} was trained on {self._actor.task}, not on {spec.name}')
-        self.control_hz: float | None = self._actor.control_hz
-        self.spec = spec
-        self.description = f'actor {path.name}'
-        self.sha256 = sha256
+def _try_out(data: bytes, path: Path) -> None:
+    """Raises ValueError for what cannot be loaded and run within the limits."""
+    command = [sys.executable, '-m', __name__, str(path)]
+    environment = os.environ | {'PYTHONPATH': os.pathsep.join(p or os.getcwd() for p in sys.path)}
+    try:
+        trial = subprocess.run(
+            command,
+            input=data,
+            capture_output=True,
+            env=environment,
+            timeout=_TRIAL_TIMEOUT,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ValueError(f'{path} cannot be tried out: {one_line(error)}') from None
+    if trial.returncode == 1:
+        raise ValueError(one_line(trial.stderr.decode(errors='replace')))
+    if trial.returncode != 0:
+        raise ValueError(
+            f'{path} needs more than {_TRIAL_MEMORY >> 20} MiB or {_TRIAL_CPU_SECONDS} s to answer '
+            'one observation, which is the most allowed'
+        )
 
-    def command(self, observation: Observation) -> NDArray[np.float64]:
-        """Returns the actor's command."""
-        action: Any = self._actor.predict(observation)
-        return np.asarray(command_from_action(self.spec.robot, action), dtype=np.float64)
+
+def _trial(path: Path) -> int:
+    """Loads the file on standard input and runs it once; returns 1 with a line if it cannot."""
+    data = sys.stdin.buffer.read()
+    try:
+        _require_onnxruntime(path)
+        used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+        seconds = int(used) + 1 + _TRIAL_CPU_SECONDS
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+        resource.setrlimit(resource.RLIMIT_DATA, (_TRIAL_MEMORY, _TRIAL_MEMORY))
+        actor = OnnxActor(data, path)
+        sizes = (actor.info.shape.observation_size, actor.info.goal_size)
+        actor.predict({name: np.zeros(n) for name, n in zip(INPUTS, sizes, strict=True)})
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 1
+    except Exception as error:
+        print(f'{path} does not run: {one_line(error)}', file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(_trial(Path(sys.argv[1])))

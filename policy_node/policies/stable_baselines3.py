@@ -6,20 +6,19 @@ not say which task or rate it was trained at, so only sizes can be checked.
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
+import zlib
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.actions import command_from_action
-from msgs_spec.tasks import TaskSpec
-
-if TYPE_CHECKING:
-    from policy_node.policies.commander import Observation
+from msgs_spec.tasks import TaskSpec, task_spec
+from policy_node.policies.files import one_line, read_file, sha256
+from policy_node.policies.policy import LoadedPolicy, Observation
 
 # Packages of policy classes, and the algorithm that loads each.
 _ALGORITHMS = {
@@ -36,46 +35,77 @@ _WITHOUT_TRAINING: dict[str, Any] = {
     'learning_rate': 0.0,
     'lr_schedule': lambda progress: 0.0,
 }
+# Unpacked; an actor and its critics of the paper's size have 10 MB with their optimisers.
+_LARGEST_CONTENTS = 256 * 2**20
+_LARGEST_DESCRIPTION = 16 * 2**20
+
+# What `zipfile` and `json` raise for a file that is none of these.
+_DAMAGES = (
+    AttributeError,
+    KeyError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    UnicodeDecodeError,
+    json.JSONDecodeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
-class StableBaselines3Commander:
-    """A policy of Stable-Baselines3 that fits the robot."""
+class StableBaselines3Policy:
+    """A policy of that library, which explores unless it is told not to.
 
-    control_hz: float | None = None
+    Args:
+        policy: The policy of a model.
+    """
 
-    def __init__(self, path: Path, spec: TaskSpec, sha256: str) -> None:
-        """Loads the file.
+    def __init__(self, policy: Any) -> None:
+        self._policy = policy
 
-        Raises:
-            ValueError: If the library is missing, the file cannot be read or its sizes do not fit.
-        """
-        algorithm = _algorithm(path)
-        try:
-            self._policy: Any = algorithm.load(
-                path, device='cpu', custom_objects=_WITHOUT_TRAINING
-            ).policy
-        except Exception as error:
-            # Unpickling a file of another version can raise anything.
-            line = ' '.join(str(error).split())[:200]
-            raise ValueError(f'{path} cannot be loaded: {line}') from None
-        _check_sizes(path, spec, self._policy)
-        self.spec = spec
-        self.description = f'Stable-Baselines3 {algorithm.__name__} {path.name}'
-        self.sha256 = sha256
-
-    def command(self, observation: Observation) -> NDArray[np.float64]:
-        """Returns the policy's command, without exploration noise."""
-        action, _ = self._policy.predict(observation, deterministic=True)
-        return np.asarray(command_from_action(self.spec.robot, action), dtype=np.float64)
+    def predict(
+        self, observation: Observation, *, deterministic: bool = True
+    ) -> tuple[NDArray[Any], Any]:
+        """Returns actions (..., action size) in [-1, 1] for one observation or a batch."""
+        action, state = self._policy.predict(dict(observation), deterministic=deterministic)
+        return action, state
 
 
-def _algorithm(path: Path) -> Any:
+def load_stable_baselines3(path: Path, task: str) -> LoadedPolicy:
+    """Loads a model to act with, which runs the code in its file.
+
+    Args:
+        path: The file.
+        task: The task whose sizes it must have.
+
+    Raises:
+        ValueError: If the library is missing, the file cannot be read or its sizes do not fit.
+    """
+    data = read_file(path, _LARGEST_CONTENTS)
+    algorithm = _algorithm(data, path)
+    try:
+        model = algorithm.load(io.BytesIO(data), device='cpu', custom_objects=_WITHOUT_TRAINING)
+    except Exception as error:
+        # Unpickling a file of another version can raise anything.
+        raise ValueError(f'{path} cannot be loaded: {one_line(error)}') from None
+    _check_sizes(path, task_spec(task), model.policy)
+    return LoadedPolicy(
+        policy=StableBaselines3Policy(model.policy),
+        task=task,
+        description=f'Stable-Baselines3 {algorithm.__name__} {path.name}',
+        sha256=sha256(data),
+    )
+
+
+def _algorithm(data: bytes, path: Path) -> Any:
     """The class that loads a file, told by the policy class in it."""
     try:
-        with zipfile.ZipFile(path) as file:
+        with zipfile.ZipFile(io.BytesIO(data)) as file:
+            _check_contents(path, file)
             module = json.loads(file.read('data'))['policy_class']['__module__']
-    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f'{path} is not a file of Stable-Baselines3: {error}') from None
+    except _DAMAGES as error:
+        line = one_line(error)
+        raise ValueError(f'{path} is not a file of Stable-Baselines3: {line}') from None
     for package, name in _ALGORITHMS.items():
         if str(module).startswith(f'{package}.'):
             library = package.partition('.')[0]
@@ -84,7 +114,20 @@ def _algorithm(path: Path) -> Any:
             except ImportError:
                 missing = library.replace('_', '-')
                 raise ValueError(f'{path.name} needs {missing}: pip install {missing}') from None
-    raise ValueError(f'{path} has a policy of {module}; allowed: {", ".join(_ALGORITHMS.values())}')
+    raise ValueError(
+        f'{path} has a policy of {one_line(module)}; allowed: {", ".join(_ALGORITHMS.values())}'
+    )
+
+
+def _check_contents(path: Path, file: zipfile.ZipFile) -> None:
+    """A megabyte of zip can hold a gigabyte of zeros."""
+    total = sum(member.file_size for member in file.infolist())
+    description = file.getinfo('data').file_size
+    if total > _LARGEST_CONTENTS or description > _LARGEST_DESCRIPTION:
+        raise ValueError(
+            f'{path} unpacks to {total} bytes, {description} of them its description; '
+            f'allowed: {_LARGEST_CONTENTS} and {_LARGEST_DESCRIPTION}'
+        )
 
 
 def _check_sizes(path: Path, spec: TaskSpec, policy: Any) -> None:

@@ -12,12 +12,12 @@ def train_her() -> int:
 
 def evaluate_policy() -> int:
     """Runs `evaluate_policy`; returns the exit code."""
-    return start_command('evaluate_policy', 'policy_node.training.evaluate_policy', 'actors')
+    return start_command('evaluate_policy', 'policy_node.training.evaluate_policy')
 
 
 def generate_episodes() -> int:
     """Runs `generate_episodes`; returns the exit code."""
-    return start_command('generate_episodes', 'policy_node.training.generate_episodes', 'actors')
+    return start_command('generate_episodes', 'policy_node.training.generate_episodes')
 
 
 def benchmark() -> int:

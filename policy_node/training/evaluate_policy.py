@@ -23,17 +23,13 @@ from msgs_spec.command_line import (
     progress,
     run_command,
 )
-from msgs_spec.tasks import TASKS, task_spec
-from policy_node.policies import checkpoint
-from policy_node.policies.actor import actor_path
+from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, summarize
-from policy_node.training.evaluation.floors import RandomPolicy, RestingPolicy
-from policy_node.training.learning.collector import Policy
+from policy_node.training.policy_options import add_policy_options, load_chosen_policy
 
 _NAME = 'evaluate_policy'
 # What `--json` without a file means.
 _STDOUT = Path('-')
-FLOORS = ('random', 'resting')
 # Far from the seeds of training and of its evaluations.
 FIRST_SEED = 2_000_000_000
 
@@ -41,13 +37,8 @@ FIRST_SEED = 2_000_000_000
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
     parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    add_policy_options(parser, former='--actor')
     add = parser.add_argument
-    add(
-        '--actor',
-        required=True,
-        help='shipped actor, checkpoint file, random, resting, or sb3:<class>:<file.zip>',
-    )
-    add('--task', choices=list(TASKS), metavar='TASK', help='default: the task of the checkpoint')
     add('--episodes', type=int, default=1000, help='default: 1000')
     add('--first-seed', type=int, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
     add('--num-envs', type=int, default=100, help='simulations in the batch; default: 100')
@@ -76,14 +67,20 @@ def _run(options: argparse.Namespace) -> int:
     for name in ('episodes', 'num_envs'):
         if getattr(options, name) < 1:
             raise UsageError(f'--{name.replace("_", "-")} {getattr(options, name)}; allowed: >= 1')
+    loaded = load_chosen_policy(options)
     try:
-        policy, task, about = load_policy(options.actor, options.task)
-        simulation = _simulation(options, task)
-    except (ValueError, ImportError) as error:
+        simulation = _simulation(options, loaded.task)
+    except ValueError as error:
         raise UsageError(str(error)) from None
-    outcomes, code = _evaluate(options, simulation, policy)
-    rules = {'reward_type': options.reward_type, 'touched_rule': options.success_rule}
-    report = {'actor': options.actor, 'task': task, **about, **summarize(outcomes), **rules}
+    outcomes, code = _evaluate(options, simulation, loaded.policy)
+    report = {
+        'policy': options.policy or loaded.task,
+        'task': loaded.task,
+        'sha256': loaded.sha256,
+        **summarize(outcomes),
+        'reward_type': options.reward_type,
+        'touched_rule': options.success_rule,
+    }
     text = json.dumps(report, indent=2)
     if options.json == _STDOUT:
         print(text)
@@ -121,42 +118,6 @@ def _evaluate(
             return finished[-1], EXIT_INTERRUPTED
 
 
-def load_policy(actor: str, task: str | None) -> tuple[Policy, str, dict[str, Any]]:
-    """Returns the policy called `actor`, its task, and what identifies it.
-
-    Raises:
-        ValueError: If there is no such actor, it does not fit the task, or the task is missing.
-        ImportError: If a Stable-Baselines3 model is asked for and that is not installed.
-    """
-    if actor not in FLOORS and not actor.startswith('sb3:'):
-        path = actor_path(actor)
-        loaded, info = checkpoint.load(path, task)
-        return loaded, info.task, {'sha256': checkpoint.checkpoint_hash(path)}
-    if task is None:
-        raise ValueError(f'--task is missing for --actor {actor}; allowed: {", ".join(TASKS)}')
-    size = task_spec(task).robot.action_size
-    if actor == 'random':
-        return RandomPolicy(size), task, {}
-    if actor == 'resting':
-        return RestingPolicy(size), task, {}
-    return _stable_baselines3(actor), task, {}
-
-
-def _stable_baselines3(actor: str) -> Policy:
-    parts = actor.split(':', 2)
-    if len(parts) != 3 or not Path(parts[2]).is_file():
-        raise ValueError(f'{actor!r} is not sb3:<class>:<file.zip> of an existing file')
-    import stable_baselines3
-
-    algorithm = getattr(stable_baselines3, parts[1], None)
-    if algorithm is None or not hasattr(algorithm, 'load'):
-        raise ValueError(f'stable_baselines3 has no algorithm {parts[1]!r}')
-    # A replay buffer for hindsight would ask for its environment; predicting needs neither.
-    replay: dict[str, Any] = {'replay_buffer_class': None, 'replay_buffer_kwargs': {}}
-    policy: Policy = algorithm.load(parts[2], device='cpu', custom_objects=replay)
-    return policy
-
-
 def _simulation(options: argparse.Namespace, task: str) -> Simulation:
     return Simulation(
         task,
@@ -178,7 +139,7 @@ _DIAGNOSES = {
 
 def print_table(report: dict[str, Any]) -> None:
     """Prints rates with their 95 % intervals."""
-    title = f'{report["task"]}: {report["actor"]}, {report["episodes"]} episodes'
+    title = f'{report["task"]}: {report["policy"]}, {report["episodes"]} episodes'
     table = Table('measure', 'value', '95 % interval', title=title)
     names = {
         'success_gymnasium': 'success at the last step, gymnasium rule',

@@ -14,29 +14,32 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from msgs_spec.command_line import EXIT_SUCCESS, UsageError, run_command
 from msgs_spec.tasks import task_spec
-from policy_node.policies import checkpoint
-from policy_node.policies.actor import actor_path
+from policy_node.policies.policy import Policy
 from policy_node.training.evaluate_policy import FIRST_SEED
 from policy_node.training.evaluation.episodes import wilson_interval
+from policy_node.training.policy_options import add_policy_options, load_chosen_policy
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
     parser = argparse.ArgumentParser(prog='evaluate_reference', description=__doc__)
+    add_policy_options(parser, former='--actor')
     add = parser.add_argument
-    add('--actor', required=True, help='shipped actor or checkpoint file')
     add('--episodes', type=int, default=1000, help='default: 1000')
     add('--first-seed', type=int, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
     add('--json', type=Path, help='add the result to this JSON file')
     return parser.parse_args(arguments)
 
 
-def success_in_reference(actor: Any, reference_id: str, ticks: int, seeds: Sequence[int]) -> int:
+def success_in_reference(
+    policy: Policy, reference_id: str, ticks: int, seeds: Sequence[int]
+) -> int:
     """Counts the episodes that end in success.
 
     Args:
-        actor: Anything with Stable-Baselines3's `predict`.
+        policy: What acts.
         reference_id: Environment of Gymnasium-Robotics, for example `FetchPush-v4`.
         ticks: Steps per episode.
         seeds: Seed of each episode; each gets a fresh environment, because the reference's hand
@@ -55,7 +58,7 @@ def success_in_reference(actor: Any, reference_id: str, ticks: int, seeds: Seque
         observation, _ = env.reset(seed=seed)
         info: dict[str, Any] = {}
         for _ in range(ticks):
-            action, _ = actor.predict(observation, deterministic=True)
+            action, _ = policy.predict(observation, deterministic=True)
             observation, _, _, _, info = env.step(action)
         successes += bool(info['is_success'])
     return successes
@@ -64,17 +67,16 @@ def success_in_reference(actor: Any, reference_id: str, ticks: int, seeds: Seque
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     options = parse_arguments(arguments)
+    return run_command('evaluate_reference', lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     if __debug__:
-        print('evaluate_reference: asserts are on; start it with python -O', file=sys.stderr)
-        return 2
-    try:
-        actor, info = checkpoint.load(actor_path(options.actor))
-    except ValueError as error:
-        print(f'evaluate_reference: {error}', file=sys.stderr)
-        return 2
-    spec = task_spec(info.task)
+        raise UsageError('asserts are on; start it with python -O')
+    loaded = load_chosen_policy(options)
+    spec = task_spec(loaded.task)
     seeds = range(options.first_seed, options.first_seed + options.episodes)
-    successes = success_in_reference(actor, spec.reference_id, spec.episode_ticks, seeds)
+    successes = success_in_reference(loaded.policy, spec.reference_id, spec.episode_ticks, seeds)
     lower, upper = wilson_interval(successes, options.episodes)
     result = {
         'environment': spec.reference_id,
@@ -87,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.json is not None:
         report = json.loads(options.json.read_text()) if options.json.is_file() else {}
         options.json.write_text(json.dumps({**report, 'reference': result}, indent=2) + '\n')
-    return 0
+    return EXIT_SUCCESS
 
 
 if __name__ == '__main__':

@@ -11,9 +11,9 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-import torch
+from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeLogError
 from fetch_hand_sim.episodes.context import RecordingContext
@@ -26,10 +26,8 @@ from msgs_spec.command_line import (
     progress,
     run_command,
 )
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS
-from policy_node.policies import checkpoint
-from policy_node.policies.actor import actor_path
-from policy_node.training.evaluate_policy import FLOORS, load_policy
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ
+from policy_node.training.policy_options import add_policy_options, load_chosen_policy
 
 _NAME = 'generate_episodes'
 
@@ -37,13 +35,8 @@ _NAME = 'generate_episodes'
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
     parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    add_policy_options(parser)
     add = parser.add_argument
-    add(
-        '--policy',
-        required=True,
-        help='shipped actor, checkpoint file, random, resting, or sb3:<class>:<file.zip>',
-    )
-    add('--task', choices=list(TASKS), metavar='TASK', help='default: the task of the checkpoint')
     add('--episodes', type=int, default=1000, help='default: 1000')
     add('--output', type=Path, required=True, help='directory in which episodes are collected')
     add('--first-seed', type=int, default=0, help='episode i has this seed plus i; default: 0')
@@ -65,30 +58,25 @@ def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simul
     """Returns what makes the episodes, and its simulation.
 
     Raises:
-        ValueError: If there is no such policy, or an option does not fit it.
-        ImportError: If a Stable-Baselines3 model is asked for and that is not installed.
+        UsageError: If there is no such policy.
+        ValueError: If an option does not fit it.
     """
-    policy, task, about = load_policy(options.policy, options.task)
-    is_actor = options.policy not in FLOORS and not options.policy.startswith('sb3:')
+    loaded = load_chosen_policy(options)
     simulation = Simulation(
-        task,
+        loaded.task,
         num_envs=min(options.num_envs, options.episodes),
         num_threads=options.threads,
         reward_type=options.reward_type,
         success_rule=options.success_rule,
-        control_hz=_control_hz(options.policy) if is_actor else DEFAULT_CONTROL_HZ,
+        control_hz=loaded.control_hz or DEFAULT_CONTROL_HZ,
     )
     context = RecordingContext(simulation, with_compiled_model=options.compiled_model)
-    context.checkpoint_sha256 = about.get('sha256')
+    context.checkpoint_sha256 = loaded.sha256 or None
 
-    def act(observation: Observation) -> np.ndarray:
-        return policy.predict(observation, deterministic=True)[0]
+    def act(observation: Observation) -> NDArray[Any]:
+        return loaded.policy.predict(observation, deterministic=True)[0]
 
     return EpisodeGenerator(simulation, options.output, act, context), simulation
-
-
-def _control_hz(actor: str) -> float:
-    return checkpoint.read_info(actor_path(actor)).control_hz
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -98,10 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    torch.set_num_threads(1)
     try:
         generator, simulation = make_generator(options)
-    except (ValueError, ImportError) as error:
+    except ValueError as error:
         raise UsageError(str(error)) from None
     began, cpu_began = time.perf_counter(), time.process_time()
     count = steps = successes = 0

@@ -57,7 +57,7 @@ def ship(options: argparse.Namespace) -> bool:
         info.task, num_envs=num_envs, num_threads=options.threads, control_hz=info.control_hz
     )
     summary = summarize(evaluate(simulation, actor, options.episodes, FIRST_SEED))
-    print_table({'actor': str(options.run), 'task': info.task, **summary})
+    print_table({'policy': str(options.run), 'task': info.task, **summary})
     shipped = options.actors / f'{info.task}.json'
     if shipped.is_file() and not is_better(summary, json.loads(shipped.read_text())):
         print(f'ship_actor: the actor in {options.actors} is at least as good; nothing changed')

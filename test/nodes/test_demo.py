@@ -12,7 +12,7 @@ from fetch_hand_sim.episode_log import read_summary
 
 @pytest.mark.parametrize(('number', 'code'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, tmp_path):
-    command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--checkpoint', 'resting']
+    command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting']
     demo = start_process(*command, '--episodes', '100', cwd=tmp_path)
     assert demo.stdout.readline().split() == [
         'episode',

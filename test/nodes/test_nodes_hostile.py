@@ -161,7 +161,7 @@ def test_two_arms_and_two_hands_in_one_graph(start_process: Start, tmp_path: Pat
     sims, policies = {}, []
     for index, (name, task) in enumerate(robots.items()):
         namespace = ['-r', f'__ns:=/{name}']
-        policies.append(start_process(*POLICY_NODE, *ros_args(checkpoint='random'), *namespace))
+        policies.append(start_process(*POLICY_NODE, *ros_args(policy='random'), *namespace))
         arguments = ros_args(
             task=task,
             mode='lockstep',
@@ -216,7 +216,7 @@ def test_memory_stays_flat_at_twenty_times_real_time(
     start_process: Start, soak_seconds: float
 ) -> None:
     sim = start_process(*SIM_NODE, *ros_args(real_time_factor=20.0))
-    policy = start_process(*POLICY_NODE, *ros_args(checkpoint='random'))
+    policy = start_process(*POLICY_NODE, *ros_args(policy='random'))
     with client(REACH) as robot:
         robot.subscribe('/diagnostics')
         robot.spin_until(
@@ -260,7 +260,7 @@ def wait_for_handler(process: subprocess.Popen[str]) -> None:
 def test_ctrl_c_at_any_moment_ends_with_0_and_no_traceback(
     start_process: Start, command: tuple[str, ...]
 ) -> None:
-    arguments = ros_args(checkpoint='FetchReach') if command is POLICY_NODE else ros_args()
+    arguments = ros_args(policy='FetchReach') if command is POLICY_NODE else ros_args()
     robot = start_process(*SIM_NODE, *ros_args(mode='lockstep'))
     delays = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.8, 1.2, 2.0, 3.0)
     for group in (delays[::2], delays[1::2]):

@@ -18,8 +18,9 @@ from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import topics
+from policy_node.node.commander import Commander
 from policy_node.node.responder import Responder
-from policy_node.policies.commander import make_commander
+from policy_node.policies.loading import load_policy
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,
@@ -50,9 +51,8 @@ def batch_run(spec: TaskSpec, episodes: int) -> list[dict[str, list[bytes]]]:
     encoder, buffer = TickEncoder(spec), CommandBuffer(spec.robot, 0.0)
     status = runner.waiting_status()
     sent: list[bytes] = []
-    responder = Responder(
-        make_commander('', status), status, lambda data: sent.append(data) or True
-    )
+    commander = Commander(load_policy('', status.task), status.control_hz)
+    responder = Responder(commander, status, lambda data: sent.append(data) or True)
     result: list[dict[str, list[bytes]]] = []
     while not runner.is_done:
         tick = runner.advance(buffer.take())
@@ -130,7 +130,7 @@ def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
         robot.subscribe('reward', 'joint_states')
         robot.connect('set_goal')
         # The reset tick is long gone when the first commander appears.
-        policy = start_process(*POLICY_NODE, *ros_args(checkpoint='resting'))
+        policy = start_process(*POLICY_NODE, *ros_args(policy='resting'))
         ticks = robot.received['reward']
         robot.spin_until(lambda: len(ticks) > 20, 'ticks')
         policy.kill()
@@ -140,7 +140,7 @@ def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
         robot.spin(1.5)
         assert len(ticks) == count
         assert len({str(m.header.stamp) for m in robot.received['joint_states']}) <= count + 9
-        again = start_process(*POLICY_NODE, *ros_args(checkpoint='resting'))
+        again = start_process(*POLICY_NODE, *ros_args(policy='resting'))
         robot.spin_until(lambda: len(ticks) > count + 20, 'ticks of the next commander')
         again.send_signal(signal.SIGSTOP)
         robot.spin(0.2)
@@ -158,7 +158,7 @@ def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
 
 def test_two_commanders_are_named_and_health_is_published(start_process: Start) -> None:
     sim = start_process(*SIM_NODE, *ros_args(real_time_factor=4.0))
-    policy = start_process(*POLICY_NODE, *ros_args(checkpoint='random'))
+    policy = start_process(*POLICY_NODE, *ros_args(policy='random'))
     with client(REACH) as robot:
         robot.subscribe('/diagnostics', 'real_time_factor')
         robot.connect('commands')

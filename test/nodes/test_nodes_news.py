@@ -19,7 +19,7 @@ REACH = task_spec('FetchReach')
 
 def test_a_policy_that_is_killed_is_missed_in_real_time(start_process: Start) -> None:
     sim = start_process(*SIM_NODE, *ros_args(wait_for_commands=True, real_time_factor=4.0))
-    policy = start_process(*POLICY_NODE, *ros_args(checkpoint='resting'))
+    policy = start_process(*POLICY_NODE, *ros_args(policy='resting'))
     with client(REACH) as robot:
         robot.subscribe('/diagnostics', 'reward')
         robot.spin_until(lambda: len(robot.received['reward']) > 5, 'ticks')
@@ -30,7 +30,7 @@ def test_a_policy_that_is_killed_is_missed_in_real_time(start_process: Start) ->
         )
         assert robot.reports()[-1].level == b'\x01'
         # A successor is one commander, though the graph remembers the first for 20 s.
-        successor = start_process(*POLICY_NODE, *ros_args(checkpoint='resting'))
+        successor = start_process(*POLICY_NODE, *ros_args(policy='resting'))
         robot.spin_until(lambda: 'stopped' not in robot.reports()[-1].message, 'commands')
         assert 'publish commands' not in robot.reports()[-1].message
         assert robot.values()['commanders'] == '/policy_node'

@@ -24,10 +24,10 @@ NEEDS = {
     'view': ['rclpy'],
     'visualization_node': ['rclpy'],
     'render_episode': [],
-    'evaluate_policy': ['torch', 'safetensors'],
-    'generate_episodes': ['torch', 'safetensors'],
-    'train_her': ['torch', 'safetensors', 'matplotlib', 'tensorboard'],
-    'benchmark': ['torch', 'safetensors', 'matplotlib', 'tensorboard'],
+    'evaluate_policy': [],
+    'generate_episodes': [],
+    'train_her': ['torch', 'matplotlib', 'tensorboard'],
+    'benchmark': ['torch', 'matplotlib', 'tensorboard'],
     'export_actor': ['torch', 'onnx', 'onnxscript'],
     'export_episodes': ['pyarrow', 'minari'],
     'fetch_hand_sim': [],
@@ -85,7 +85,7 @@ def test_help_is_there(name, run):
 @pytest.mark.parametrize(
     ('name', 'arguments'),
     [
-        ('evaluate_policy', ['--actor', 'nosuch']),
+        ('evaluate_policy', ['--policy', 'nosuch']),
         ('generate_episodes', ['--policy', 'nosuch', '--output', 'x']),
         ('export_actor', ['nosuch', 'x.onnx']),
         ('export_actor', ['FetchReach', 'nosuch.txt']),
@@ -108,7 +108,7 @@ def test_what_is_not_there_is_bad_usage_in_one_line(name, arguments, run, tmp_pa
 
 
 def test_ctrl_c_in_an_evaluation_keeps_what_is_finished():
-    arguments = ['--actor', 'resting', '--task', 'FetchReach', '--episodes', '1000000']
+    arguments = ['--policy', 'resting', '--task', 'FetchReach', '--episodes', '1000000']
     terminal, end = pty.openpty()
     process = subprocess.Popen(
         [*executable('evaluate_policy'), *arguments, '--num-envs', '4', '--threads', '1'],

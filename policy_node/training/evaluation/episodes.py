@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
-from policy_node.training.learning.collector import Policy
+from policy_node.policies.policy import Policy
 
 # Two-sided 95 % quantile of the standard normal distribution.
 _Z95 = 1.959963984540054

@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from policy_node.policies.policy import Policy
 from policy_node.training.learning.replay import Episodes
-
-
-class Policy(Protocol):
-    """What acts: an `Actor`, a floor for comparison, or a Stable-Baselines3 model."""
-
-    def predict(
-        self, observation: Mapping[str, ArrayLike], *, deterministic: bool = True
-    ) -> tuple[NDArray[Any], Any]:
-        """Returns actions (N, action_size) in [-1, 1] and a state that is not used."""
-        ...
 
 
 class Collector:

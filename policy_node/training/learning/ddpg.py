@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from policy_node.policies.actor import MLP, Actor, NetworkShape
+from policy_node.policies.actor import MLP, Actor
+from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.hindsight import Transitions

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
-from policy_node.policies.actor import NetworkShape, actor_path
 from policy_node.policies.goal_features import goal_features
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.policies.shipped import actor_path
 from policy_node.training.learning.config import TrainConfig, config_from_dict
 from policy_node.training.learning.run_folder import STATE_FILE, companion_file
 from policy_node.training.learning.training_state import part_of, read_state

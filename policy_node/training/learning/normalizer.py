@@ -7,7 +7,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from policy_node.policies.actor import INPUT_CLIP, Normalizer
+from policy_node.policies.actor import Normalizer
+from policy_node.policies.network_shape import INPUT_CLIP
 from policy_node.training.learning.distributed import Workers
 
 # Smallest standard deviation (paper, appendix B: eps = 0.01).

@@ -6,12 +6,12 @@ import contextlib
 import fcntl
 import os
 import signal
-import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+from fetch_hand_sim.episodes.context import source_revision
 from msgs_spec.command_line import CommandError, UsageError, complain, require_extra
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.ddpg import choose_device
@@ -168,18 +168,3 @@ def _stop_on_signals(trainer: Trainer) -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def source_revision() -> str:
-    """Git revision of the source with `-dirty` where it differs, or the installed version."""
-    folder = Path(__file__).parent
-    command = ['git', '-C', str(folder), 'describe', '--always', '--dirty', '--abbrev=40']
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    if result.returncode == 0:
-        return result.stdout.strip()
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return f'fetch_hand_sim {version("fetch_hand_sim")}'
-    except PackageNotFoundError:
-        return 'unknown'

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from policy_node.policies.checkpoint import read_tensors, write_tensors
+from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.normalizer import RunningStatistics
 
@@ -100,7 +100,7 @@ def read_state(path: Path) -> TrainingState:
     Raises:
         ValueError: If the file is no training state of this version, or damaged.
     """
-    tensors, metadata = read_tensors(path)
+    arrays, metadata = read_tensors(path)
     found = (metadata.get('format'), metadata.get('format_version'))
     if found != (FORMAT, str(FORMAT_VERSION)):
         raise ValueError(f'{path} is no training state of version {FORMAT_VERSION}: {found}')
@@ -113,6 +113,7 @@ def read_state(path: Path) -> TrainingState:
         raise ValueError(f'{path} lacks {error.args[0]!r} in its metadata') from None
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f'{path} has unreadable metadata: {error}') from None
+    tensors = {name: torch.tensor(values) for name, values in arrays.items()}
     return TrainingState(tensors, counters, extra)
 
 

@@ -29,8 +29,8 @@ from msgs_spec.codecs import decode
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import topic
+from policy_node.policies.policy import RandomPolicy
 from policy_node.training import generate_episodes
-from policy_node.training.evaluation.floors import RandomPolicy
 from policy_node.training.learning.logged_episodes import read_experience
 from support.episode_recorder import Recorder
 
@@ -490,7 +490,7 @@ def test_the_command_line_generates(tmp_path, capsys):
     assert '2 episodes of FetchReach' in capsys.readouterr().out
     assert list_episodes.main([str(tmp_path), '--complete']) == 0
     assert generate_episodes.main(['--policy', 'random', '--output', str(tmp_path)]) == 2
-    assert '--task is missing' in capsys.readouterr().err
+    assert 'random needs a task' in capsys.readouterr().err
     with pytest.raises(SystemExit) as caught:
         generate_episodes.main([*arguments, '--episodes', '0'])
     assert caught.value.code == 2

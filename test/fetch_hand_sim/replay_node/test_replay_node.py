@@ -61,7 +61,7 @@ def collect(listener, name):
 
 def record(start_process, directory, task, actor):
     """One episode of real nodes in lockstep, so that every tick has its command."""
-    policy = start_process(*POLICY_NODE, *ros_args(checkpoint=actor))
+    policy = start_process(*POLICY_NODE, *ros_args(policy=actor))
     arguments = ros_args(
         task=task,
         episodes=1,
@@ -110,7 +110,7 @@ def test_actor_on_a_replay_repeats_the_recorded_commands(start_process, tmp_path
         replay = start_process(
             *REPLAY_NODE, *ros_args(path=path, rate=RATE, wait_for_commands=True)
         )
-        start_process(*POLICY_NODE, *ros_args(checkpoint=actor))
+        start_process(*POLICY_NODE, *ros_args(policy=actor))
         # The policy also answers the last observation, after which the robot took no command.
         listener.spin_until(lambda: len(received) > spec.episode_ticks, 'all commands')
         assert finish(replay)[0] == 0

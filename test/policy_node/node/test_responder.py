@@ -12,17 +12,23 @@ from fetch_hand_sim.simulation import Simulation
 from msgs_spec.actions import command_from_action
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode
-from msgs_spec.diagnostics import Level
+from msgs_spec.diagnostics import Level, Report, encode_reports
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import topic
-from policy_node.node.health import Health
+from policy_node.node.commander import Commander
+from policy_node.node.health import Health, read_pause
 from policy_node.node.responder import Responder
 from policy_node.node.stamp_join import StampJoin
-from policy_node.policies.commander import RandomCommander, RestingCommander
+from policy_node.policies.loading import load_policy
+from policy_node.policies.policy import LoadedPolicy
 
 REACH = task_spec('FetchReach')
+
+
+def resting():
+    return Commander(load_policy('resting', 'FetchReach'), 25.0)
 
 
 class Wire:
@@ -50,7 +56,7 @@ def episode():
 @pytest.fixture
 def case(episode):
     wire = Wire()
-    return Responder(RestingCommander(REACH), episode[0], wire, lambda: 7.0), wire, episode[1]
+    return Responder(resting(), episode[0], wire, lambda: 7.0), wire, episode[1]
 
 
 def feed(responder, tick):
@@ -151,19 +157,38 @@ def test_join_keeps_a_bounded_number_of_incomplete_stamps():
     assert join.dropped == 10_000 - 8
 
 
-def test_random_commander_draws_valid_commands_and_starts_alike():
-    first, second = (RandomCommander(task_spec('HandReach')) for _ in range(2))
-    commands = [first.command({}) for _ in range(3)]
-    assert [c.tolist() for c in commands] == [second.command({}).tolist() for _ in range(3)]
+def test_random_commands_are_valid_and_start_alike():
+    first, second = (Commander(load_policy('random', 'HandReach'), 25.0) for _ in range(2))
+    commands = [first.command({'observation': np.zeros(63)}) for _ in range(3)]
+    again = [second.command({'observation': np.zeros(63)}) for _ in range(3)]
+    assert [c.tolist() for c in commands] == [c.tolist() for c in again]
     low, high = (command_from_action(first.spec.robot, np.full(20, x)) for x in (-1.0, 1.0))
     assert all(((c >= low) & (c <= high)).all() for c in commands)
+
+
+def test_a_policy_of_another_rate_is_refused():
+    with pytest.raises(ValueError, match=r'was trained at 25 Hz; the robot runs at 50 Hz'):
+        Commander(load_policy('FetchReach'), 50.0)
+
+
+def test_a_command_that_is_not_finite_is_never_sent(case, episode):
+    class Lost:
+        def predict(self, observation, *, deterministic=True):
+            return np.array([0.0, math.nan, 0.0, 0.0]), None
+
+    _, wire, ticks = case
+    lost = Commander(LoadedPolicy(Lost(), 'FetchReach', 'actor lost.onnx'), 25.0)
+    responder = Responder(lost, episode[0], wire, lambda: 7.0)
+    with pytest.raises(ValueError, match=r'actor lost.onnx gives a value that is not finite'):
+        feed(responder, ticks[0])
+    assert (wire.sent, responder.unusable) == ([], 1)
 
 
 def test_report_says_what_is_wrong(case, episode):
     responder, _, ticks = case
     health = Health('/policy_node')
     assert health.report(7.0, 0).message == 'waits for a robot'
-    health.start(RestingCommander(REACH), responder, episode[0])
+    health.start(resting(), responder, episode[0])
     feed(responder, ticks[0])
     health.report(7.0, 1)
     feed(responder, ticks[1])
@@ -180,3 +205,29 @@ def test_report_says_what_is_wrong(case, episode):
     assert 'slow inference: 100.000 ms, a tick is 40.0 ms' in message
     assert '2 robots publish here' in message
     assert 'no robot publishes episode_status' in health.report(15.0, 0).message
+
+
+def diagnostics(*reports):
+    return deserialize('diagnostic_msgs/msg/DiagnosticArray', encode_reports(0, reports))
+
+
+def test_a_paused_robot_is_not_called_silent(case, episode):
+    responder, _, ticks = case
+    health = Health('/arm/policy_node')
+    health.start(resting(), responder, episode[0])
+    feed(responder, ticks[0])
+    message = diagnostics(Report('/arm/sim_node', 'FetchReach', {'paused': 'True'}, 'is paused'))
+    assert read_pause(message, '/arm') is True
+    assert read_pause(message, '/') is None and read_pause(message, '/arm2') is None
+    report = health.report(30.0, 1, is_paused=True)
+    assert (report.level, report.message) == (Level.OK, 'FetchReach: the robot is paused')
+    assert health.report(31.0, 1, is_paused=False).level == Level.WARN
+
+
+def test_robots_of_other_namespaces_are_named_where_there_is_none():
+    health = Health('/policy_node')
+    report = health.report(5.0, 0, elsewhere=['/arm1', '/arm2'])
+    assert report.message == (
+        'no robot here: there is one in /arm1, /arm2; join it with --ros-args -r __ns:=/arm1'
+    )
+    assert health.news(report) and not health.news(health.report(6.0, 0, elsewhere=['/arm1']))

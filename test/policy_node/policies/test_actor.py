@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from policy_node import load_actor
-from policy_node.policies.actor import Actor, NetworkShape, Normalizer, actor_path
-from policy_node.policies.shipped import shipped_actors
+from policy_node.policies.actor import Actor, Normalizer
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.policies.shipped import actor_path, shipped_actors
 
 SHAPE = NetworkShape(observation_size=10, goal_size=3, action_size=4, hidden_sizes=(16, 16))
 

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import os
 import pickle
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.numpy import save_file
 
 from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
-from policy_node.policies.actor import Actor, NetworkShape
+from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.policies.tensor_file import read_tensors
 
 
 def make_info(task: str = 'FetchPush', **changes: Any) -> ActorInfo:
@@ -51,7 +57,7 @@ def saved(tmp_path: Path) -> Path:
 
 def rewrite(path: Path, tensors: dict[str, Any] | None = None, **metadata: str) -> None:
     """Replaces tensors (None removes one) and metadata of a checkpoint."""
-    old_tensors, old_metadata = checkpoint.read_tensors(path)
+    old_tensors, old_metadata = read_tensors(path)
     merged = {k: v for k, v in {**old_tensors, **(tensors or {})}.items() if v is not None}
     save_file(merged, path, {**old_metadata, **metadata})
 
@@ -106,7 +112,7 @@ def test_what_is_no_safetensors_file_is_refused(tmp_path: Path) -> None:
     assert_refused(path, 'not a readable safetensors file')
     path.write_bytes(b'')
     assert_refused(path, 'not a readable safetensors file')
-    assert_refused(tmp_path / 'missing', 'not a readable safetensors file')
+    assert_refused(tmp_path / 'missing', 'is no file')
 
 
 def test_a_truncated_file_is_refused(saved: Path) -> None:
@@ -124,7 +130,7 @@ def test_other_formats_and_versions_are_refused(saved: Path) -> None:
 def test_missing_or_broken_metadata_are_refused(saved: Path) -> None:
     rewrite(saved, hidden_sizes='"wide"')
     assert_refused(saved, 'unreadable metadata')
-    tensors, metadata = checkpoint.read_tensors(saved)
+    tensors, metadata = read_tensors(saved)
     del metadata['seed']
     save_file(tensors, saved, metadata)
     assert_refused(saved, 'lacks metadata: seed')
@@ -145,9 +151,132 @@ def test_sizes_of_another_task_are_refused(saved: Path, field: str, value: str, 
 
 
 def test_tensors_that_do_not_fit_the_metadata_are_refused(saved: Path) -> None:
-    rewrite(saved, {'goal_normalizer.mean': torch.zeros(5)})
+    rewrite(saved, {'goal_normalizer.mean': np.zeros(5, np.float32)})
     assert_refused(saved, r'tensor goal_normalizer.mean \(5,\); its metadata ask for \(3,\)')
     rewrite(saved, {'goal_normalizer.mean': None})
     assert_refused(saved, r'tensor goal_normalizer.mean none')
-    rewrite(saved, {'goal_normalizer.mean': torch.zeros(3), 'extra': torch.zeros(1)})
+    rewrite(
+        saved, {'goal_normalizer.mean': np.zeros(3, np.float32), 'extra': np.zeros(1, np.float32)}
+    )
     assert_refused(saved, r'tensor extra \(1,\); its metadata ask for none')
+
+
+# Crafted files: each answers at once, in one line
+
+
+@pytest.mark.parametrize(
+    ('field', 'text', 'match'),
+    [
+        (
+            'hidden_sizes',
+            '[40000, 40000]',
+            r'hidden.0.bias \(8,\); its metadata ask',
+        ),
+        (
+            'hidden_sizes',
+            '[-1]',
+            r'metadata: hidden_sizes: \[-1\]; allowed: widths of 1',
+        ),
+        ('hidden_sizes', '[1e999]', 'unreadable metadata: hidden_sizes: inf is no whole number'),
+        ('hidden_sizes', '[8.5]', '8.5 is no whole number'),
+        ('hidden_sizes', '[true]', 'True is no whole number'),
+        ('hidden_sizes', '[' * 100_000 + ']' * 100_000, 'unreadable metadata: hidden_sizes'),
+        ('config', '{"a":' * 100_000, 'unreadable metadata: config'),
+        ('config', '[]', r'config: \[\] is no object'),
+        ('task', '[]', r'task: \[\] is no text'),
+        ('task', '{}', r'task: \{\} is no text'),
+        ('observation_layout', '[[["a"], 3]]', 'is no text'),
+        ('observation_layout', '7', 'unreadable metadata: observation_layout'),
+        ('goal_size', '"3"', "'3' is no whole number"),
+        ('layer_norm', '1', '1 is neither true nor false'),
+        ('control_hz', 'NaN', 'unreadable metadata: control_hz'),
+        ('control_hz', '1e999', 'unreadable metadata: control_hz'),
+        ('control_hz', '[25]', r'\[25\] is no number'),
+        ('seed', '9' * 5000, 'unreadable metadata: seed'),
+        ('goal_features', '"\\u001b[31m"', 'has goal_features'),
+    ],
+)
+def test_crafted_metadata_are_refused_at_once(
+    saved: Path, field: str, text: str, match: str
+) -> None:
+    rewrite(saved, **{field: text})
+    began = time.perf_counter()
+    assert_refused(saved, match)
+    assert time.perf_counter() - began < 1.0
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
+def test_weights_that_are_not_finite_are_refused(saved: Path, value: float) -> None:
+    bias = np.zeros(4, np.float32)
+    bias[2] = value
+    rewrite(saved, {'network.output.bias': bias})
+    assert_refused(saved, r'tensor network.output.bias with a value that is not finite')
+
+
+def test_a_normaliser_that_divides_by_zero_is_refused(saved: Path) -> None:
+    rewrite(saved, {'goal_normalizer.std': np.zeros(3, np.float32)})
+    assert_refused(saved, r'goal_normalizer.std with a value that is not above 0')
+
+
+def test_weights_of_another_type_are_refused(saved: Path) -> None:
+    rewrite(saved, {'goal_normalizer.mean': np.zeros(3)})
+    assert_refused(saved, r'goal_normalizer.mean of F64; allowed: F32')
+
+
+def test_escape_characters_of_a_file_never_reach_the_terminal(saved: Path) -> None:
+    rewrite(saved, {'\x1b[31mred': np.zeros(1, np.float32)})
+    with pytest.raises(ValueError, match='none') as caught:
+        checkpoint.load(saved)
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    'header',
+    [b'{' * 1000, b'[]', b'{"a": 1}', b'{"__metadata__": []}', b'{"a": {"shape": 1, "dtype": []}}'],
+)
+def test_crafted_headers_are_refused_in_one_line(tmp_path: Path, header: bytes) -> None:
+    path = tmp_path / 'a.safetensors'
+    path.write_bytes(len(header).to_bytes(8, 'little') + header)
+    assert_refused(path, 'not a readable safetensors file|no actor checkpoint')
+
+
+def test_large_headers_and_files_are_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / 'a.safetensors'
+    header = b'[' + b'[],' * 700_000 + b'[]]'
+    path.write_bytes(len(header).to_bytes(8, 'little') + header)
+    assert_refused(path, r'header of \d+ bytes; allowed: up to 1048576')
+    with path.open('wb') as file:
+        file.truncate(10**12)
+    assert_refused(path, 'has more than 67108864 bytes')
+
+
+def test_a_pipe_is_no_file(tmp_path: Path) -> None:
+    path = tmp_path / 'a.safetensors'
+    os.mkfifo(path)
+    assert_refused(path, 'is no file')
+
+
+def test_a_full_disk_leaves_the_old_file_and_nothing_else(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = saved.read_bytes()
+
+    def full(number: int) -> None:
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(os, 'fsync', full)
+    info = make_info()
+    with pytest.raises(OSError, match='No space left'):
+        checkpoint.save(saved, Actor(info.shape), info)
+    assert saved.read_bytes() == before
+    assert [path.name for path in saved.parent.iterdir()] == [saved.name]
+
+
+@pytest.mark.parametrize('layer_norm', [False, True])
+@pytest.mark.parametrize('hidden_sizes', [(), (8,), (8, 16, 4)])
+def test_names_and_shapes_of_tensors_are_those_of_the_actor(
+    hidden_sizes: tuple[int, ...], layer_norm: bool
+) -> None:
+    shape = make_info(hidden_sizes=hidden_sizes, layer_norm=layer_norm).shape
+    state = Actor(shape).state_dict()
+    assert {name: tuple(value.shape) for name, value in state.items()} == shape.tensor_shapes()

@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+import pickle
+import resource
+import subprocess
 import sys
+import time
 import zipfile
+from pathlib import Path
 
 import gymnasium
 import numpy as np
+import onnx
 import pytest
+from onnx import TensorProto, helper, numpy_helper
+from test_loading import fresh_actor, observations
 
 import fetch_hand_sim  # noqa: F401  registers the environments
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.actions import command_from_action
 from msgs_spec.tasks import task_spec
-from policy_node.policies.actor import load_actor
-from policy_node.policies.commander import make_commander
+from policy_node.node.commander import Commander
+from policy_node.policies import checkpoint
 from policy_node.policies.export_actor import main as export_actor
+from policy_node.policies.loading import TaskMissing, load_actor, load_policy
 from policy_node.policies.shipped import shipped_actors
 
 REACH = task_spec('FetchReach')
-
-
-@pytest.fixture(scope='module')
-def status():
-    return EpisodeRunner(Simulation('FetchReach', num_threads=1)).waiting_status()
 
 
 @pytest.fixture(scope='module')
@@ -34,27 +38,36 @@ def onnx_file(tmp_path_factory):
     return path
 
 
-def random_observation(seed):
-    generator = np.random.default_rng(seed)
-    return {
-        'observation': generator.normal(size=REACH.observation_size),
-        'achieved_goal': generator.normal(size=3),
-        'desired_goal': generator.normal(size=3),
-    }
+def test_onnx_actor_answers_as_its_checkpoint(onnx_file):
+    found, actor = load_policy(onnx_file), load_actor('FetchReach')
+    for leading in ((), (20,), (2, 3)):
+        observation = observations(REACH, *leading)
+        action, _ = found.policy.predict(observation)
+        np.testing.assert_allclose(action, actor.predict(observation)[0], atol=1e-5)
+    assert (found.task, found.control_hz) == ('FetchReach', 25.0)
+    assert found.description == 'actor reach.onnx'
+    assert found.sha256 == checkpoint.checkpoint_hash(onnx_file)
 
 
-def test_onnx_actor_answers_as_its_checkpoint(onnx_file, status):
-    commander, actor = make_commander(str(onnx_file), status), load_actor('FetchReach')
-    for seed in range(20):
-        observation = random_observation(seed)
-        wanted = command_from_action(REACH.robot, actor.predict(observation)[0])
-        np.testing.assert_allclose(commander.command(observation), wanted, atol=1e-5)
-    assert commander.description == 'actor reach.onnx'
-    assert len(commander.sha256) == 64
+@pytest.mark.parametrize(
+    ('task', 'features'),
+    [
+        ('HandManipulateBlockFull', 'symmetric'),
+        ('HandManipulatePenFull', 'relative'),
+    ],
+)
+def test_actors_that_see_how_far_the_goal_is_are_exported(task, features, tmp_path):
+    source, target = tmp_path / 'a.safetensors', tmp_path / 'a.onnx'
+    fresh_actor(source, task, goal_features=features, layer_norm=True)
+    assert export_actor([str(source), str(target)]) == 0
+    observation = observations(task_spec(task), 10)
+    action, _ = load_policy(target, task).policy.predict(observation)
+    wanted, _ = load_policy(source, task).policy.predict(observation)
+    np.testing.assert_allclose(action, wanted, atol=1e-5)
 
 
-def test_onnx_actor_solves_its_task(onnx_file, status):
-    commander = make_commander(str(onnx_file), status)
+def test_onnx_actor_solves_its_task(onnx_file):
+    commander = Commander(load_policy(onnx_file), 25.0)
     runner = EpisodeRunner(Simulation('FetchReach', num_threads=1), first_seed=5, episodes=3)
     successes, command = [], np.zeros(4)
     while not runner.is_done:
@@ -68,26 +81,84 @@ def test_onnx_actor_solves_its_task(onnx_file, status):
 
 def test_onnx_runs_without_torch(onnx_file):
     code = (
-        'import sys; from pathlib import Path\n'
-        'from msgs_spec.tasks import task_spec\n'
-        'from policy_node.policies.onnx import OnnxCommander\n'
-        f'OnnxCommander(Path({str(onnx_file)!r}), task_spec("FetchReach"), "")\n'
+        'import sys; from policy_node import load_policy\n'
+        f'load_policy({str(onnx_file)!r})\n'
         'assert "torch" not in sys.modules'
     )
-    import subprocess
-
     subprocess.run([sys.executable, '-c', code], check=True)
 
 
-def test_onnx_of_another_task_or_damaged_is_refused_in_one_line(onnx_file, tmp_path, status):
-    hand = EpisodeRunner(Simulation('HandReach', num_threads=1)).waiting_status()
+def test_onnx_of_another_task_or_damaged_is_refused_in_one_line(onnx_file, tmp_path):
     with pytest.raises(ValueError, match=r'reach.onnx was trained on FetchReach, not on HandReach'):
-        make_commander(str(onnx_file), hand)
+        load_policy(onnx_file, 'HandReach')
     cut = tmp_path / 'cut.onnx'
     cut.write_bytes(onnx_file.read_bytes()[:1000])
     with pytest.raises(ValueError, match='is not a readable ONNX file') as error:
-        make_commander(str(cut), status)
-    assert '\n' not in str(error.value)
+        load_policy(cut)
+    assert str(error.value).isprintable()
+
+
+def crafted_onnx(path, nodes, metadata, initializers=()):
+    """An ONNX file with the inputs and the output of an actor of FetchReach."""
+
+    def place(name, size):
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, ['batch', size])
+
+    inputs = [place('observation', 10), place('desired_goal', 3)]
+    graph = helper.make_graph(nodes, 'crafted', inputs, [place('action', 4)], list(initializers))
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid('', 17)], ir_version=8)
+    helper.set_model_props(model, metadata)
+    onnx.save(model, path)
+    return path
+
+
+def test_a_few_bytes_of_onnx_that_ask_for_gigabytes_are_refused(onnx_file, tmp_path):
+    metadata = {p.key: p.value for p in onnx.load(onnx_file).metadata_props}
+    shape = numpy_helper.from_array(np.array([2**31], np.int64), 'shape')
+    head = [
+        helper.make_node('Slice', ['observation', 'zero', 'four', 'one'], ['head']),
+        helper.make_node('ConstantOfShape', ['shape'], ['zeros']),
+        helper.make_node('ReduceSum', ['zeros'], ['sum'], keepdims=0),
+        helper.make_node('Add', ['head', 'sum'], ['action']),
+    ]
+    values = {'zero': 0, 'four': 4, 'one': 1}
+    numbers = [numpy_helper.from_array(np.array([v], np.int64), n) for n, v in values.items()]
+    path = crafted_onnx(tmp_path / 'bomb.onnx', head, metadata, [shape, *numbers])
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    began = time.perf_counter()
+    with pytest.raises(ValueError, match=r'bomb\.onnx') as error:
+        load_policy(path)
+    assert str(error.value).isprintable()
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 4.0
+    assert time.perf_counter() - began < 20.0
+
+
+def test_onnx_that_computes_for_ever_is_refused(onnx_file, tmp_path):
+    metadata = {p.key: p.value for p in onnx.load(onnx_file).metadata_props}
+    scalars = {'count': np.array(2**60), 'go': np.array(True), 'four': np.array([4])}
+    scalars |= {'zero': np.array([0]), 'one': np.array([1])}
+    numbers = [numpy_helper.from_array(value, name) for name, value in scalars.items()]
+    flag = helper.make_tensor_value_info
+    body = helper.make_graph(
+        [
+            helper.make_node('Identity', ['go_in'], ['go_out']),
+            helper.make_node('Tanh', ['state'], ['next']),
+        ],
+        'body',
+        [
+            flag('index', TensorProto.INT64, []),
+            flag('go_in', TensorProto.BOOL, []),
+            flag('state', TensorProto.FLOAT, None),
+        ],
+        [flag('go_out', TensorProto.BOOL, []), flag('next', TensorProto.FLOAT, None)],
+    )
+    nodes = [
+        helper.make_node('Slice', ['observation', 'zero', 'four', 'one'], ['head']),
+        helper.make_node('Loop', ['count', 'go', 'head'], ['action'], body=body),
+    ]
+    path = crafted_onnx(tmp_path / 'loop.onnx', nodes, metadata, numbers)
+    with pytest.raises(ValueError, match=r'loop.onnx needs more than 400 MiB or 2 s to answer'):
+        load_policy(path)
 
 
 @pytest.mark.parametrize(
@@ -97,9 +168,7 @@ def test_onnx_of_another_task_or_damaged_is_refused_in_one_line(onnx_file, tmp_p
         ('stable_baselines3', '.zip', 'sac.zip needs stable-baselines3: pip install stable-'),
     ],
 )
-def test_a_missing_library_is_named(
-    library, suffix, line, onnx_file, tmp_path, status, monkeypatch
-):
+def test_a_missing_library_is_named(library, suffix, line, onnx_file, tmp_path, monkeypatch):
     path = onnx_file
     if suffix == '.zip':
         path = tmp_path / 'sac.zip'
@@ -108,12 +177,12 @@ def test_a_missing_library_is_named(
             file.writestr('data', module)
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ValueError, match=line):
-        make_commander(str(path), status)
+        load_policy(path, 'FetchReach', trust=True)
 
 
 def test_export_says_what_is_missing(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'onnxscript', None)
-    assert export_actor(['FetchReach', str(tmp_path / 'x.onnx')]) == 1
+    assert export_actor(['FetchReach', str(tmp_path / 'x.onnx')]) == 2
     assert 'pip install onnx onnxscript' in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
     assert export_actor([str(tmp_path / 'none'), str(tmp_path / 'x.onnx')]) == 2
@@ -121,7 +190,7 @@ def test_export_says_what_is_missing(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize('algorithm', ['SAC', 'TD3', 'DDPG'])
-def test_stable_baselines3_model_answers_as_it_does_there(algorithm, tmp_path, status):
+def test_stable_baselines3_model_answers_as_it_does_there(algorithm, tmp_path):
     library = pytest.importorskip('stable_baselines3')
     env = gymnasium.make('fetch_hand_sim/FetchReach-v0')
     model = getattr(library, algorithm)(
@@ -134,23 +203,59 @@ def test_stable_baselines3_model_answers_as_it_does_there(algorithm, tmp_path, s
     )
     path = tmp_path / 'model.zip'
     model.save(path)
-    commander = make_commander(str(path), status)
+    found = load_policy(path, 'FetchReach', trust=True)
+    commander = Commander(found, 25.0)
     for seed in range(5):
-        observation = random_observation(seed)
+        observation = observations(REACH, seed=seed)
         action, _ = model.predict(observation, deterministic=True)
         wanted = command_from_action(REACH.robot, action)
         assert commander.command(observation).tolist() == wanted.astype(np.float64).tolist()
-    hand = EpisodeRunner(Simulation('HandReach', num_threads=1)).waiting_status()
+    batch = observations(REACH, 7)
+    assert (found.policy.predict(batch)[0] == model.predict(batch, deterministic=True)[0]).all()
     with pytest.raises(ValueError, match=r'has shapes .*\(10,\).*; HandReach has .*\(63,\)'):
-        make_commander(str(path), hand)
+        load_policy(path, 'HandReach', trust=True)
+    with pytest.raises(TaskMissing, match=r'model\.zip needs a task'):
+        load_policy(path, trust=True)
 
 
-def test_another_zip_is_refused(tmp_path, status):
+class Intruder:
+    """Leaves a mark when it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return Path.touch, (self.mark,)
+
+
+def test_a_zip_runs_its_code_only_where_somebody_says_so(tmp_path):
+    path, mark = tmp_path / 'model.zip', tmp_path / 'mark'
+    with zipfile.ZipFile(path, 'w') as file:
+        module = '{"policy_class": {"__module__": "stable_baselines3.sac.policies"}}'
+        file.writestr('data', module)
+        file.writestr('policy.pth', pickle.dumps(Intruder(mark)))
+    with pytest.raises(ValueError, match=r'model.zip .* runs the code in it; .*--trust; trust:='):
+        load_policy(path, 'FetchReach')
+    assert not mark.exists()
+
+
+def test_another_zip_is_refused(tmp_path):
     path = tmp_path / 'other.zip'
     with zipfile.ZipFile(path, 'w') as file:
         file.writestr('readme', 'hello')
-    with pytest.raises(ValueError, match=r'is not a file of Stable-Baselines3'):
-        make_commander(str(path), status)
-    path.write_bytes(b'no zip')
-    with pytest.raises(ValueError, match=r'is not a file of Stable-Baselines3'):
-        make_commander(str(path), status)
+    for contents in (path.read_bytes(), b'no zip', b''):
+        path.write_bytes(contents)
+        with pytest.raises(ValueError, match=r'is not a file of Stable-Baselines3') as error:
+            load_policy(path, 'FetchReach', trust=True)
+        assert str(error.value).isprintable()
+
+
+def test_a_megabyte_of_zip_that_unpacks_to_gigabytes_is_refused(tmp_path):
+    path = tmp_path / 'bomb.zip'
+    with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as file:
+        with file.open('data', 'w', force_zip64=True) as data:
+            for _ in range(32):
+                data.write(bytes(2**20))
+    assert path.stat().st_size < 100_000
+    with pytest.raises(ValueError, match=r'bomb.zip unpacks to 33554432 bytes'):
+        load_policy(path, 'FetchReach', trust=True)

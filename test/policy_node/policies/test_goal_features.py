@@ -12,8 +12,9 @@ from msgs_spec.rotations import (
     quaternion_multiply,
 )
 from msgs_spec.tasks import TASKS, GoalKind, task_spec
-from policy_node.policies.actor import Actor, NetworkShape
+from policy_node.policies.actor import Actor
 from policy_node.policies.goal_features import RelativeGoal, goal_features
+from policy_node.policies.network_shape import NetworkShape
 
 
 def relative_goal(task: str) -> RelativeGoal:

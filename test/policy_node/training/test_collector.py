@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from fetch_hand_sim.simulation import Simulation
-from policy_node.policies.actor import Actor, NetworkShape
-from policy_node.training.evaluation.floors import RestingPolicy
+from policy_node.policies.actor import Actor
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.policies.policy import RestingPolicy
 from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.replay import Episodes
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from policy_node.policies.actor import MLP, NetworkShape
+from policy_node.policies.actor import MLP
+from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.config import recipe_config
 from policy_node.training.learning.ddpg import DDPG, choose_device, uses_bfloat16
 from policy_node.training.learning.distributed import Workers

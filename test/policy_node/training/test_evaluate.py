@@ -1,4 +1,4 @@
-"""Evaluation: intervals, floors, and the command line, on the real simulation."""
+"""Evaluation: intervals, outcomes, and the command line, on the real simulation."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from fetch_hand_sim.simulation import Simulation
+from policy_node.policies.policy import RandomPolicy, RestingPolicy
 from policy_node.training.evaluate_policy import main
 from policy_node.training.evaluation.episodes import (
     EpisodeOutcomes,
@@ -20,7 +21,6 @@ from policy_node.training.evaluation.episodes import (
     summarize,
     wilson_interval,
 )
-from policy_node.training.evaluation.floors import RandomPolicy, RestingPolicy
 
 torch.set_num_threads(1)
 
@@ -162,17 +162,9 @@ def test_objects_that_fall_and_goals_the_long_way_round_are_seen() -> None:
     assert np.isnan(dropped.final_distance).all() and (dropped.final_rotation >= 0).all()
 
 
-def test_random_policy_is_seeded_and_bounded() -> None:
-    observation = {'observation': np.zeros((1000, 10))}
-    first, _ = RandomPolicy(4, seed=1).predict(observation)
-    again, _ = RandomPolicy(4, seed=1).predict(observation)
-    assert (first == again).all() and first.shape == (1000, 4)
-    assert -1 <= first.min() < -0.99 and 0.99 < first.max() <= 1
-
-
 def test_command_line_writes_table_json_and_csv(tmp_path: Path, capsys: object) -> None:
     json_file, csv_file = tmp_path / 'a' / 'e.json', tmp_path / 'e.csv'
-    arguments = ['--actor', 'FetchReach', '--episodes', '20', '--threads', '1', '--num-envs', '8']
+    arguments = ['--policy', 'FetchReach', '--episodes', '20', '--threads', '1', '--num-envs', '8']
     assert main([*arguments, '--json', str(json_file), '--csv', str(csv_file)]) == 0
     report = json.loads(json_file.read_text())
     assert report['task'] == 'FetchReach' and report['episodes'] == 20
@@ -185,14 +177,30 @@ def test_command_line_writes_table_json_and_csv(tmp_path: Path, capsys: object) 
     assert 'gymnasium rule' in capsys.readouterr().out  # type: ignore[attr-defined]
 
 
+def test_former_names_work_and_say_what_they_are_called_now(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ['--episodes', '2', '--threads', '1', '--task', 'FetchReach']
+    assert main(['--actor', 'resting', *arguments]) == 0
+    captured = capsys.readouterr()
+    assert 'FetchReach: resting, 2 episodes' in captured.out
+    assert captured.err == 'evaluate_policy: --actor is now called --policy\n'
+    path = tmp_path / 'model.zip'
+    path.write_bytes(b'')
+    assert main(['--policy', f'sb3:SAC:{path}', '--trust', *arguments]) == 2
+    captured = capsys.readouterr()
+    assert f'is not needed any more; give {path} and --trust' in captured.err
+    assert f'{path} is not a file of Stable-Baselines3' in captured.err
+
+
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        (['--actor', 'Nobody'], "no actor 'Nobody'; shipped: "),
-        (['--actor', 'random'], '--task is missing for --actor random'),
-        (['--actor', 'FetchReach', '--task', 'FetchPush'], 'trained on FetchReach, not on FetchPu'),
-        (['--actor', 'FetchReach', '--episodes', '0'], '--episodes 0'),
-        (['--actor', 'sb3:SAC', '--task', 'FetchReach'], "'sb3:SAC' is not sb3:<class>"),
+        (['--policy', 'Nobody'], "no actor 'Nobody'; shipped: "),
+        (['--policy', 'random'], 'random needs a task; allowed: FetchReach, '),
+        ([], '--policy is missing; allowed: a shipped actor'),
+        (['--policy', 'FetchReach', '--task', 'FetchPush'], 'trained on FetchReach, not on Fetch'),
+        (['--policy', 'FetchReach', '--episodes', '0'], '--episodes 0'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(
@@ -204,7 +212,7 @@ def test_bad_usage_is_one_line_and_exit_status_2(
 
 
 def test_json_is_all_that_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ['--actor', 'resting', '--task', 'FetchReach', '--episodes', '2', '--json']
+    arguments = ['--policy', 'resting', '--task', 'FetchReach', '--episodes', '2', '--json']
     assert main([*arguments, '--threads', '1']) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report['task'], report['episodes']) == ('FetchReach', 2)
@@ -221,6 +229,6 @@ def test_ctrl_c_reports_the_episodes_that_are_finished(
         return run_episodes(*arguments)
 
     monkeypatch.setattr('policy_node.training.evaluation.episodes.run_episodes', interrupted)
-    arguments = ['--actor', 'resting', '--task', 'FetchReach', '--episodes', '9', '--json']
+    arguments = ['--policy', 'resting', '--task', 'FetchReach', '--episodes', '9', '--json']
     assert main([*arguments, '--num-envs', '3', '--threads', '1']) == 130
     assert json.loads(capsys.readouterr().out)['episodes'] == 3

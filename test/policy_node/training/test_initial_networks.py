@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from policy_node.policies import checkpoint
-from policy_node.policies.actor import load_actor
+from policy_node.policies.loading import load_actor
 from policy_node.policies.shipped import shipped_actors
 from policy_node.training.learning.config import TrainConfig, recipe_config
 from policy_node.training.learning.distributed import Workers
@@ -154,7 +154,7 @@ def test_networks_that_do_not_fit_are_refused_before_anything_is_written(
     ('arguments', 'message'),
     [
         (['--init-from', 'Nobody'], "no actor 'Nobody'; shipped: "),
-        (['--init-from', '.'], 'training_state.safetensors is not a readable'),
+        (['--init-from', '.'], 'training_state.safetensors is no file'),
         (['--init-from', 'FetchReach', '--resume', '.'], '--init-from excludes --resume'),
     ],
 )

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from policy_node.policies.checkpoint import read_tensors, write_tensors
+from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.learning.config import TrainConfig, recipe_config
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.replay import EpisodeReplay

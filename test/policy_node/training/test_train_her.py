@@ -16,6 +16,7 @@ import torch
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
+from policy_node.policies.tensor_file import read_tensors
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.generate_episodes import main as generate_episodes
 from policy_node.training.learning.config import TrainConfig, recipe_config
@@ -44,7 +45,7 @@ SMALL = [
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
-    return checkpoint.read_tensors(path)[0]
+    return {name: torch.tensor(values) for name, values in read_tensors(path)[0].items()}
 
 
 def same(first: Path, second: Path) -> bool:
@@ -373,7 +374,7 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
         (['--task', 'FetchReach', '--set', 'gama=1'], "'gama=1' is not name=value; names: "),
         (['--task', 'FetchReach', '--no-her', '--strategy', 'final'], '--no-her excludes'),
         (['--task', 'FetchReach', '--strategy', 'past'], "strategy 'past'; allowed: "),
-        (['--resume', 'nowhere'], 'nowhere/training_state.safetensors is not a readable'),
+        (['--resume', 'nowhere'], 'nowhere/training_state.safetensors is no file'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(

@@ -1,0 +1,51 @@
+"""The one who commands a robot: a policy whose actions become commands."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_spec.actions import command_from_action
+from msgs_spec.tasks import task_spec
+from policy_node.policies.policy import LoadedPolicy
+
+Observation = dict[str, NDArray[np.float64]]
+
+
+class Commander:
+    """Turns observations into commands for one robot.
+
+    Args:
+        loaded: The policy.
+        control_hz: The robot's action frequency, Hz.
+
+    Attributes:
+        spec: The task.
+        description: Who it is, for people.
+        sha256: Fingerprint of its file; empty if it has none.
+
+    Raises:
+        ValueError: If the policy was trained at another rate; one line says which.
+    """
+
+    def __init__(self, loaded: LoadedPolicy, control_hz: float) -> None:
+        if loaded.control_hz not in (None, control_hz):
+            raise ValueError(
+                f'{loaded.description} was trained at {loaded.control_hz:g} Hz; the robot runs at '
+                f'{control_hz:g} Hz'
+            )
+        self.spec = task_spec(loaded.task)
+        self.description = loaded.description
+        self.sha256 = loaded.sha256
+        self._policy = loaded.policy
+
+    def command(self, observation: Observation) -> NDArray[np.float64]:
+        """Returns the command (action size,), command units, for one observation.
+
+        Raises:
+            ValueError: If the policy gives a value that is not finite.
+        """
+        action, _ = self._policy.predict(observation, deterministic=True)
+        if not np.isfinite(action).all():
+            raise ValueError(f'{self.description} gives a value that is not finite')
+        return np.asarray(command_from_action(self.spec.robot, action), dtype=np.float64)

@@ -1,0 +1,58 @@
+"""Files of policies: read whole and within bounds, written whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+# The largest actor of the paper's size has 0.7 MB.
+LARGEST_POLICY = 64 * 2**20
+
+
+def read_file(path: Path, largest: int = LARGEST_POLICY) -> bytes:
+    """Reads a regular file.
+
+    Raises:
+        ValueError: If it cannot be read, is none, or has more than `largest` bytes.
+    """
+    try:
+        if not path.is_file():
+            raise ValueError(f'{path} is no file')
+        with path.open('rb') as file:
+            data = file.read(largest + 1)
+    except OSError as error:
+        raise ValueError(f'{path} cannot be read: {error.strerror or error}') from None
+    if len(data) > largest:
+        raise ValueError(f'{path} has more than {largest} bytes, which is the most allowed')
+    return data
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Writes a file under a temporary name and moves it into place.
+
+    Raises:
+        OSError: If that fails; nothing is left behind.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f'.{path.name}.partial')
+    try:
+        with partial.open('wb') as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def sha256(data: bytes) -> str:
+    """Fingerprint of a policy's file, hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def one_line(text: object, longest: int = 200) -> str:
+    """What a file or a library says, as one line that is safe to print."""
+    words = ' '.join(str(text).split())[:longest]
+    return ''.join(c if c.isprintable() else '?' for c in words)

@@ -1,0 +1,137 @@
+"""One name for every policy: what the node and all commands accept, whatever the format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msgs_spec.tasks import TASKS, TaskSpec, task_spec
+from policy_node.policies.files import one_line
+from policy_node.policies.policy import LoadedPolicy, Policy, RandomPolicy, RestingPolicy
+from policy_node.policies.shipped import actor_path, shipped_actors
+
+if TYPE_CHECKING:
+    from policy_node.policies.actor import Actor
+
+RANDOM, RESTING = 'random', 'resting'
+_WARM_UP_CALLS = 20
+# For help texts and descriptions of parameters.
+POLICY_NAMES = (
+    'a shipped actor (FetchReach), a file (.safetensors, .onnx; .zip of Stable-Baselines3 if you '
+    'trust it), random or resting; default: the shipped actor of the task'
+)
+
+
+class TaskMissing(ValueError):
+    """A policy that fits any task, or does not say which, was asked for without one."""
+
+
+def load_actor(name_or_path: str | Path, task: str | None = None) -> Actor:
+    """Loads an actor as a torch module, ready to `predict` on the CPU.
+
+    Args:
+        name_or_path: Task name of a shipped actor (`FetchReach`), or a checkpoint file.
+        task: Refuse a checkpoint of any other task.
+
+    Raises:
+        ValueError: If there is no such actor or it does not fit; one line says why.
+    """
+    from policy_node.policies import checkpoint
+
+    return checkpoint.load(actor_path(name_or_path), task)[0]
+
+
+def load_policy(
+    name: str | Path = '', task: str | None = None, *, trust: bool = False
+) -> LoadedPolicy:
+    """Loads the policy called `name`; torch is imported only for those of Stable-Baselines3.
+
+    Args:
+        name: Task name of a shipped actor; file of an actor of this project, as checkpoint or ONNX;
+            .zip of Stable-Baselines3; `random`, `resting`; or '' for the shipped actor of `task`.
+        task: Refuse a policy of any other task. Needed where the name does not tell.
+        trust: Whether a file may run code of its own: a .zip of Stable-Baselines3 does.
+
+    Raises:
+        TaskMissing: If the policy needs a task and none is given.
+        ValueError: If there is no such policy, or it does not fit; one line says why.
+    """
+    name = str(name)
+    if name in (RANDOM, RESTING):
+        return _untrained(name, task)
+    path = _named(name) if name else _shipped(task)
+    loaded = _read(path, task, trust)
+    _try_out(loaded, task_spec(loaded.task))
+    return loaded
+
+
+def _untrained(name: str, task: str | None) -> LoadedPolicy:
+    size = task_spec(_require_task(name, task)).robot.action_size
+    policy: Policy = RandomPolicy(size) if name == RANDOM else RestingPolicy(size)
+    return LoadedPolicy(policy, _require_task(name, task), f'a {name} policy')
+
+
+def _named(name: str) -> Path:
+    try:
+        return actor_path(name)
+    except ValueError as error:
+        raise ValueError(f'{error}, {RANDOM!r} or {RESTING!r}') from None
+
+
+def _shipped(task: str | None) -> Path:
+    shipped = shipped_actors()
+    task = _require_task('the shipped actor', task)
+    if task not in shipped:
+        raise ValueError(
+            f'no actor is shipped for {task} (shipped: {", ".join(shipped) or "none"}); '
+            f'give a policy: a file, {RANDOM!r} or {RESTING!r}'
+        )
+    return shipped[task]
+
+
+def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:
+    """Reads a file by the ending of its name; each format brings its own libraries."""
+    if path.suffix == '.onnx':
+        from policy_node.policies.onnx import load_onnx
+
+        return load_onnx(path, task)
+    if path.suffix == '.zip':
+        from policy_node.policies.stable_baselines3 import load_stable_baselines3
+
+        if not trust:
+            raise ValueError(
+                f'{path} is a model of Stable-Baselines3: loading it runs the code in it; if you '
+                'trust who made it, say so (--trust; trust:=true for policy_node)'
+            )
+        return load_stable_baselines3(path, _require_task(path.name, task))
+    from policy_node.policies.numpy_actor import load_checkpoint
+
+    return load_checkpoint(path, task)
+
+
+def _require_task(name: str, task: str | None) -> str:
+    if task is None:
+        raise TaskMissing(f'{name} needs a task; allowed: {", ".join(TASKS)}')
+    return task
+
+
+def _try_out(loaded: LoadedPolicy, spec: TaskSpec) -> None:
+    """Refuses a policy that cannot answer; the first answers of a library take longest, too."""
+    zeros = {
+        'observation': np.zeros(spec.observation_size),
+        'achieved_goal': np.zeros(spec.goal.size),
+        'desired_goal': np.zeros(spec.goal.size),
+    }
+    try:
+        for _ in range(_WARM_UP_CALLS):
+            action, _ = loaded.policy.predict(zeros, deterministic=True)
+    except Exception as error:
+        # Libraries raise types of their own for a model that loads but does not run.
+        raise ValueError(f'{loaded.description} does not run: {one_line(error)}') from None
+    if action.shape != (spec.robot.action_size,) or not np.isfinite(action).all():
+        raise ValueError(
+            f'{loaded.description} answers with {one_line(action)}; '
+            f'allowed: {spec.robot.action_size} finite numbers'
+        )

@@ -1,0 +1,66 @@
+"""What determines the network of an actor: sizes, inputs and the names of its tensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from policy_node.policies.goal_features import GoalFeatures
+
+# Plappert et al. 2018, appendix B.
+INPUT_CLIP = 200.0
+NORMALIZED_CLIP = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkShape:
+    """Sizes of an actor, and of the critic trained with it.
+
+    Attributes:
+        observation_size: Length of `observation`.
+        goal_size: Length of `desired_goal`.
+        action_size: Length of the action.
+        hidden_sizes: Width of each hidden layer.
+        layer_norm: Whether a LayerNorm precedes each activation.
+        goal_features: How observation and goal become inputs; None for both as they are.
+    """
+
+    observation_size: int
+    goal_size: int
+    action_size: int
+    hidden_sizes: tuple[int, ...] = (256, 256, 256)
+    layer_norm: bool = False
+    goal_features: GoalFeatures | None = None
+
+    @property
+    def feature_size(self) -> int:
+        """Length of the network input."""
+        if self.goal_features is None:
+            return self.observation_size + self.goal_size
+        return self.goal_features.size(self.observation_size, self.goal_size)
+
+    @property
+    def layer_names(self) -> list[str]:
+        """Names of the hidden layers in `Actor`; a LayerNorm has the number after its layer's."""
+        stride = 3 if self.layer_norm else 2
+        return [f'network.hidden.{stride * i}' for i in range(len(self.hidden_sizes))]
+
+    @property
+    def norm_names(self) -> list[str]:
+        """Names of the LayerNorms in `Actor`, in the order of the layers they follow."""
+        count = len(self.hidden_sizes) if self.layer_norm else 0
+        return [f'network.hidden.{3 * i + 1}' for i in range(count)]
+
+    def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Name and shape of every tensor in the state of an `Actor`, without making one."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        for part, size in (('observation', self.observation_size), ('goal', self.goal_size)):
+            for statistic in ('mean', 'std'):
+                shapes[f'{part}_normalizer.{statistic}'] = (size,)
+        inputs = (self.feature_size, *self.hidden_sizes)
+        outputs = (*self.hidden_sizes, self.action_size)
+        names = (*self.layer_names, 'network.output')
+        for name, size, width in zip(names, inputs, outputs, strict=True):
+            shapes[f'{name}.weight'], shapes[f'{name}.bias'] = (width, size), (width,)
+        for name, width in zip(self.norm_names, self.hidden_sizes, strict=False):
+            shapes[f'{name}.weight'] = shapes[f'{name}.bias'] = (width,)
+        return shapes

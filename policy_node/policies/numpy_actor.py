@@ -1,0 +1,105 @@
+"""The actor as it acts: NumPy alone, which starts seconds before torch and answers sooner.
+
+It computes in float64 with the float32 weights and rounds the action to float32, so that neither
+the size of a batch nor the order in which a library adds changes more than, rarely, the last bit.
+torch computes in float32 throughout; `docs/training.md` has the difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policy_node.policies import checkpoint
+from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
+from policy_node.policies.policy import LoadedPolicy, Observation, observation_part
+
+Array = NDArray[np.float64]
+
+# As torch.nn.LayerNorm.
+_NORM_EPSILON = 1e-5
+
+
+class NumpyActor:
+    """Deterministic policy: multilayer perceptron with tanh output on normalised inputs.
+
+    Args:
+        shape: Its sizes.
+        tensors: Weights and normalisers by their names in `Actor`.
+    """
+
+    def __init__(self, shape: NetworkShape, tensors: Mapping[str, NDArray[np.float32]]) -> None:
+        self.shape = shape
+        self._values = {name: values.astype(np.float64) for name, values in tensors.items()}
+
+    def predict(
+        self, observation: Observation, *, deterministic: bool = True
+    ) -> tuple[NDArray[np.float32], None]:
+        """Returns the action for one observation or a batch.
+
+        Args:
+            observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
+                in the units of the task; other keys are ignored.
+            deterministic: Ignored: the policy has no noise.
+
+        Returns:
+            Actions (..., action_size) in [-1, 1], float32, and None.
+
+        Raises:
+            ValueError: If a part is missing or has the wrong length.
+        """
+        del deterministic
+        shape = self.shape
+        # Rounded to float32 first, as in training.
+        state = observation_part(observation, 'observation', shape.observation_size)
+        goal = observation_part(observation, 'desired_goal', shape.goal_size)
+        layer = self._features(state.astype(np.float64), goal.astype(np.float64))
+        for index, name in enumerate(shape.layer_names):
+            layer = self._linear(name, layer)
+            if shape.layer_norm:
+                layer = self._norm(shape.norm_names[index], layer)
+            layer = np.maximum(layer, 0.0)
+        return np.tanh(self._linear('network.output', layer)).astype(np.float32), None
+
+    def _features(self, state: Array, goal: Array) -> Array:
+        normalized = (
+            self._normalize('observation_normalizer', state),
+            self._normalize('goal_normalizer', goal),
+        )
+        if self.shape.goal_features is None:
+            return np.concatenate(normalized, axis=-1)
+        return np.asarray(self.shape.goal_features.inputs(state, goal, *normalized))
+
+    def _normalize(self, name: str, values: Array) -> Array:
+        mean, std = self._values[f'{name}.mean'], self._values[f'{name}.std']
+        clipped = values.clip(-INPUT_CLIP, INPUT_CLIP)
+        return ((clipped - mean) / std).clip(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+
+    def _linear(self, name: str, values: Array) -> Array:
+        weight, bias = self._values[f'{name}.weight'], self._values[f'{name}.bias']
+        return np.asarray(values @ weight.T + bias)
+
+    def _norm(self, name: str, values: Array) -> Array:
+        centred = values - values.mean(axis=-1, keepdims=True)
+        variance = np.square(centred).mean(axis=-1, keepdims=True)
+        scaled = centred / np.sqrt(variance + _NORM_EPSILON)
+        return np.asarray(scaled * self._values[f'{name}.weight'] + self._values[f'{name}.bias'])
+
+
+def load_checkpoint(path: Path, task: str | None = None) -> LoadedPolicy:
+    """Loads a checkpoint to act with.
+
+    Raises:
+        ValueError: As `checkpoint.read`.
+    """
+    found = checkpoint.read(path, task)
+    return LoadedPolicy(
+        policy=NumpyActor(found.info.shape, found.tensors),
+        task=found.info.task,
+        description=f'actor {path.name}',
+        control_hz=found.info.control_hz,
+        sha256=found.sha256,
+    )

@@ -1,0 +1,98 @@
+"""What a policy is, and the two that need no training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Observation = Mapping[str, ArrayLike]
+
+
+class Policy(Protocol):
+    """What acts, in the form of Stable-Baselines3's `predict`."""
+
+    def predict(
+        self, observation: Observation, *, deterministic: bool = True
+    ) -> tuple[NDArray[Any], Any]:
+        """Acts on one observation or on a batch.
+
+        Args:
+            observation: `observation` (..., observation size), `achieved_goal` and `desired_goal`
+                (..., goal size) in the units of the task.
+            deterministic: Without exploration noise.
+
+        Returns:
+            Actions (..., action size) in [-1, 1], and a state that is not used.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedPolicy:
+    """A policy for one task and what is known about it.
+
+    Attributes:
+        policy: What acts.
+        task: Name of the task.
+        description: Who it is, for people.
+        control_hz: Action frequency it was trained at, Hz; None where any will do.
+        sha256: Fingerprint of its file; empty if it has none.
+    """
+
+    policy: Policy
+    task: str
+    description: str
+    control_hz: float | None = None
+    sha256: str = ''
+
+
+class RandomPolicy:
+    """Uniformly random actions, alike for equal seeds."""
+
+    def __init__(self, action_size: int, seed: int = 0) -> None:
+        self._action_size = action_size
+        self._generator = np.random.default_rng(seed)
+
+    def predict(
+        self, observation: Observation, *, deterministic: bool = True
+    ) -> tuple[NDArray[np.float32], None]:
+        """Returns actions (..., action size) in [-1, 1], whatever the observation."""
+        del deterministic
+        shape = _action_shape(observation, self._action_size)
+        return self._generator.uniform(-1.0, 1.0, shape).astype(np.float32), None
+
+
+class RestingPolicy:
+    """The zero action: the gripper stays, the hand takes the middle of its ranges."""
+
+    def __init__(self, action_size: int) -> None:
+        self._action_size = action_size
+
+    def predict(
+        self, observation: Observation, *, deterministic: bool = True
+    ) -> tuple[NDArray[np.float32], None]:
+        """Returns zeros (..., action size), whatever the observation."""
+        del deterministic
+        return np.zeros(_action_shape(observation, self._action_size), np.float32), None
+
+
+def _action_shape(observation: Observation, action_size: int) -> tuple[int, ...]:
+    return (*np.shape(observation['observation'])[:-1], action_size)
+
+
+def observation_part(observation: Observation, key: str, size: int) -> NDArray[np.float32]:
+    """Returns one part of an observation (..., size), as actors take it.
+
+    Raises:
+        ValueError: If it is missing or has the wrong length.
+    """
+    if key not in observation:
+        raise ValueError(f'observation has no {key!r}; given: {", ".join(observation)}')
+    values = np.asarray(observation[key], dtype=np.float32)
+    if values.ndim == 0 or values.shape[-1] != size:
+        raise ValueError(f'{key} has shape {values.shape}; allowed: (..., {size})')
+    return values

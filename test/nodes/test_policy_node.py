@@ -1,0 +1,129 @@
+"""`policy_node` as a user meets it: wrong names, other robots, paused robots, other namespaces."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from std_srvs.srv import SetBool
+
+from msgs_spec.codecs import decode_status
+from msgs_spec.tasks import task_spec
+from support.graph import (
+    POLICY_NODE,
+    SIM_NODE,
+    Start,
+    client,
+    end,
+    episodes_in,
+    finish,
+    ros_args,
+)
+
+REACH = task_spec('FetchReach')
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'line'),
+    [
+        ({'policy': 'nosuch'}, "no actor 'nosuch'; shipped: "),
+        ({'checkpoint': 'nosuch'}, "no actor 'nosuch'; shipped: "),
+        ({'policy': 'FetchReach', 'task': 'HandReach'}, 'trained on FetchReach, not on HandReach'),
+        ({'task': 'HandManipulatePenFull'}, 'no actor is shipped for HandManipulatePenFull'),
+    ],
+)
+def test_a_policy_that_is_not_there_is_noticed_before_a_robot_is(
+    start_process: Start, parameters: dict[str, object], line: str
+) -> None:
+    code, output = finish(start_process(*POLICY_NODE, *ros_args(**parameters)))
+    assert code == 2
+    assert line in output
+    assert 'Traceback' not in output
+    assert ('checkpoint is now called policy' in output) == ('checkpoint' in parameters)
+
+
+def test_a_zip_of_strangers_is_refused_at_the_start(start_process: Start, tmp_path: Path) -> None:
+    path = tmp_path / 'model.zip'
+    path.write_bytes(b'no zip')
+    code, output = finish(start_process(*POLICY_NODE, *ros_args(policy=path)))
+    assert (code, 'trust:=true' in output) == (2, True), output
+    code, output = finish(
+        start_process(*POLICY_NODE, *ros_args(policy=path, trust=True, task='FetchReach'))
+    )
+    assert (code, 'is not a file of Stable-Baselines3' in output) == (2, True), output
+
+
+def test_a_robot_that_comes_back_with_another_task_gets_its_own_actor(
+    start_process: Start, tmp_path: Path
+) -> None:
+    policy = start_process(*POLICY_NODE)
+    for task in ('FetchReach', 'HandReach', 'FetchReach'):
+        arguments = ros_args(
+            task=task, episodes=1, mode='lockstep', wait_for_commands=True, episode_dir=tmp_path
+        )
+        code, output = finish(start_process(*SIM_NODE, *arguments))
+        assert code == 0, output
+    assert policy.poll() is None
+    output = end(policy)
+    assert 'the robot changed from FetchReach at 25 Hz to HandReach at 25 Hz' in output
+    assert 'HandReach: commands come from actor HandReach.safetensors' in output
+    logged = episodes_in(tmp_path)
+    assert sorted(e.metadata['task'] for e in logged) == ['FetchReach', 'FetchReach', 'HandReach']
+    assert len({e.metadata['checkpoint_sha256'] for e in logged}) == 2
+
+
+def test_a_paused_robot_is_no_silent_one_and_acting_needs_no_torch(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(wait_for_commands=True))
+    policy = start_process(*POLICY_NODE)
+    with client(REACH) as robot:
+        robot.subscribe('applied_command', '/diagnostics')
+        robot.spin_until(lambda: len(robot.received['applied_command']) > 3, 'commands')
+        maps = Path(f'/proc/{policy.pid}/maps').read_text()
+        assert 'libtorch' not in maps and '_multiarray' in maps
+        assert robot.call(SetBool, 'sim_node/pause', data=True).success
+        robot.spin(4.0)
+        reports = [
+            message
+            for message in robot.received['/diagnostics']
+            if message.status[0].name == '/policy_node'
+        ]
+        assert reports[-1].status[0].message == 'FetchReach: the robot is paused'
+        assert float(decode_status(reports[-1])['observation age (s)']) > 2.5
+        # Wall time, as REP 107 has it.
+        assert abs(reports[-1].header.stamp.sec - time.time()) < 10.0
+    assert 'no state' not in end(policy)
+    end(sim)
+
+
+def test_robots_in_other_namespaces_are_named(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(mode='lockstep'), '-r', '__ns:=/arm1')
+    # ROS logs to standard error.
+    policy = start_process(*POLICY_NODE)
+    lines: list[str] = []
+    assert policy.stderr is not None
+    while not any('/arm1' in line for line in lines):
+        line = policy.stderr.readline()
+        assert line, lines
+        lines.append(line)
+    assert 'waiting for a robot on /episode_status' in lines[0]
+    assert 'no robot here: there is one in /arm1; join it with --ros-args -r __ns:=/arm1' in line
+    end(policy)
+    end(sim)
+
+
+def test_the_first_command_comes_soon_after_the_start(start_process: Start) -> None:
+    """Under 3 s on an idle machine; this one may be busy, so only what it costs is counted."""
+    import resource
+
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    code = (
+        'import threading, os, signal; from policy_node.node import main\n'
+        'threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start(); main()'
+    )
+    process = start_process(sys.executable, '-c', code)
+    assert finish(process)[0] == 0
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    assert used < 2.0

@@ -1,0 +1,164 @@
+"""One name for every policy: what is loaded, what it does without, what is refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from msgs_spec.tasks import TASKS, TaskSpec, task_spec
+from policy_node import load_policy
+from policy_node.policies import checkpoint
+from policy_node.policies.actor import Actor
+from policy_node.policies.checkpoint import ActorInfo
+from policy_node.policies.loading import TaskMissing
+from policy_node.policies.numpy_actor import NumpyActor
+from policy_node.policies.policy import RandomPolicy
+from policy_node.policies.shipped import shipped_actors
+
+
+def observations(spec: TaskSpec, *leading: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Observations in which quaternions are what they should be."""
+    generator = np.random.default_rng(seed)
+    parts = {'observation': spec.observation_size, 'desired_goal': spec.goal.size}
+    values = {name: generator.normal(size=(*leading, size)) for name, size in parts.items()}
+    if spec.goal.size == 7:
+        start = spec.achieved_goal_start + 3
+        for quaternion in (
+            values['observation'][..., start : start + 4],
+            values['desired_goal'][..., 3:],
+        ):
+            quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    return {**values, 'achieved_goal': values['desired_goal']}
+
+
+def fresh_actor(path: Path, task: str, **changes: object) -> Actor:
+    """Writes an actor nobody trained, with normalisers that are not trivial."""
+    torch.manual_seed(1)
+    spec = task_spec(task)
+    fields = {
+        'task': task,
+        'observation_layout': checkpoint.observation_layout(spec),
+        'goal_size': spec.goal.size,
+        'action_size': spec.robot.action_size,
+        'hidden_sizes': (32, 16),
+        'layer_norm': False,
+        'control_hz': 25.0,
+        'seed': 0,
+    }
+    info = ActorInfo(**(fields | changes))
+    actor = Actor(info.shape).eval()
+    for normalizer in (actor.observation_normalizer, actor.goal_normalizer):
+        normalizer.mean.uniform_(-1, 1)
+        normalizer.std.uniform_(0.5, 2)
+    checkpoint.save(path, actor, info)
+    return actor
+
+
+@pytest.mark.parametrize('task', shipped_actors())
+def test_shipped_actors_answer_as_torch_does(task: str) -> None:
+    actor, found = checkpoint.load(shipped_actors()[task])[0], load_policy(task)
+    assert (found.task, found.control_hz) == (task, 25.0)
+    assert found.sha256 == checkpoint.checkpoint_hash(shipped_actors()[task])
+    for leading in ((), (40,), (2, 3)):
+        observation = observations(task_spec(task), *leading)
+        action, _ = found.policy.predict(observation)
+        wanted, _ = actor.predict(observation)
+        assert action.shape == wanted.shape and action.dtype == np.float32
+        np.testing.assert_allclose(action, wanted, atol=5e-4)
+
+
+@pytest.mark.parametrize('task', ['FetchSlide', 'HandReach', 'HandManipulateBlockFull'])
+@pytest.mark.parametrize('features', ['plain', 'relative', 'symmetric'])
+@pytest.mark.parametrize('layer_norm', [False, True])
+def test_every_kind_of_actor_answers_as_torch_does(
+    task: str, features: str, layer_norm: bool, tmp_path: Path
+) -> None:
+    if features == 'symmetric' and not task.startswith('HandManipulate'):
+        pytest.skip('without an object pose as its goal')
+    path = tmp_path / 'a.safetensors'
+    actor = fresh_actor(path, task, goal_features=features, layer_norm=layer_norm)
+    observation = observations(task_spec(task), 50)
+    action, _ = load_policy(path).policy.predict(observation)
+    np.testing.assert_allclose(action, actor.predict(observation)[0], atol=1e-5)
+
+
+def test_a_batch_is_answered_as_its_rows() -> None:
+    policy, observation = load_policy('FetchPush').policy, observations(task_spec('FetchPush'), 64)
+    batch, _ = policy.predict(observation)
+    rows = [policy.predict({k: v[i] for k, v in observation.items()})[0] for i in range(64)]
+    # In float64 first: all but the rare last bit.
+    np.testing.assert_allclose(batch, rows, rtol=2e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize('task', ['FetchReach', 'HandReach'])
+@pytest.mark.parametrize('name', ['random', 'resting'])
+def test_policies_without_training(task: str, name: str) -> None:
+    spec = task_spec(task)
+    found = load_policy(name, task)
+    assert (found.task, found.control_hz, found.sha256) == (task, None, '')
+    for leading in ((), (5,)):
+        action, _ = found.policy.predict(observations(spec, *leading))
+        assert action.shape == (*leading, spec.robot.action_size)
+        assert (np.abs(action) <= 1.0).all() and bool(action.any()) == (name == 'random')
+
+
+def test_random_actions_are_alike_for_equal_seeds_and_fill_the_range() -> None:
+    observation = observations(task_spec('FetchReach'), 1000)
+    first, again, other = (RandomPolicy(4, seed).predict(observation)[0] for seed in (1, 1, 2))
+    assert (first == again).all() and (first != other).any()
+    assert -1 <= first.min() < -0.99 and 0.99 < first.max() <= 1
+
+
+def test_no_name_is_the_shipped_actor_of_the_task() -> None:
+    assert load_policy('', 'FetchPush').description == 'actor FetchPush.safetensors'
+    missing = next(task for task in TASKS if task not in shipped_actors())
+    with pytest.raises(ValueError, match=f'no actor is shipped for {missing} .*FetchReach'):
+        load_policy('', missing)
+
+
+@pytest.mark.parametrize('name', ['random', 'resting', ''])
+def test_a_task_that_is_missing_is_told_apart(name: str) -> None:
+    with pytest.raises(TaskMissing, match='needs a task; allowed: FetchReach, '):
+        load_policy(name)
+
+
+def test_unknown_and_unfitting_names_are_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"no actor 'rnd'; shipped: .*, 'random' or 'resting'$"):
+        load_policy('rnd', 'FetchReach')
+    with pytest.raises(ValueError, match='trained on FetchReach, not on FetchPush'):
+        load_policy('FetchReach', 'FetchPush')
+    with pytest.raises(ValueError, match='no actor'):
+        load_policy(tmp_path)
+
+
+def test_finite_weights_give_finite_actions_however_large(tmp_path: Path) -> None:
+    path = tmp_path / 'a.safetensors'
+    fresh_actor(path, 'FetchReach', layer_norm=True)
+    found = checkpoint.read(path)
+    huge = {name: np.full_like(value, 3e38) for name, value in found.tensors.items()}
+    actor = NumpyActor(found.info.shape, huge)
+    assert np.isfinite(actor.predict(observations(task_spec('FetchReach')))[0]).all()
+
+
+def _modules_after(code: str) -> set[str]:
+    code += "\nimport sys; print(*sorted(name.partition('.')[0] for name in sys.modules))"
+    result = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    return set(result.stdout.split())
+
+
+@pytest.mark.parametrize('name', ['FetchReach', 'random', 'resting'])
+def test_acting_needs_no_torch(name: str) -> None:
+    code = (
+        'import numpy as np; from policy_node import load_policy\n'
+        "ones = {'observation': np.ones(10), 'desired_goal': np.ones(3)}\n"
+        f"load_policy({name!r}, 'FetchReach').policy.predict(ones)"
+    )
+    assert 'torch' not in _modules_after(code)
