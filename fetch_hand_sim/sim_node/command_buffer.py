@@ -129,11 +129,14 @@ class CommandBuffer:
         self.last_rejection = line
 
     def take(self) -> Array:
-        """Returns what the next tick applies, (action size,), command units, within limits."""
-        self._is_fresh = False
+        """Returns what the next tick applies, (action size,), command units, within limits.
+
+        What came since the last tick answers it and is never too old, however slow the ticks are.
+        """
+        is_fresh, self._is_fresh = self._is_fresh, False
         if self._command is None:
             return self._resting
-        is_late = 0.0 < self.timeout < (self.age() or 0.0)
+        is_late = not is_fresh and 0.0 < self.timeout < (self.age() or 0.0)
         return self._holding(self._command) if is_late else self._command
 
     def _holding(self, command: Array) -> Array:

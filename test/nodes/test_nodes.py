@@ -325,24 +325,21 @@ def test_killed_simulation_leaves_finished_episodes_and_a_marked_rest(
     assert leftover.name in output
 
 
-@pytest.mark.parametrize(
-    ('parameters', 'line'),
-    [
+def test_bad_parameters_end_with_one_line_and_code_2(start_process: Start) -> None:
+    lines: list[tuple[dict[str, object], str]] = [
         ({'task': 'FetchFly'}, "'FetchFly' given; allowed: 'FetchReach', 'FetchPush'"),
         ({'control_hz': 30.0}, 'nearest: 29.4117647 and 31.25'),
         ({'seed': -1}, '0 ... 4294967295'),
         ({'seed': 'seven'}, '0 ... 4294967295'),
         ({'mode': 'warp'}, "'realtime', 'lockstep'"),
         ({'real_time_factor': -1.0}, '0 or 0.01 ... 1000'),
-    ],
-)
-def test_bad_parameters_end_with_one_line_and_code_2(
-    start_process: Start, parameters: dict[str, object], line: str
-) -> None:
-    code, output = finish(start_process(*SIM_NODE, *ros_args(**parameters)))
-    assert code == 2
-    assert line in output
-    assert len(output.strip().splitlines()) == 1
+    ]
+    nodes = [start_process(*SIM_NODE, *ros_args(**parameters)) for parameters, _ in lines]
+    for node, (parameters, line) in zip(nodes, lines, strict=True):
+        code, output = finish(node)
+        assert code == 2, parameters
+        assert line in output
+        assert len(output.strip().splitlines()) == 1
 
 
 def test_policy_refuses_an_actor_of_another_task(start_process: Start) -> None:

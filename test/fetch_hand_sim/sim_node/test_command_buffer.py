@@ -38,6 +38,18 @@ def test_the_largest_numbers_are_clipped_too(value):
     assert buffer.far_out == 1
 
 
+def test_in_slow_motion_a_command_that_answers_the_last_tick_is_not_too_old():
+    """At 0.02 x real time, ticks are 2 s apart and the timeout is half a second."""
+    now = 0.0
+    buffer = CommandBuffer(REACH, 0.5, lambda: now)
+    for _ in range(3):
+        buffer.accept([0.5, 0.0, 0.0, 1.0])
+        now += 2.0
+        assert buffer.take().tolist() == [0.5, 0.0, 0.0, 1.0]
+    now += 2.0
+    assert buffer.take().tolist() == [0.0, 0.0, 0.0, 1.0]
+
+
 def test_a_command_is_held_after_the_timeout_and_its_age_outlives_the_episode():
     now = 5.0
     buffer = CommandBuffer(REACH, 0.5, lambda: now)
