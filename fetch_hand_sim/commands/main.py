@@ -51,6 +51,9 @@ COMMANDS = {
     'sim': Command('the simulated robot, a ROS node', 'sim_node', is_node=True),
     'policy': Command('the actor, a ROS node', 'policy_node', is_node=True),
     'replay': Command('a logged episode as a ROS node', 'replay_node', is_node=True),
+    'visualize': Command(
+        'URDF, transforms, markers for RViz, a ROS node', 'visualization_node', is_node=True
+    ),
     'train': Command('train an actor', 'train_her'),
     'evaluate': Command('success of an actor over many episodes', 'evaluate_policy'),
     'benchmark': Command("the paper's comparison, four arms", 'benchmark'),

@@ -23,7 +23,9 @@ def leaves(commands=COMMANDS, path=()):
 def test_every_executable_has_a_command_and_every_command_its_executable():
     named = [command.executable for _, command in leaves() if command.executable]
     points = distribution('fetch_hand_sim').entry_points.select(group='console_scripts')
-    assert sorted([*named, 'fetch_hand_sim']) == sorted(points.names)
+    assert sorted([*named, 'fetch_hand_sim']) == sorted(points.names), (
+        'setup.py and COMMANDS in fetch_hand_sim/commands/main.py differ'
+    )
 
 
 @pytest.mark.parametrize(
