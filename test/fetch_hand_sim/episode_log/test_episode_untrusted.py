@@ -22,7 +22,7 @@ from support.episode_recorder import Recorder
 
 # `make torture` turns these up.
 FILES = int(os.environ.get('EPISODE_MUTATIONS', '360'))
-CRAFTED = int(os.environ.get('EPISODE_CRAFTED', '60'))
+CRAFTED = int(os.environ.get('EPISODE_CRAFTED', '40'))
 SCRIPT = SUPPORT / 'mutated_files.py'
 READERS = 6
 
