@@ -153,8 +153,8 @@ def _run(options: argparse.Namespace) -> int:
         filtered = len(episodes) - len(shown)
         print(f'{len(shown)} episodes, {successes} successes; {filtered} filtered')
     for leftover in leftovers:
-        line = printable(f'{leftover}; recover_episodes makes a bag of it')
-        print(line, file=sys.stderr if options.json else sys.stdout)
+        remedy = '' if leftover.problem else '; recover_episodes makes a bag of it'
+        print(f'{leftover}{remedy}', file=sys.stderr if options.json else sys.stdout)
     for skipped in errors:
         complain(_NAME, f'skipped {skipped}')
     return EXIT_FAILURE if errors else EXIT_SUCCESS
