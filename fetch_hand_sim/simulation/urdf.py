@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.tasks import task_asset
 from fetch_hand_sim.simulation.urdf_shapes import add_shapes, numbers
+from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.rotations import (
     quaternion_conjugate,
     quaternion_from_axis_angle,
@@ -30,7 +31,6 @@ Array = NDArray[np.float64]
 JointType = Literal['fixed', 'revolute', 'continuous', 'prismatic']
 
 ROOT = 'world'
-_PREFIX = 'robot0:'
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 # URDF demands limits of what MuJoCo leaves unlimited: m or rad, N or N m, and per second.
 _FAR, _STRONG, _FAST = 1000.0, 1000.0, 100.0
@@ -129,11 +129,12 @@ class RobotDescription:
             found[joint.child] = found[joint.parent] @ joint.pose(positions.get(joint.name, 0.0))
         return found
 
-    def to_xml(self, frame_prefix: str = '') -> str:
+    def to_xml(self, frame_prefix: str = '', joint_prefix: str = JOINT_PREFIX) -> str:
         """Returns the URDF.
 
         Args:
             frame_prefix: Before the names of all links but the root, such as `left/`.
+            joint_prefix: What the names of the robot's joints begin with in `joint_states`.
         """
         robot = ElementTree.Element('robot', name=self._spec.robot.name)
         ElementTree.SubElement(robot, 'link', name=ROOT)
@@ -142,7 +143,8 @@ class RobotDescription:
             link = ElementTree.SubElement(robot, 'link', name=frame_prefix + joint.child)
             if joint.child in names:
                 self._fill_link(link, names[joint.child])
-            self._add_joint(robot, joint, frame_prefix)
+            name = joint_prefix + joint.name.removeprefix(JOINT_PREFIX)
+            self._add_joint(robot, joint, name, frame_prefix)
         ElementTree.indent(robot)
         return ElementTree.tostring(robot, encoding='unicode')
 
@@ -151,7 +153,7 @@ class RobotDescription:
         model = self._model
         name = model.body(body).name
         is_mocap = int(model.body_mocapid[body]) >= 0
-        return name.startswith(_PREFIX) and not is_mocap and 'external_camera' not in name
+        return name.startswith(JOINT_PREFIX) and not is_mocap and 'external_camera' not in name
 
     def _joints_of(self, body: int) -> Iterator[UrdfJoint]:
         """The chain of joints from a body's parent to the body."""
@@ -208,9 +210,11 @@ class RobotDescription:
             )
         add_shapes(link, self._mjcf, model, body)
 
-    def _add_joint(self, robot: ElementTree.Element, joint: UrdfJoint, frame_prefix: str) -> None:
+    def _add_joint(
+        self, robot: ElementTree.Element, joint: UrdfJoint, name: str, frame_prefix: str
+    ) -> None:
         parent = joint.parent if joint.parent == ROOT else frame_prefix + joint.parent
-        element = ElementTree.SubElement(robot, 'joint', name=joint.name, type=joint.kind)
+        element = ElementTree.SubElement(robot, 'joint', name=name, type=joint.kind)
         ElementTree.SubElement(element, 'parent', link=parent)
         ElementTree.SubElement(element, 'child', link=frame_prefix + joint.child)
         add_origin(element, joint.origin.position, joint.origin.quaternion)

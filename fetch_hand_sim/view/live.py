@@ -37,6 +37,7 @@ from fetch_hand_sim.view.messages import (
 from fetch_hand_sim.view.remote_node import RemoteNode
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode_status
+from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
@@ -101,7 +102,13 @@ class LiveRobot:
     @property
     def spec(self) -> TaskSpec | None:
         """The robot's task; None until there is one."""
-        return task_spec(self._status.task) if self._status else None
+        status = self._status
+        return task_spec(status.task, status.joint_prefix) if status else None
+
+    @property
+    def joint_prefix(self) -> str:
+        """What the names of the robot's joints begin with."""
+        return self._status.joint_prefix if self._status else JOINT_PREFIX
 
     def picture(self) -> Picture | None:
         """Returns what to show if it has changed since the last call."""

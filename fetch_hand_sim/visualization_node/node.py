@@ -102,7 +102,7 @@ class VisualizationNode(Node):
         self._camera.close()
         self._scene = Scene(task)
         self._transforms = Transforms(task, self._prefix)
-        urdf = self._transforms.description.to_xml(self._prefix)
+        urdf = self._transforms.description.to_xml(self._prefix, self._robot.joint_prefix)
         self._description.publish(String(data=urdf))
         if self._tf_static is not None:
             camera = view_transform(self._scene.view, self._prefix + _CAMERA_FRAME)

@@ -13,7 +13,7 @@ import pytest
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.simulation.urdf import ROOT, RobotDescription, roll_pitch_yaw
 from msgs_spec.rotations import quaternion_to_matrix
-from msgs_spec.tasks import TASKS
+from msgs_spec.tasks import TASKS, task_spec
 
 TASKS_OF_ROBOTS = ['FetchReach', 'HandReach']
 CONFIGURATIONS = 100
@@ -163,3 +163,10 @@ def test_frames_of_several_robots_have_a_prefix():
     assert {joint.get('name') for joint in root.findall('joint')} >= set(
         TASKS['HandReach'].robot.joints
     )
+
+
+def test_joints_have_the_names_of_joint_states():
+    spec = task_spec('HandReach', 'rh_')
+    root = ElementTree.fromstring(RobotDescription('HandReach').to_xml(joint_prefix='rh_'))
+    moving = [each.get('name') for each in root.findall('joint') if each.get('type') != 'fixed']
+    assert set(moving) == set(spec.robot.joints)
