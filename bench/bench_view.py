@@ -119,7 +119,7 @@ def main() -> None:
             words = ['--ros-args', '-p', f'task:={options.task}', '-p', f'mode:={mode}']
             start(stack, 'fetch_hand_sim.sim_node', *words)
             if mode == 'lockstep':
-                policy = ['--ros-args', '-p', 'checkpoint:=resting']
+                policy = ['--ros-args', '-p', 'policy:=resting']
                 start(stack, 'policy_node.node', *policy)
             watcher.wait_for_ticks()
             compare(watcher, options, factor)

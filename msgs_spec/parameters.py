@@ -166,7 +166,8 @@ POLICY_NODE = (
         'string',
         '',
         'Shipped actor, file (.safetensors, .onnx, .zip), random or resting; empty takes the '
-        'shipped actor of the task.',
+        'shipped actor of the task. May be set while it acts.',
+        read_only=False,
         former='checkpoint',
     ),
     ParameterSpec(

@@ -6,7 +6,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
@@ -22,6 +24,7 @@ from msgs_spec.ros import (
     declare_parameters,
     rclpy_profile,
     ros_message_class,
+    set_callback,
 )
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TASKS
@@ -62,6 +65,7 @@ class PolicyNode(Node):
         self._commands: Publisher | None = None
         self._of_robot: list[Publisher | Subscription] = []
         self._is_paused = False
+        self._is_replaced = False
         self._health = Health(self.get_fully_qualified_name())
         self._diagnostics = self._publisher(DIAGNOSTICS)
         self._report_due = time.monotonic() + REPORT_PERIOD
@@ -69,6 +73,7 @@ class PolicyNode(Node):
         self._status_name = self.resolve_topic_name('episode_status')
         self._subscribe(topic(_ANY_TASK, 'episode_status'), self._on_status)
         self._subscribe(DIAGNOSTICS, self._on_diagnostics)
+        self.add_on_set_parameters_callback(self._take_policy)
 
     def run(self, stop: StopSignals) -> None:
         """Serves until told to stop.
@@ -81,7 +86,7 @@ class PolicyNode(Node):
         try:
             while not stop:
                 loop.wait(BEAT)
-                if self._has_robot_changed():
+                if self._has_robot_changed() or self._is_replaced:
                     self._leave()
                     # Only then the middleware lets go of topics that the next robot may type anew.
                     loop.serve_pending(_SERVED_AT_ONCE)
@@ -146,14 +151,34 @@ class PolicyNode(Node):
             return False
         return (now.task, now.control_hz) != (before.task, before.control_hz)
 
+    def _take_policy(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Loads another policy at once, so that who sets it hears whether there is one."""
+        result = set_callback(POLICY_NODE)(parameters)
+        for parameter in parameters:
+            if parameter.name != 'policy' or not result.successful:
+                continue
+            status, settings = self._status, self._settings
+            task = status.task if status else settings['task'] or None
+            try:
+                self._loaded = load_policy(parameter.value, task, trust=settings['trust'])
+            except TaskMissing:
+                self._loaded = None
+            except ValueError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            settings['policy'] = parameter.value
+            self._is_replaced = self._answered_status is not None
+        return result
+
     def _leave(self) -> None:
-        """Lets go of the robot that was answered."""
+        """Lets go of the robot that was answered; another policy, or another robot, follows."""
         assert self._answered_status is not None and self._status is not None
         before, now = self._answered_status, self._status
-        self.get_logger().info(
-            f'the robot changed from {before.task} at {before.control_hz:g} Hz to {now.task} at '
-            f'{now.control_hz:g} Hz'
-        )
+        if not self._is_replaced:
+            self.get_logger().info(
+                f'the robot changed from {before.task} at {before.control_hz:g} Hz to {now.task} '
+                f'at {now.control_hz:g} Hz'
+            )
+        self._is_replaced = False
         for each in self._of_robot:
             if isinstance(each, Publisher):
                 self.destroy_publisher(each)

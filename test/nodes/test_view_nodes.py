@@ -16,11 +16,11 @@ import rclpy
 
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from fetch_hand_sim.view.live import LiveRobot
-from fetch_hand_sim.view.messages import Reset, SetGoal, SetPaused, StepOnce
+from fetch_hand_sim.view.messages import ChooseActor, Reset, SetGoal, SetPaused, StepOnce
 from msgs_spec.codecs import decode
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic
-from support.graph import SIM_NODE, client, ros_args
+from support.graph import POLICY_NODE, SIM_NODE, client, ros_args
 
 Start = Callable[..., subprocess.Popen[str]]
 REACH = task_spec('FetchReach')
@@ -70,6 +70,28 @@ def test_what_the_page_asks_for_happens(start_process: Start) -> None:
         follower.robot.picture()
         follower.robot.perform(StepOnce())
         follower.until(lambda p: p.stamp_ns > before or '1 run' in p.facts.notice, 'a step')
+
+
+def test_another_actor_takes_over(start_process: Start) -> None:
+    start_process(*POLICY_NODE)
+    start_process(*SIM_NODE, *ros_args(task='FetchReach', wait_for_commands=True))
+    with client(REACH) as connection:
+        follower = Follower(connection)
+        follower.until(
+            lambda p: 'FetchReach' in p.facts.commander and p.facts.actors, 'actor that commands'
+        )
+        follower.robot.perform(ChooseActor('nosuch'))
+        follower.until(lambda p: 'refuses policy' in p.facts.notice, 'refusal')
+        follower.robot.perform(ChooseActor('random'))
+        follower.until(lambda p: 'random' in p.facts.commander, 'random commander')
+        stamp = follower.picture.stamp_ns
+        commands = [follower.picture.command]
+
+        def has_changed(picture):
+            commands.append(picture.command)
+            return picture.stamp_ns > stamp and np.ptp(np.stack(commands), axis=0).min() > 0.5
+
+        follower.until(has_changed, 'random commands')
 
 
 def test_who_may_only_watch_changes_nothing(start_process: Start) -> None:
@@ -150,7 +172,7 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
         (['--wait', '0.2', '--robot', 'nosuch'], 1, 'no robot in namespace /nosuch'),
         (['--wait', '0.2'], 1, 'start sim_node'),
         (['--host', '203.0.113.1'], 1, 'cannot listen on 203.0.113.1'),
-        (['--task', 'FetchReach', '--checkpoint', 'nosuch'], 1, 'a node ended'),
+        (['--task', 'FetchReach', '--policy', 'nosuch'], 1, 'a node ended'),
         (['--port', '99999'], 2, '--port 99999; allowed: 0 ... 65535'),
         (['--task', 'FetchWalk'], 2, 'FetchWalk'),
         (['episodes', '--task', 'FetchReach'], 2, 'exclude each other'),

@@ -26,16 +26,15 @@ from fetch_hand_sim.commands.main import main as fetch_hand_sim
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.parameters import POLICY_NODE, REPLAY_NODE, SIM_NODE, validate
+from msgs_spec.parameters import NODES, validate
 from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS
 from msgs_spec.topics import topics
 from support import ROOT, script_environment
 from support.shell_lines import commands, python_blocks, shell_lines
 
-NODES = {'sim_node': SIM_NODE, 'policy_node': POLICY_NODE, 'replay_node': REPLAY_NODE}
 # Of others, or of the reader: nothing here says what they take.
-FOREIGN = {'.', '>', 'apt', 'cd', 'colcon', 'git', 'pip', 'python3', 'ssh', 'touch', 'uvx'}
+FOREIGN = {'.', '>', 'apt', 'cd', 'colcon', 'git', 'pip', 'python3', 'rviz2', 'ssh', 'touch', 'uvx'}
 # The controller is run by test_write_your_own_controller.py, against a robot.
 RUN_ELSEWHERE = {'write_your_own_controller.md'}
 
