@@ -9,63 +9,16 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import statistics
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+
+from policy_node.training.benchmark.actors_table import actors_table
 
 ROOT = Path(__file__).resolve().parent.parent
 ACTORS = ROOT / 'policy_node' / 'actors'
 SPEED = ROOT / 'bench' / 'results' / 'bench_sim.csv'
-
-# Best success at the last step found published for each task: value, steps, source.
-PUBLISHED = {
-    'FetchReach': '1.00, 10k-20k (`spitis/mrl`)',
-    'FetchPush': '0.994, 2M (SAC+HER, `VladPrytula/robotics_series`)',
-    'FetchSlide': '0.88, 2.5M (`spitis/mrl`, read off a figure)',
-    'FetchPickAndPlace': '1.000 of 300 episodes, 5M (SAC+HER, `VladPrytula/robotics_series`)',
-    'HandReach': 'about 0.40, 2M (`zzyunzhi/vds`, quoted)',
-    'HandManipulateBlockRotateZ': 'no number found',
-    'HandManipulateBlockRotateParallel': 'no number found',
-    'HandManipulateBlockRotateXYZ': 'no number found',
-    'HandManipulateBlockFull': '0.675, 40M (`spitis/mrl`, read off a figure)',
-    'HandManipulateEggRotate': 'no number found',
-    'HandManipulateEggFull': '0.93, 40M (`spitis/mrl`, read off a figure)',
-    'HandManipulatePenRotate': '0.317, 38M (EBP, arXiv 1810.01363, quoted)',
-    'HandManipulatePenFull': '0.48, 40M (`spitis/mrl`, read off a figure)',
-}
-
-
-def actors_table(actors: Path = ACTORS) -> str:
-    """Returns the Markdown table."""
-    lines = [
-        '| task | success (95 % interval) | in Gymnasium-Robotics | touched once | mean return '
-        '| episodes | env steps | best published, steps |',
-        '| --- | --- | --- | --- | --- | --- | --- | --- |',
-    ]
-    found = {path.stem: json.loads(path.read_text()) for path in actors.glob('*.json')}
-    for task, published in PUBLISHED.items():
-        if task in found:
-            lines.append(_row(task, found[task], published))
-    return '\n'.join(lines)
-
-
-def _row(task: str, report: dict[str, Any], published: str) -> str:
-    lower, upper = report['success_gymnasium_interval_95']
-    reference = report.get('reference')
-    cells = [
-        task,
-        f'**{report["success_gymnasium"]:.3f}** ({lower:.3f} ... {upper:.3f})',
-        f'{reference["success"]:.3f} of {reference["episodes"]:,}' if reference else '',
-        f'{report["touched"]:.3f}',
-        f'{report["mean_return"]:.2f}',
-        f'{report["episodes"]:,}',
-        f'{report["env_steps"] / 1e6:.2f}M',
-        published,
-    ]
-    return f'| {" | ".join(cells)} |'
 
 
 def speed_table(path: Path = SPEED) -> str:
@@ -105,7 +58,7 @@ def _without_comments(text: str) -> Iterable[str]:
     return (line for line in text.splitlines() if not line.startswith('#'))
 
 
-TABLES = {'results': actors_table, 'speed': speed_table}
+TABLES = {'results': lambda: actors_table(ACTORS), 'speed': speed_table}
 
 
 def with_tables(page: str) -> str:

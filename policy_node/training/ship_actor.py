@@ -43,42 +43,83 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    if options.episodes < 1 or options.num_envs < 1:
+        raise UsageError(f'--episodes {options.episodes}, --num-envs {options.num_envs}: >= 1')
     try:
-        return EXIT_SUCCESS if ship(options) else EXIT_FAILURE
+        better = ship(
+            options.run,
+            options.actors,
+            episodes=options.episodes,
+            num_envs=options.num_envs,
+            threads=options.threads,
+            name=options.checkpoint,
+        )
+        return EXIT_SUCCESS if better else EXIT_FAILURE
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from None
 
 
-def ship(options: argparse.Namespace) -> bool:
-    """Evaluates and, if it is better than the shipped actor, copies what belongs to an actor."""
-    actor, info = checkpoint.load(options.run / options.checkpoint)
-    num_envs = min(options.num_envs, options.episodes)
+def ship(
+    run: Path,
+    actors: Path,
+    *,
+    episodes: int,
+    num_envs: int = 100,
+    threads: int = 0,
+    name: str = BEST_FILE,
+) -> bool:
+    """Evaluates and, if it is better than the shipped actor, copies what belongs to an actor.
+
+    An actor that is the shipped one, evaluated on as many episodes, is left as it is.
+
+    Args:
+        run: Folder of the run.
+        actors: Where actors go.
+        episodes: Fresh episodes.
+        num_envs: Simulations in the batch.
+        threads: Simulation threads; 0 is all cores.
+        name: File of the actor in the run.
+
+    Returns:
+        Whether the actor of the run is the shipped one now.
+
+    Raises:
+        ValueError: If there is no such actor.
+    """
+    actor, info = checkpoint.load(run / name)
+    shipped, digest = actors / f'{info.task}.json', checkpoint.checkpoint_hash(run / name)
+    old = json.loads(shipped.read_text()) if shipped.is_file() else {}
+    if (old.get('run_sha256'), old.get('episodes')) == (digest, episodes):
+        return True
     simulation = Simulation(
-        info.task, num_envs=num_envs, num_threads=options.threads, control_hz=info.control_hz
+        info.task,
+        num_envs=min(num_envs, episodes),
+        num_threads=threads,
+        control_hz=info.control_hz,
     )
-    summary = summarize(evaluate(simulation, actor, options.episodes, FIRST_SEED))
-    print_table({'policy': str(options.run), 'task': info.task, **summary})
-    shipped = options.actors / f'{info.task}.json'
-    if shipped.is_file() and not is_better(summary, json.loads(shipped.read_text())):
-        print(f'ship_actor: the actor in {options.actors} is at least as good; nothing changed')
+    summary = summarize(evaluate(simulation, actor, episodes, FIRST_SEED))
+    print_table({'policy': str(run), 'task': info.task, **summary})
+    if old and not is_better(summary, old):
+        print(f'{_NAME}: the actor in {actors} is at least as good; nothing changed')
         return False
-    target = options.actors / f'{info.task}.safetensors'
-    command = commands_of(options.run) or info.command
+    target = actors / f'{info.task}.safetensors'
+    command = commands_of(run) or info.command
     checkpoint.save(target, actor, replace(info, success=summary, command=command))
     report = {
         'actor': info.task,
         'sha256': checkpoint.checkpoint_hash(target),
+        'run_sha256': digest,
         'env_steps': info.env_steps,
         'command': command,
         'init_from': info.init_from,
         'source_revision': info.source_revision,
         **summary,
     }
-    shipped.write_text(json.dumps(report, indent=2) + '\n')
-    if (options.run / STATE_FILE).is_file():
-        ship_critic(options.run / STATE_FILE, target)
+    if (run / STATE_FILE).is_file():
+        ship_critic(run / STATE_FILE, target)
     title = f'{info.task}, {info.config["recipe"]} recipe, seed {info.seed}'
-    draw_curve(read_progress(options.run / 'progress.csv'), title, target.with_suffix('.png'))
+    draw_curve(read_progress(run / 'progress.csv'), title, target.with_suffix('.png'))
+    shipped.write_text(json.dumps(report, indent=2) + '\n')
     return True
 
 
@@ -96,7 +137,8 @@ def ship_critic(state_file: Path, actor: Path) -> None:
 def commands_of(run: Path) -> str:
     """Every command of a run in order, the first and those that resumed it; '' if unknown."""
     path = run / 'command.txt'
-    return ' && '.join(path.read_text().splitlines()) if path.is_file() else ''
+    # The same command again goes on where it stopped: once is enough to say it.
+    return ' && '.join(dict.fromkeys(path.read_text().splitlines())) if path.is_file() else ''
 
 
 def is_better(new: dict[str, Any], old: dict[str, Any]) -> bool:

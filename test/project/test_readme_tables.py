@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from policy_node.policies.shipped import shipped_actors
 from support import ROOT
 
 ACTORS = ROOT / 'policy_node' / 'actors'
@@ -33,7 +34,7 @@ def test_the_readme_is_short() -> None:
     assert (ROOT / 'README.md').read_text().count('\n') <= 130
 
 
-@pytest.mark.parametrize('path', sorted(ACTORS.glob('*.safetensors')), ids=lambda path: path.stem)
+@pytest.mark.parametrize('path', shipped_actors().values(), ids=lambda path: path.stem)
 def test_each_actor_is_the_one_that_was_evaluated(path: Path) -> None:
     report = json.loads(path.with_suffix('.json').read_text())
     assert report['sha256'] == hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,13 +1,21 @@
-"""`benchmark`: the paper's comparison, DDPG with and without HER on sparse and dense rewards.
+"""`benchmark`: trains whole studies, as resumable jobs, on one machine or on Ray.
 
+`--study paper`: the paper's comparison, DDPG with and without HER on sparse and dense rewards.
 Trains task x arm x seed, each in <output>/<task>/<arm>/seed<k>, then draws success against steps
-and prints a table beside the published numbers. Finished jobs are skipped and interrupted ones
-continued, so the same command goes on where it stopped; given twice at once, it shares the work.
+and prints a table beside the published numbers.
+
+`--study best`: the best recipe of every task, as many at once as there are cores; some start from
+the networks of another. At the end it also evaluates each best actor on fresh episodes and puts it
+with its critic, evaluation and curve into <output>/actors.
+
+Finished jobs are skipped and interrupted ones continued, so the same command goes on where it
+stopped; given twice at once, it shares the work.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -17,65 +25,53 @@ from typing import Any
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
-    CommandError,
     UsageError,
+    complain,
     require_extra,
     run_command,
 )
 from msgs_spec.tasks import TASKS
-from policy_node.training.benchmark.jobs import (
-    ARMS,
-    Job,
-    JobError,
-    JobTakenError,
-    list_jobs,
-    run_job,
-)
+from policy_node.training.benchmark.actors_table import actors_table
+from policy_node.training.benchmark.jobs import ARMS, Job
 from policy_node.training.benchmark.results import write_report
-from policy_node.training.learning.config import RECIPES, parse_assignment, recipe_config
+from policy_node.training.benchmark.studies import STUDIES, best_jobs, paper_jobs, reduced_budget
+from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
+from policy_node.training.learning.config import RECIPES, parse_assignment
+from policy_node.training.learning.run_folder import BEST_FILE
+from policy_node.training.ship_actor import ship
 
 _NAME = 'benchmark'
-
-
-def reduced_budget(task: str) -> dict[str, Any]:
-    """What makes the `paper` recipe fit one machine; everything else stays as in the paper.
-
-    Two collections of 38 episodes are one, with twice the updates. Steps are 1.2 % (FetchReach) or
-    12 % of the paper's; batches 256 or 1024 instead of 4864; to learn in so few updates, targets
-    move after every 10 of them instead of 40.
-    """
-    small = task == 'FetchReach'
-    full = recipe_config(task, 'paper').total_steps
-    return {
-        'total_steps': full * 12 // (1000 if small else 100),
-        'num_envs': 76,
-        'updates_per_cycle': 80,
-        'batch_size': 256 if small else 1024,
-        'target_update_interval': 10,
-        'replay_transitions': 1_000_000,
-        'evaluate_every': 3_800 if small else 19_000,
-        # As many as there are simulations, so that none of them is cut short.
-        'evaluation_episodes': 76,
-    }
+ACTORS_TABLE = 'actors.md'
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog=_NAME, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     add = parser.add_argument
-    add('--tasks', nargs='+', choices=list(TASKS), default=['FetchReach'], metavar='TASK')
-    add('--arms', nargs='+', choices=list(ARMS), default=list(ARMS), metavar='ARM')
-    add('--seeds', nargs='+', type=int, default=[0, 1, 2, 3, 4], metavar='SEED')
-    add('--recipe', choices=RECIPES, default='paper', help='of all jobs; default: paper')
-    add('--full', action='store_true', help="the recipe's own budget instead of the reduced one")
+    add('--study', choices=STUDIES, default='paper', help='default: paper')
+    add('--tasks', nargs='+', choices=list(TASKS), metavar='TASK', help='default: FetchReach; all')
+    add('--seeds', nargs='+', type=int, metavar='SEED', help='default: 0 1 2 3 4; 0')
+    add('--jobs', type=int, help='at once; default: 1; one per core')
     add('--steps', type=int, help='environment steps of each job')
     add('--threads', type=int, help='simulation threads of each job')
     add('--torch-threads', type=int, help='tensor threads of each job')
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='any field of TrainConfig')
-    add('--output', type=Path, default=Path('runs/benchmark'), help='default: runs/benchmark')
+    add('--output', type=Path, help='default: runs/benchmark; runs/best')
     add('--report', type=Path, help='where figure and tables go; default: the output folder')
     add('--ray', action='store_true', help='independent jobs on Ray (extra: cluster)')
+    paper = parser.add_argument_group('study paper').add_argument
+    paper('--arms', nargs='+', choices=list(ARMS), metavar='ARM', help='default: all four')
+    paper('--recipe', choices=RECIPES, help='of all jobs; default: paper')
+    paper('--full', action='store_true', help="the recipe's own budget, not the reduced one")
+    best = parser.add_argument_group('study best').add_argument
+    best('--actors', type=Path, help='where actors go; default: <output>/actors')
+    best('--episodes', type=int, help='fresh episodes behind each; default: 2000')
     return parser.parse_args(arguments)
+
+
+_OF_STUDY = {'paper': ('arms', 'recipe', 'full'), 'best': ('actors', 'episodes')}
 
 
 def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
@@ -84,6 +80,20 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
     Raises:
         ValueError: If a value is not allowed or does not fit a run that is there.
     """
+    for study, names in _OF_STUDY.items():
+        for name in names:
+            if study != options.study and getattr(options, name) not in (None, False):
+                raise ValueError(f'--{name} belongs to --study {study}')
+    if options.jobs is not None and options.jobs < 1:
+        raise ValueError(f'--jobs {options.jobs}; allowed: 1 or more')
+    overrides = _overrides(options)
+    jobs = _paper(options, overrides) if options.study == 'paper' else _best(options, overrides)
+    for job in jobs:
+        job.check_configuration()
+    return jobs
+
+
+def _overrides(options: argparse.Namespace) -> dict[str, Any]:
     chosen = {
         'total_steps': options.steps,
         'simulation_threads': options.threads,
@@ -91,20 +101,37 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
     }
     overrides = {name: value for name, value in chosen.items() if value is not None}
     overrides.update(parse_assignment(text) for text in options.set)
-    for name in ('task', 'recipe', 'seed', 'reward_type'):
+    decided = ('task', 'recipe', 'seed', 'init_from')
+    for name in (*decided, 'reward_type') if options.study == 'paper' else decided:
         if name in overrides:
             raise ValueError(f'--set {name} is not possible: jobs differ in it')
     if overrides.get('strategy') == 'none':
         raise ValueError('--set strategy=none is not possible: choose --arms')
+    return overrides
+
+
+def _paper(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
+    recipe, output = options.recipe or 'paper', _output(options)
+    seeds = list(dict.fromkeys(options.seeds or range(5)))
+    arms = list(dict.fromkeys(options.arms or ARMS))
     jobs = []
-    for task in dict.fromkeys(options.tasks):
-        reduced = {} if options.full or options.recipe != 'paper' else reduced_budget(task)
-        values = {**reduced, **overrides}
-        seeds, arms = dict.fromkeys(options.seeds), dict.fromkeys(options.arms)
-        jobs += list_jobs([task], list(arms), list(seeds), options.recipe, values, options.output)
-    for job in jobs:
-        job.check_configuration()
+    for task in dict.fromkeys(options.tasks or ['FetchReach']):
+        reduced = {} if options.full or recipe != 'paper' else reduced_budget(task)
+        jobs += paper_jobs([task], arms, seeds, recipe, {**reduced, **overrides}, output)
     return jobs
+
+
+def _best(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
+    # A job collects and learns at the same time, in a thread each.
+    threads = {'simulation_threads': 1, 'torch_threads': 1}
+    seeds = list(dict.fromkeys(options.seeds or [0]))
+    tasks = options.tasks or list(TASKS)
+    return best_jobs(tasks, seeds, {**threads, **overrides}, _output(options))
+
+
+def _output(options: argparse.Namespace) -> Path:
+    default = Path('runs') / ('benchmark' if options.study == 'paper' else 'best')
+    return Path(options.output or default)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -122,68 +149,42 @@ def _run(options: argparse.Namespace, command: str) -> int:
     except (ValueError, TypeError) as error:
         raise UsageError(str(error)) from None
     try:
-        whole = (_run_on_ray if options.ray else _run_in_turn)(jobs, command)
-        return EXIT_SUCCESS if whole else EXIT_FAILURE
-    except JobError as error:
-        raise CommandError(str(error)) from None
+        whole = _run_where_asked(options, jobs, command)
     finally:
         _report(options, jobs, command)
+    return EXIT_SUCCESS if whole else EXIT_FAILURE
+
+
+def _run_where_asked(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> bool:
+    if options.ray:
+        return run_jobs(jobs, Ray(command))
+    cores = len(os.sched_getaffinity(0))
+    limit = options.jobs or (1 if options.study == 'paper' else cores)
+    if limit == 1:
+        return run_jobs(jobs, ThisProcess(command))
+    with Processes(limit, command) as processes:
+        return run_jobs(jobs, processes)
 
 
 def _report(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> None:
-    """Draws and prints what is finished, and says what is not."""
+    """Draws, prints and ships what is finished, and says what is not."""
     finished = [job for job in jobs if job.is_finished]
+    report = options.report or _output(options)
     if finished:
-        write_report(finished, options.report or options.output, command)
+        write_report(finished, report, command)
+    if options.study == 'best':
+        actors = options.actors or _output(options) / 'actors'
+        _ship(finished, actors, options.episodes or 2000)
+        if actors.is_dir():
+            (report / ACTORS_TABLE).write_text(actors_table(actors) + '\n')
     if len(finished) < len(jobs):
         print(f'{len(finished)} of {len(jobs)} jobs are finished; the same command goes on')
 
 
-def _run_in_turn(jobs: Sequence[Job], command: str) -> bool:
-    """Runs what is not finished; whether all is now."""
-    whole = True
-    for number, job in enumerate(jobs, 1):
-        if job.is_finished:
-            continue
-        print(f'job {number} of {len(jobs)}: {job.name}', flush=True)
-        try:
-            if not run_job(job, command):
-                # The trainer took the signal and finished its cycle.
-                raise KeyboardInterrupt
-        except JobTakenError as error:
-            print(error)
-            whole = False
-    return whole
-
-
-def _run_on_ray(jobs: Sequence[Job], command: str) -> bool:
-    """Gives every job that is not finished to Ray; folders must lie where all its machines see."""
-    import ray
-
-    ray.init(ignore_reinit_error=True, log_to_driver=True)
-    remote = ray.remote(max_retries=0)(run_job)
-    waiting = {}
+def _ship(jobs: Sequence[Job], actors: Path, episodes: int) -> None:
+    """Evaluates best actors that were not evaluated before, and keeps the better ones."""
     for job in jobs:
-        if not job.is_finished:
-            config = job.config
-            cores = max(config.simulation_threads + config.torch_threads, 1)
-            waiting[remote.options(num_cpus=cores).remote(_with_absolute_folder(job), command)] = (
-                job
-            )
-    whole = True
-    while waiting:
-        (done, *_), _ = ray.wait(list(waiting))
-        job = waiting.pop(done)
-        try:
-            whole &= bool(ray.get(done))
-        except ray.exceptions.RayTaskError as error:
-            if isinstance(error.cause, JobTakenError):
-                whole = False
-                continue
-            raise JobError(f'{job.name}: {error.cause}') from None
-        print(f'{job.name} is finished; {len(waiting)} to go', flush=True)
-    return whole
-
-
-def _with_absolute_folder(job: Job) -> Job:
-    return Job(job.arm, job.config, job.folder.resolve())
+        if not (job.folder / BEST_FILE).is_file():
+            complain(_NAME, f'{job.name} has no best actor: no evaluation was whole')
+            continue
+        ship(job.folder, actors, episodes=episodes)

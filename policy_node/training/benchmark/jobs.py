@@ -1,23 +1,29 @@
-"""The jobs of a benchmark: task x arm x seed, each a `train_her` run in a folder of its own."""
+"""The jobs of a benchmark, each a training run in a folder of its own."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from msgs_spec.command_line import CommandError
-from policy_node.training.learning.config import TrainConfig, config_from_dict, recipe_config
+from policy_node.training.learning.config import TrainConfig, config_from_dict
 from policy_node.training.learning.run import RunTakenError, train_run
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.training_state import read_state
 
 PROGRESS_FILE = 'progress.csv'
-# What may differ between two parts of a job without another result to be expected.
-_SPEED_FIELDS = ('simulation_threads', 'torch_threads', 'checkpoint_seconds', 'device')
+# What may differ between two parts of a job without another result to be expected; where a run
+# started from is decided once, and its path depends on the working directory.
+_MAY_DIFFER = (
+    'simulation_threads',
+    'torch_threads',
+    'checkpoint_seconds',
+    'kept_transitions',
+    'device',
+    'init_from',
+)
 
 
 class JobError(RuntimeError):
@@ -56,6 +62,9 @@ ARMS = {
 }
 
 
+BEST_ARM = Arm('best', 'DDPG+HER, best recipe', 'sparse', True)
+
+
 @dataclass(frozen=True, slots=True)
 class Job:
     """One training run.
@@ -64,11 +73,13 @@ class Job:
         arm: What is compared.
         config: The whole configuration.
         folder: Output of `train_her`.
+        after: The job whose networks it starts from; None starts from nothing.
     """
 
     arm: Arm
     config: TrainConfig
     folder: Path
+    after: Job | None = None
 
     @property
     def name(self) -> str:
@@ -79,6 +90,11 @@ class Job:
     def is_finished(self) -> bool:
         """Whether the budget is spent: the curve is whole."""
         return self.has_checkpoint and self.env_steps >= self.config.total_steps
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether what it starts from is there."""
+        return self.after is None or self.has_checkpoint or self.after.is_finished
 
     @property
     def has_checkpoint(self) -> bool:
@@ -105,48 +121,12 @@ class Job:
         differing = [
             f'{name} {value!r}, now {wanted[name]!r}'
             for name, value in dataclasses.asdict(stored).items()
-            if value != wanted[name] and name not in _SPEED_FIELDS
+            if value != wanted[name] and name not in _MAY_DIFFER
         ]
         if differing:
             raise ValueError(
                 f'{self.folder} holds a run with {"; ".join(differing)}: choose another --output'
             )
-
-
-def list_jobs(
-    tasks: Sequence[str],
-    arms: Sequence[str],
-    seeds: Sequence[int],
-    recipe: str,
-    overrides: dict[str, Any],
-    output: Path,
-) -> list[Job]:
-    """All jobs, seed by seed, so that an early stop leaves all arms with about as many seeds.
-
-    Args:
-        tasks: Task names.
-        arms: Keys of `ARMS`.
-        seeds: Seeds.
-        recipe: The recipe of all jobs.
-        overrides: Fields of `TrainConfig` for all jobs; what the arms differ in is theirs.
-        output: Folder for all runs.
-
-    Raises:
-        ValueError: If a value is not allowed.
-    """
-    jobs = []
-    for task in tasks:
-        for seed in seeds:
-            for arm in (ARMS[name] for name in arms):
-                config = recipe_config(task, recipe, **{**overrides, 'seed': seed})
-                config = dataclasses.replace(
-                    config,
-                    reward_type=arm.reward_type,
-                    strategy=config.strategy if arm.hindsight else 'none',
-                    goals=config.goals if arm.hindsight else '',
-                )
-                jobs.append(Job(arm, config, output / task / arm.name / f'seed{seed}'))
-    return jobs
 
 
 def run_job(job: Job, command: str) -> bool:

@@ -65,3 +65,10 @@ BEST: dict[str, Published] = {
     'HandManipulatePenFull': Published('0.48', FIGURE, f'{_MRL}, 40M'),
 }
 """Best known by task, with any method and budget."""
+
+CEILINGS: dict[str, float] = {
+    'HandReach': 0.957,
+    'HandManipulatePenRotate': 0.925,
+    'HandManipulatePenFull': 0.926,
+}
+"""Share of goals that can be reached at all, where it was computed (docs/training.md, Ceilings)."""

@@ -20,8 +20,9 @@ import torch
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark import published
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
-from policy_node.training.benchmark.jobs import ARMS, list_jobs
+from policy_node.training.benchmark.jobs import ARMS
 from policy_node.training.benchmark.results import Curve, aggregate, read_curve, summarize
+from policy_node.training.benchmark.studies import paper_jobs
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.run_folder import LOCK_FILE
 from policy_node.training.learning.run_log import COLUMNS
@@ -57,7 +58,7 @@ def curve(*success: float) -> Curve:
 
 
 def test_jobs_come_seed_by_seed_with_all_arms(tmp_path: Path) -> None:
-    jobs = list_jobs(['FetchReach', 'FetchPush'], list(ARMS), [3, 4], 'paper', {}, tmp_path)
+    jobs = paper_jobs(['FetchReach', 'FetchPush'], list(ARMS), [3, 4], 'paper', {}, tmp_path)
     assert [job.name for job in jobs[:5]] == [
         'FetchReach/her_sparse/seed3',
         'FetchReach/her_dense/seed3',

@@ -1,0 +1,127 @@
+"""What the studies train: the paper's four arms, or the best recipe of every task."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from msgs_spec.tasks import TASKS
+from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, Job
+from policy_node.training.learning.config import recipe_config
+
+STUDIES = ('paper', 'best')
+
+# The long ones first. What XYZ has learnt of turning a block serves every other task of the block;
+# likewise the egg and the pen.
+BEST_ORDER = (
+    'HandManipulateBlockRotateXYZ',
+    'HandManipulateEggRotate',
+    'HandManipulatePenRotate',
+    'HandManipulateBlockFull',
+    'HandManipulateEggFull',
+    'HandManipulatePenFull',
+    'HandManipulateBlockRotateParallel',
+    'HandManipulateBlockRotateZ',
+    'FetchSlide',
+    'HandReach',
+    'FetchPickAndPlace',
+    'FetchPush',
+    'FetchReach',
+)
+STARTS_FROM = {
+    'HandManipulateBlockRotateParallel': 'HandManipulateBlockRotateXYZ',
+    'HandManipulateBlockRotateZ': 'HandManipulateBlockRotateXYZ',
+    'HandManipulateBlockFull': 'HandManipulateBlockRotateXYZ',
+    'HandManipulateEggFull': 'HandManipulateEggRotate',
+    'HandManipulatePenFull': 'HandManipulatePenRotate',
+}
+
+
+def reduced_budget(task: str) -> dict[str, Any]:
+    """What makes the `paper` recipe fit one machine; everything else stays as in the paper.
+
+    Two collections of 38 episodes are one, with twice the updates. Steps are 1.2 % (FetchReach) or
+    12 % of the paper's; batches 256 or 1024 instead of 4864; to learn in so few updates, targets
+    move after every 10 of them instead of 40.
+    """
+    small = task == 'FetchReach'
+    full = recipe_config(task, 'paper').total_steps
+    return {
+        'total_steps': full * 12 // (1000 if small else 100),
+        'num_envs': 76,
+        'updates_per_cycle': 80,
+        'batch_size': 256 if small else 1024,
+        'target_update_interval': 10,
+        'replay_transitions': 1_000_000,
+        'evaluate_every': 3_800 if small else 19_000,
+        # As many as there are simulations, so that none of them is cut short.
+        'evaluation_episodes': 76,
+    }
+
+
+def paper_jobs(
+    tasks: Sequence[str],
+    arms: Sequence[str],
+    seeds: Sequence[int],
+    recipe: str,
+    overrides: dict[str, Any],
+    output: Path,
+) -> list[Job]:
+    """Task x arm x seed, seed by seed, so that an early stop leaves all arms with as many seeds.
+
+    Args:
+        tasks: Task names.
+        arms: Keys of `ARMS`.
+        seeds: Seeds.
+        recipe: The recipe of all jobs.
+        overrides: Fields of `TrainConfig` for all jobs; what the arms differ in is theirs.
+        output: Folder for all runs.
+
+    Raises:
+        ValueError: If a value is not allowed.
+    """
+    jobs = []
+    for task in tasks:
+        for seed in seeds:
+            for arm in (ARMS[name] for name in arms):
+                config = recipe_config(task, recipe, **{**overrides, 'seed': seed})
+                config = dataclasses.replace(
+                    config,
+                    reward_type=arm.reward_type,
+                    strategy=config.strategy if arm.hindsight else 'none',
+                    goals=config.goals if arm.hindsight else '',
+                )
+                jobs.append(Job(arm, config, output / task / arm.name / f'seed{seed}'))
+    return jobs
+
+
+def best_jobs(
+    tasks: Sequence[str], seeds: Sequence[int], overrides: dict[str, Any], output: Path
+) -> list[Job]:
+    """The best recipe of each task; some start from the networks of another that comes before.
+
+    A task whose predecessor is not among the tasks starts from nothing.
+
+    Args:
+        tasks: Task names.
+        seeds: Seeds.
+        overrides: Fields of `TrainConfig` for all jobs.
+        output: Folder for all runs.
+
+    Raises:
+        ValueError: If a value is not allowed.
+    """
+    jobs: dict[tuple[str, int], Job] = {}
+    for seed in seeds:
+        for task in (name for name in BEST_ORDER if name in tasks):
+            before = jobs.get((STARTS_FROM.get(task, ''), seed))
+            start = {'init_from': str(before.folder)} if before else {}
+            config = recipe_config(task, 'best', **{**overrides, **start, 'seed': seed})
+            folder = output / task / BEST_ARM.name / f'seed{seed}'
+            jobs[task, seed] = Job(BEST_ARM, config, folder, before)
+    return list(jobs.values())
+
+
+assert set(BEST_ORDER) == set(TASKS)

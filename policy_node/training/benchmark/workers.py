@@ -1,0 +1,212 @@
+"""Where jobs run: in this process, in several of this machine, or on Ray; and in which order."""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from enum import Enum
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol, Self
+
+from msgs_spec.command_line import EXIT_FAILURE, EXIT_SUCCESS, complain
+from policy_node.training.benchmark.jobs import Job, JobError, JobTakenError, run_job
+
+LOG_FILE = 'log.txt'
+_SET_PARENT_DEATH_SIGNAL = 1
+
+
+class Outcome(Enum):
+    """What became of a job."""
+
+    FINISHED = EXIT_SUCCESS
+    FAILED = EXIT_FAILURE
+    STOPPED = 3
+    TAKEN = 4
+
+
+class Place(Protocol):
+    """Where jobs run."""
+
+    limit: int
+    """Most jobs at once."""
+
+    def start(self, job: Job) -> None:
+        """Starts a job; it may be over when this returns."""
+        ...
+
+    def wait(self) -> tuple[Job, Outcome]:
+        """Waits until one of the started jobs is over."""
+        ...
+
+
+def run_jobs(jobs: Sequence[Job], place: Place) -> bool:
+    """Runs what is not finished, each job after the one it starts from; whether all is now.
+
+    Raises:
+        KeyboardInterrupt: If a signal stopped a job; nothing else is started then.
+    """
+    waiting = [job for job in jobs if not job.is_finished]
+    numbers = {job.name: number for number, job in enumerate(jobs, 1)}
+    running, stopped, whole = 0, False, True
+    while True:
+        for job in [job for job in waiting if job.is_ready and not stopped]:
+            if running < place.limit:
+                print(f'job {numbers[job.name]} of {len(jobs)}: {job.name}', flush=True)
+                waiting.remove(job)
+                place.start(job)
+                running += 1
+        if running == 0:
+            break
+        job, outcome = place.wait()
+        running -= 1
+        whole &= outcome is Outcome.FINISHED
+        stopped |= outcome is Outcome.STOPPED
+        if outcome is Outcome.FINISHED:
+            left = sum(not other.is_finished for other in jobs)
+            print(f'{job.name} is finished; {left} to go', flush=True)
+    if stopped:
+        raise KeyboardInterrupt
+    return whole and not waiting
+
+
+def attempt(job: Job, command: str) -> Outcome:
+    """Runs a job in this process and says what goes wrong."""
+    try:
+        return Outcome.FINISHED if run_job(job, command) else Outcome.STOPPED
+    except JobTakenError as error:
+        print(error, flush=True)
+        return Outcome.TAKEN
+    except JobError as error:
+        complain('benchmark', error)
+        return Outcome.FAILED
+
+
+class ThisProcess:
+    """One job after the other, here."""
+
+    def __init__(self, command: str) -> None:
+        self.limit = 1
+        self._command = command
+        self._over: list[tuple[Job, Outcome]] = []
+
+    def start(self, job: Job) -> None:
+        """Runs the job."""
+        self._over.append((job, attempt(job, self._command)))
+
+    def wait(self) -> tuple[Job, Outcome]:
+        """The job that ran last."""
+        return self._over.pop()
+
+
+class Processes:
+    """Several jobs at once, each in a process of its own that prints into `log.txt` of its run.
+
+    Ctrl-C and SIGTERM reach them as SIGTERM, once: they finish their cycle and keep their state. So
+    they do if this process is killed.
+    """
+
+    def __init__(self, limit: int, command: str) -> None:
+        self.limit = limit
+        self._command = command
+        self._running: dict[int, tuple[Job, BaseProcess]] = {}
+        self._stopping = False
+        self._handlers: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._handlers[number] = signal.signal(number, self._stop)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for _, process in self._running.values():
+            process.terminate()
+            process.join()
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        if not self._stopping:
+            complain('benchmark', 'stopping; jobs finish their cycle and keep their state')
+            self._stopping = True
+            for _, process in self._running.values():
+                process.terminate()
+
+    def start(self, job: Job) -> None:
+        """Starts a process for the job."""
+        context = multiprocessing.get_context('spawn')
+        process = context.Process(target=_work, args=(job, self._command))
+        process.start()
+        self._running[process.sentinel] = job, process
+        if self._stopping:
+            process.terminate()
+
+    def wait(self) -> tuple[Job, Outcome]:
+        """Waits for one of the processes."""
+        sentinel = next(iter(wait(list(self._running))))
+        assert isinstance(sentinel, int)
+        job, process = self._running.pop(sentinel)
+        process.join()
+        # By the signal itself where it came before the trainer listened.
+        codes = {outcome.value: outcome for outcome in Outcome}
+        codes[-signal.SIGTERM] = Outcome.STOPPED
+        outcome = codes.get(process.exitcode or 0, Outcome.FAILED)
+        if outcome is Outcome.FAILED:
+            complain('benchmark', f'{job.name} failed; see {job.folder / LOG_FILE}')
+        elif outcome is Outcome.TAKEN:
+            print(f'{job.name} is being run by another process', flush=True)
+        return job, outcome
+
+
+def _work(job: Job, command: str) -> None:
+    """The body of a process of `Processes`."""
+    # Out of the terminal's group, so that Ctrl-C does not come twice.
+    os.setsid()
+    if sys.platform == 'linux':
+        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
+    job.folder.mkdir(parents=True, exist_ok=True)
+    with (job.folder / LOG_FILE).open('a') as log:
+        os.dup2(log.fileno(), sys.stdout.fileno())
+        os.dup2(log.fileno(), sys.stderr.fileno())
+    sys.exit(attempt(job, command).value)
+
+
+class Ray:
+    """As many jobs as the cluster has cores for; folders must lie where all its machines see."""
+
+    def __init__(self, command: str) -> None:
+        import ray
+
+        ray.init(ignore_reinit_error=True, log_to_driver=True)
+        self._ray = ray
+        self.limit = sys.maxsize
+        self._command = command
+        self._attempt = ray.remote(max_retries=0)(attempt)
+        self._running: dict[Any, Job] = {}
+
+    def start(self, job: Job) -> None:
+        """Gives the job to the cluster."""
+        cores = max(job.config.simulation_threads, job.config.torch_threads, 1)
+        # Paths mean the same from every working directory.
+        start = job.config.init_from and str(Path(job.config.init_from).resolve())
+        config = dataclasses.replace(job.config, init_from=start)
+        absolute = dataclasses.replace(job, config=config, folder=job.folder.resolve())
+        self._running[self._attempt.options(num_cpus=cores).remote(absolute, self._command)] = job
+
+    def wait(self) -> tuple[Job, Outcome]:
+        """Waits for one of the jobs."""
+        (done, *_), _ = self._ray.wait(list(self._running))
+        job = self._running.pop(done)
+        try:
+            return job, self._ray.get(done)
+        except self._ray.exceptions.RayError as error:
+            complain('benchmark', f'{job.name}: {error}')
+            return job, Outcome.FAILED

@@ -1,0 +1,164 @@
+"""The study of the best recipes: chained, several at once, stopped, resumed and shipped."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from msgs_spec.tasks import TASKS
+from policy_node.policies import checkpoint
+from policy_node.training.benchmark.actors_table import steps_behind
+from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
+from policy_node.training.benchmark.jobs import Job
+from policy_node.training.benchmark.studies import STARTS_FROM
+from policy_node.training.benchmark.workers import LOG_FILE, Outcome, run_jobs
+from policy_node.training.learning.config import recipe_config
+from policy_node.training.learning.run_log import read_progress
+
+torch.set_num_threads(1)
+
+TINY = [
+    *['--study', 'best', '--set', 'num_envs=2', '--set', 'updates_per_cycle=2'],
+    *['--set', 'batch_size=32', '--set', 'evaluation_episodes=2', '--set', 'evaluate_every=1000'],
+    *['--set', 'hidden_sizes=32,32', '--set', 'replay_transitions=4000'],
+]
+EGGS = ['HandManipulateEggRotate', 'HandManipulateEggFull']
+
+
+def jobs_of(*arguments: str) -> list[Job]:
+    return jobs_from_arguments(parse_arguments(['--study', 'best', *arguments]))
+
+
+def test_every_task_is_trained_with_its_best_recipe_after_what_it_starts_from(
+    tmp_path: Path,
+) -> None:
+    jobs = jobs_of('--output', str(tmp_path))
+    assert {job.config.task for job in jobs} == set(TASKS) and len(jobs) == len(TASKS)
+    for number, job in enumerate(jobs):
+        start = STARTS_FROM.get(job.config.task)
+        chained = {'init_from': str(tmp_path / start / 'best' / 'seed0')} if start else {}
+        threads = {'simulation_threads': 1, 'torch_threads': 1}
+        assert job.config == recipe_config(job.config.task, 'best', **threads, **chained)
+        assert job.is_ready == (start is None)
+        if start:
+            assert job.after in jobs[:number] and job.after.config.task == start
+
+
+def test_a_task_alone_starts_from_nothing(tmp_path: Path) -> None:
+    (job,) = jobs_of('--tasks', 'HandManipulateEggFull', '--output', str(tmp_path))
+    assert job.after is None and job.config.init_from == ''
+
+
+class Recorder:
+    """A place where jobs take no time; some of them fail."""
+
+    def __init__(self, limit: int, failing: tuple[str, ...] = ()) -> None:
+        self.limit, self.failing = limit, failing
+        self.running: list[Job] = []
+        self.order: list[str] = []
+        self.most = 0
+
+    def start(self, job: Job) -> None:
+        self.order.append(job.config.task)
+        self.running.append(job)
+        self.most = max(self.most, len(self.running))
+
+    def wait(self) -> tuple[Job, Outcome]:
+        job = self.running.pop(0)
+        if job.config.task in self.failing:
+            return job, Outcome.FAILED
+        job.folder.mkdir(parents=True)
+        (job.folder / 'training_state.safetensors').touch()
+        steps = job.config.total_steps
+        (job.folder / 'progress.csv').write_text(f'seconds,env_steps\n1,{steps}\n')
+        return job, Outcome.FINISHED
+
+
+def test_jobs_run_as_many_at_once_as_allowed_and_after_what_they_need(tmp_path: Path) -> None:
+    place = Recorder(limit=3)
+    assert run_jobs(jobs_of('--output', str(tmp_path)), place)
+    assert place.most == 3 and sorted(place.order) == sorted(TASKS)
+    for task, start in STARTS_FROM.items():
+        assert place.order.index(start) < place.order.index(task)
+
+
+def test_a_job_that_fails_stops_only_what_starts_from_it(tmp_path: Path) -> None:
+    place = Recorder(limit=2, failing=('HandManipulateBlockRotateXYZ',))
+    jobs = jobs_of('--output', str(tmp_path))
+    assert not run_jobs(jobs, place)
+    lost = {task for task, start in STARTS_FROM.items() if start == place.failing[0]}
+    assert set(place.order) == set(TASKS) - lost
+    again = Recorder(limit=2)
+    assert run_jobs(jobs, again)
+    assert set(again.order) == lost | set(place.failing)
+
+
+# Nine processes that load torch: on a busy machine that takes its time.
+@pytest.mark.timeout(900)
+def test_two_at_once_are_stopped_resumed_and_shipped(tmp_path: Path) -> None:
+    arguments = [*TINY, '--tasks', *EGGS, 'FetchReach', '--jobs', '2', '--steps', '2000']
+    arguments += ['--episodes', '4', '--output', str(tmp_path)]
+    module = [sys.executable, '-m', 'policy_node.training.benchmark', *arguments]
+    first, second, other = (tmp_path / task / 'best' / 'seed0' for task in (*EGGS, 'FetchReach'))
+    process = subprocess.Popen(module, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 300
+        logs = [folder / 'progress.csv' for folder in (first, other)]
+        while not all(log.is_file() and log.read_text().count('\n') >= 2 for log in logs):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        printed, said = process.communicate(timeout=200)
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == 130, said
+    assert said.count('stopping; jobs finish their cycle') == 1
+    assert not second.exists(), 'its predecessor was not finished'
+    stopped = [checkpoint.read_info(f / 'latest.safetensors').env_steps for f in (first, other)]
+    assert stopped[0] < 2000 and 'jobs are finished; the same command goes on' in printed
+    assert 'stopped by SIGTERM' not in said and (first / LOG_FILE).is_file()
+
+    assert main(arguments) == 0
+    for folder in (first, second, other):
+        assert read_progress(folder / 'progress.csv')[-1]['env_steps'] == 2000
+    report = json.loads((tmp_path / 'actors' / 'HandManipulateEggFull.json').read_text())
+    assert report['init_from']['task'] == EGGS[0] and steps_behind(report) > 2000
+    assert report['command'].startswith('benchmark --study best')
+    names = {f'{task}{end}' for task in (*EGGS, 'FetchReach') for end in ('.json', '.png')}
+    assert names <= {path.name for path in (tmp_path / 'actors').iterdir()}
+    table = (tmp_path / 'actors.md').read_text()
+    assert all(f'| {task} | **' in table for task in (*EGGS, 'FetchReach'))
+    assert (tmp_path / 'benchmark.png').is_file()
+
+    shutil.rmtree(tmp_path / 'actors')
+    before = {path: path.read_bytes() for path in tmp_path.rglob('progress.csv')}
+    assert main(arguments) == 0
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob('progress.csv')}
+    assert (tmp_path / 'actors' / 'FetchReach.training.safetensors').is_file()
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--study', 'best', '--arms', 'her_sparse'], '--arms belongs to --study paper'),
+        (['--study', 'best', '--full'], '--full belongs to --study paper'),
+        (['--episodes', '10'], '--episodes belongs to --study best'),
+        (['--jobs', '0'], '--jobs 0; allowed: 1 or more'),
+        (['--set', 'init_from=FetchReach'], '--set init_from is not possible'),
+    ],
+)
+def test_bad_usage_is_one_line_and_exit_status_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main([*arguments, '--output', str(tmp_path / 'runs')]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
