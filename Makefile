@@ -98,7 +98,8 @@ bench-rate: env
 torture: env
 	$(BIN)/python -m pytest --hostile-messages 100000 --soak-seconds 3600 --timeout 0 \
 		test/fetch_hand_sim/sim_node/test_receivers.py \
-		test/policy_node/node/test_responder.py test/nodes/test_nodes_hostile.py
+		test/policy_node/node/test_responder.py test/policy_node/policies/test_hostile_files.py \
+		test/nodes/test_nodes_hostile.py
 	EPISODE_KILLS=50 EPISODE_LIFE=3 EPISODE_MUTATIONS=10000 EPISODE_CRAFTED=2000 $(BIN)/python -m pytest --timeout 0 -s \
 		test/fetch_hand_sim/episode_log/test_episode_endings.py \
 		test/fetch_hand_sim/episode_log/test_episode_untrusted.py

@@ -1,0 +1,110 @@
+"""Damaged and crafted files of policies: one line each, at no more than their size."""
+
+from __future__ import annotations
+
+import json
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from test_loading import fresh_actor
+
+from policy_node.policies.export_actor import export
+from policy_node.policies.loading import load_policy
+
+# What stands in the metadata of files by people who mean harm, or cannot count.
+VALUES = [
+    *('null', 'true', '-1', '0', '1e999', 'NaN', '""', '[]', '{}', '[[]]', '[-1]', '[null]'),
+    *('[1e999]', '[40000, 40000]', '"FetchPush"', '"\\u001b[31m"', '[' * 50_000, '9' * 5_000),
+    *('{"a": ' * 20_000, '"' + 'x' * 100_000 + '"', '[1.5]', '[true]', '12.5', '[["a", -1]]', ''),
+]
+
+
+@pytest.fixture(scope='module')
+def actor(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp('actor') / 'a.safetensors'
+    fresh_actor(path, 'FetchReach')
+    return path.read_bytes()
+
+
+def split(data: bytes) -> tuple[dict[str, dict[str, str]], bytes]:
+    """Header and arrays of a safetensors file."""
+    end = 8 + int.from_bytes(data[:8], 'little')
+    return json.loads(data[8:end]), data[end:]
+
+
+def joined(header: dict[str, dict[str, str]], arrays: bytes) -> bytes:
+    text = json.dumps(header).encode()
+    return len(text).to_bytes(8, 'little') + text + arrays
+
+
+def damaged(data: bytes, generator: np.random.Generator) -> bytes:
+    """Bytes changed, most of them in the header, a piece lost or doubled."""
+    changed = bytearray(data)
+    for _ in range(generator.integers(1, 8)):
+        within = len(data) if generator.random() < 0.3 else min(len(data), 3000)
+        changed[generator.integers(within)] = generator.integers(256)
+    cut = int(generator.integers(len(data)))
+    kind = generator.random()
+    if kind < 0.1:
+        return bytes(changed[:cut])
+    return bytes(changed + changed[cut:]) if kind < 0.2 else bytes(changed)
+
+
+def crafted(data: bytes, generator: np.random.Generator) -> bytes:
+    """A whole file whose header says something else."""
+    header, arrays = split(data)
+    metadata = header['__metadata__']
+    names = [name for name in metadata if name not in ('format', 'format_version')]
+    for _ in range(generator.integers(1, 3)):
+        metadata[str(generator.choice(names))] = VALUES[generator.integers(len(VALUES))]
+    return joined(header, arrays)
+
+
+def outcome(path: Path) -> str:
+    """`loads`, or `refused` in one line that is safe to print."""
+    began = time.perf_counter()
+    try:
+        load_policy(path)
+    except ValueError as error:
+        line = str(error)
+        assert line.isprintable() and len(line) < 1000, line[:2000]
+        return 'refused'
+    finally:
+        assert time.perf_counter() - began < 5.0
+    return 'loads'
+
+
+@pytest.mark.parametrize('change', [damaged, crafted])
+def test_damaged_and_crafted_checkpoints(change, actor, tmp_path, hostile_count) -> None:
+    generator = np.random.default_rng(6)
+    path = tmp_path / 'a.safetensors'
+    count = hostile_count // 4
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    outcomes = []
+    for _ in range(count):
+        path.write_bytes(change(actor, generator))
+        outcomes.append(outcome(path))
+    assert outcomes.count('refused') > count / 3
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert grown < 100_000, f'{grown} KiB more'
+
+
+def test_damaged_and_crafted_onnx_files(actor, tmp_path, hostile_count) -> None:
+    generator = np.random.default_rng(7)
+    source, path = tmp_path / 'a.safetensors', tmp_path / 'a.onnx'
+    source.write_bytes(actor)
+    export(source, path)
+    data = path.read_bytes()
+    for index in range(hostile_count // 500):
+        if index % 2:
+            path.write_bytes(damaged(data, generator))
+        else:
+            model = onnx.load_from_string(data)
+            pair = model.metadata_props[generator.integers(len(model.metadata_props))]
+            pair.value = VALUES[generator.integers(len(VALUES))]
+            path.write_bytes(model.SerializeToString())
+        outcome(path)
