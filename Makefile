@@ -9,7 +9,7 @@ EPISODES ?= 5
 SECONDS ?= 60
 
 PACKAGES := msgs_spec fetch_hand_sim policy_node
-PYTHON_FILES := $(PACKAGES) bench test tools setup.py
+PYTHON_FILES := $(PACKAGES) bench examples test tools setup.py
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.complete
 

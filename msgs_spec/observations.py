@@ -24,6 +24,8 @@ Readings = Mapping[str, Array]
 
 def observed_topics(task: TaskSpec) -> tuple[str, ...]:
     """Names of the topics from which the observation of a task is made."""
+    if task.formulas is not None:
+        return task.formulas.topics
     if task.goal is GoalKind.FINGERTIPS:
         return ('joint_states', 'fingertip_poses')
     if task.goal is GoalKind.POSE:
@@ -43,6 +45,8 @@ def observation(task: TaskSpec, readings: Readings, tick_duration: float) -> Arr
     Returns:
         (..., task.observation_size).
     """
+    if task.formulas is not None:
+        return task.formulas.observation(readings, tick_duration)
     if task.robot.has_gripper_command:
         return np.concatenate(_fetch_parts(task, readings, tick_duration), axis=-1)
     position, velocity, _ = np.split(readings['joint_states'], 3, axis=-1)
@@ -89,6 +93,8 @@ def _fingertip_positions(readings: Readings) -> Array:
 
 def achieved_goal(task: TaskSpec, readings: Readings) -> Array:
     """Achieved goals (..., task.goal.size) from what the sensors say, a fresh array."""
+    if task.formulas is not None:
+        return task.formulas.achieved_goal(readings)
     if task.goal is GoalKind.FINGERTIPS:
         return _fingertip_positions(readings)
     if task.goal is GoalKind.POSE:

@@ -1,11 +1,22 @@
-"""The thirteen tasks of Plappert et al. 2018 as data: goals, observations, lengths, thresholds."""
+"""The tasks as data: goals, observations, lengths, thresholds.
+
+Thirteen are those of Plappert et al. 2018; other packages add theirs (`foreign_tasks.py`).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_spec.foreign_tasks import foreign_tasks
 from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, RobotSpec
+
+Array = NDArray[np.float64]
 
 # One physics substep, seconds, and the paper's 20 substeps per action (25 Hz).
 PHYSICS_TIMESTEP = 0.002
@@ -46,6 +57,24 @@ class VectorPart:
 
 
 @dataclass(frozen=True, slots=True)
+class TaskFormulas:
+    """How observation and achieved goal of a task follow from what its sensors say.
+
+    All take any leading batch shape and give fresh arrays. Readings are vectors by name of their
+    topic, as `topics` lays them out.
+
+    Attributes:
+        topics: Names of the topics they read.
+        observation: Readings and seconds of one control period -> (..., observation size).
+        achieved_goal: Readings -> (..., goal size).
+    """
+
+    topics: tuple[str, ...]
+    observation: Callable[[Mapping[str, Array], float], Array]
+    achieved_goal: Callable[[Mapping[str, Array]], Array]
+
+
+@dataclass(frozen=True, slots=True)
 class TaskSpec:
     """One task as policies and tools see it.
 
@@ -58,12 +87,13 @@ class TaskSpec:
         object_name: `object0` (Fetch), `object` (hand), or None where there is none.
         distance_threshold: Success within this distance, metres.
         rotation_threshold: Success within this rotation, radians; None where there is no rotation.
-        reference_id: The environment of Gymnasium-Robotics 1.4.2 that this task equals.
+        reference_id: The environment of Gymnasium-Robotics 1.4.2 that this task equals, or None.
         achieved_goal: Name of the part of the observation that is the achieved goal.
         position_counts: Whether the position of a pose goal counts (False for the Rotate tasks).
         ignores_z_rotation: Whether the rotation about the object's own z axis does not count (pen).
         object_symmetry: `cube`, or `revolution` for an object that is the same turned about its z
             axis or upside down; None where the goal is no pose.
+        formulas: Those of a task that is none of the thirteen; None for these.
     """
 
     name: str
@@ -74,11 +104,12 @@ class TaskSpec:
     object_name: str | None
     distance_threshold: float
     rotation_threshold: float | None
-    reference_id: str
+    reference_id: str | None
     achieved_goal: str
     position_counts: bool = True
     ignores_z_rotation: bool = False
     object_symmetry: str | None = None
+    formulas: TaskFormulas | None = None
 
     @property
     def achieved_goal_start(self) -> int:
@@ -245,3 +276,26 @@ def substeps_per_tick(control_hz: float, timestep: float = PHYSICS_TIMESTEP) -> 
         f'control_hz {control_hz:g} is not a whole number of {timestep * 1e3:g} ms substeps; '
         f'allowed: 500/n Hz for n = {smallest} ... {largest} (12.5 ... 500), nearest: {nearest}'
     )
+
+
+def _accept(name: str, spec: Any) -> TaskSpec:
+    """Returns what another package calls a task, if it is one."""
+    if not isinstance(spec, TaskSpec):
+        raise ValueError(f'no TaskSpec but {type(spec).__name__}')
+    if spec.name != name:
+        raise ValueError(f'the task calls itself {spec.name!r}')
+    if name in TASKS:
+        raise ValueError('one of the thirteen has this name')
+    if spec.formulas is None:
+        raise ValueError('it has no formulas')
+    achieved = [part.size for part in spec.observation if part.name == spec.achieved_goal]
+    if achieved != [spec.goal.size]:
+        raise ValueError(
+            f'achieved_goal {spec.achieved_goal!r} must be the name of one part of the observation '
+            f'with {spec.goal.size} values'
+        )
+    return spec
+
+
+# Their packages import this module: all that they need of it is above.
+TASKS.update(foreign_tasks(_accept))

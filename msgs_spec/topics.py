@@ -133,7 +133,7 @@ def _body_topics(task: TaskSpec) -> list[TopicSpec]:
             TopicSpec('object_pose', pose, 'Centre of the object.', _POSE, frame=WORLD),
             TopicSpec('object_twist', twist, 'The same, in world axes.', _TWIST, frame=WORLD),
         ]
-    if task.goal is GoalKind.POSE:
+    if task.goal is GoalKind.POSE and task.has_object:
         joint = f'{task.object_name}:joint'
         text = 'Free joint of the object as MuJoCo holds it: angular velocity in the object frame.'
         dof = 'sensor_msgs/msg/MultiDOFJointState'

@@ -18,11 +18,13 @@ _LOGGER = logging.getLogger(__name__)
 
 
 def asset_path(relative: str) -> Path:
-    """Returns the path of an asset, for example `fetch/reach.xml`.
+    """Returns the path of an asset, for example `fetch/reach.xml`; an absolute path stays.
 
     Raises:
         FileNotFoundError: If `gymnasium-robotics` or the asset is missing.
     """
+    if Path(relative).is_absolute():
+        return Path(relative)
     spec = util.find_spec('gymnasium_robotics')
     if spec is None or spec.origin is None:
         raise FileNotFoundError(

@@ -144,7 +144,7 @@ class Scene:
     @property
     def has_ghost(self) -> bool:
         """Whether the goal is shown as a ghost of the object."""
-        return self.spec.goal is GoalKind.POSE
+        return self.spec.goal is GoalKind.POSE and self.spec.has_object
 
     def show(self, frame: Frame) -> None:
         """Poses robot, object and ghost."""
@@ -162,7 +162,7 @@ class Scene:
             trail: Positions (3,) of the object or gripper before, the oldest first.
         """
         color = REACHED if frame.is_success else MISSED
-        if self.spec.goal is GoalKind.POSE:
+        if self.has_ghost:
             shapes = self._shell(frame, color)
         elif self.spec.goal is GoalKind.FINGERTIPS:
             shapes = _fingertip_markers(frame, color)
@@ -207,11 +207,11 @@ def _sphere(position: Array, radius: float, color: Color) -> Marker:
 
 def _point_markers(spec: TaskSpec, frame: Frame, color: Color) -> list[Marker]:
     halo = (*color[:3], _HALO_OPACITY)
-    goal = frame.desired_goal
+    goal, achieved = frame.desired_goal[:3], frame.achieved_goal[:3]
     shapes = [_sphere(goal, 0.02, color), _sphere(goal, spec.distance_threshold, halo)]
     if not spec.has_object:
-        shapes.append(_sphere(frame.achieved_goal, 0.012, _ACHIEVED))
-    return [*shapes, *_line([frame.achieved_goal, goal], 0.002, _LINK)]
+        shapes.append(_sphere(achieved, 0.012, _ACHIEVED))
+    return [*shapes, *_line([achieved, goal], 0.002, _LINK)]
 
 
 def _fingertip_markers(frame: Frame, color: Color) -> list[Marker]:

@@ -76,6 +76,9 @@ def _run(options: argparse.Namespace) -> int:
     loaded = load_chosen_policy(options)
     spec = task_spec(loaded.task)
     seeds = range(options.first_seed, options.first_seed + options.episodes)
+    if spec.reference_id is None:
+        print(f'evaluate_reference: {spec.name} is no task of Gymnasium-Robotics', file=sys.stderr)
+        return 2
     successes = success_in_reference(loaded.policy, spec.reference_id, spec.episode_ticks, seeds)
     lower, upper = wilson_interval(successes, options.episodes)
     result = {

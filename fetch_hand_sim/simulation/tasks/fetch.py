@@ -117,11 +117,20 @@ class FetchTask(Task):
         config: In what they differ.
         gripper_start: (3,) where the gripper is at a reset, m, world.
         object_height: Where the object's centre is then, m; only with an object.
+        gripper_rotation: (N, 4) how the gripper is turned now, wxyz, live and read-only.
     """
 
-    def __init__(self, spec: TaskSpec, batch: BatchConfig) -> None:
-        """Lets the robot settle once and keeps that state as the start of every episode."""
-        self.config = FETCH_CONFIGS[spec.name]
+    def __init__(
+        self, spec: TaskSpec, batch: BatchConfig, config: FetchConfig | None = None
+    ) -> None:
+        """Lets the robot settle once and keeps that state as the start of every episode.
+
+        Args:
+            spec: The task.
+            batch: How many simulations, and how they are stepped.
+            config: In what it differs; None for those of the thirteen.
+        """
+        self.config = config or FETCH_CONFIGS[spec.name]
         mjcf = load_spec(self.config.asset)
         exclude_body_pairs(mjcf, FETCH_NEVER_TOUCHING)
         model = mjcf.compile()
@@ -140,7 +149,7 @@ class FetchTask(Task):
         self._mocap_quat = self.batch.bind('mocap_quat')
         gripper_body = model.body('robot0:gripper_link').id
         self._gripper_xpos = self.output('xpos')[:, gripper_body]
-        self._gripper_xquat = self.output('xquat')[:, gripper_body]
+        self.gripper_rotation = self.output('xquat')[:, gripper_body]
         self.batch.state[:] = self.start_state
 
     def _settle(self, model: mujoco.MjModel, spec: TaskSpec) -> None:
@@ -209,8 +218,12 @@ class FetchTask(Task):
         if self.model.nu:
             fingers = 0.0 if self.config.block_gripper else commands[:, 3:]
             self._ctrl[:] = self._finger_controls(fingers)
+        self.move_gripper(offset, self.gripper_rotation + _GRIPPER_ROTATION)
+
+    def move_gripper(self, offset: NDArray[np.floating], rotation: Array) -> None:
+        """Sets where the gripper is drawn to: (N, 3) m from where it is, (N, 4) quaternion wxyz."""
         self._mocap_pos[:, 0] = self._gripper_xpos + offset
-        self._mocap_quat[:, 0] = self._gripper_xquat + _GRIPPER_ROTATION
+        self._mocap_quat[:, 0] = rotation
 
     def resting_commands(self) -> Array:
         """Returns zeros: the gripper stays where it is, the fingers too."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
 from fetch_hand_sim.simulation.tasks.hand_reach import REACH_ASSET, HandReachTask
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, substeps_per_tick, task_spec
+from msgs_spec.foreign_tasks import foreign_simulation
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec, substeps_per_tick, task_spec
 
 
 def make_task(
@@ -27,18 +30,24 @@ def make_task(
         keeps_data: Whether each simulation keeps an `MjData` of its own.
 
     Raises:
-        ValueError: If the task is unknown or the rate is not a whole number of substeps.
+        ValueError: If the task is unknown, the rate is not a whole number of substeps, or the
+            package of a task that is none of the thirteen has no simulation of it.
     """
     spec = task_spec(name)
     batch = BatchConfig(num_envs, num_threads, substeps_per_tick(control_hz), keeps_data)
-    family: type[FetchTask] | type[HandReachTask] | type[HandManipulateTask]
+    task: Task = _family(spec)(spec, batch)
+    return task
+
+
+def _family(spec: TaskSpec) -> Any:
+    """The class that simulates a task."""
     if spec.name in FETCH_CONFIGS:
-        family = FetchTask
-    elif spec.name == 'HandReach':
-        family = HandReachTask
-    else:
-        family = HandManipulateTask
-    return family(spec, batch)
+        return FetchTask
+    if spec.name == 'HandReach':
+        return HandReachTask
+    if spec.name in MANIPULATE_CONFIGS:
+        return HandManipulateTask
+    return foreign_simulation(spec.name)
 
 
 def task_asset(name: str) -> str:
@@ -52,4 +61,4 @@ def task_asset(name: str) -> str:
         return FETCH_CONFIGS[spec.name].asset
     if spec.name in MANIPULATE_CONFIGS:
         return MANIPULATE_CONFIGS[spec.name].asset
-    return REACH_ASSET
+    return REACH_ASSET if spec.name == 'HandReach' else str(foreign_simulation(spec.name).ASSET)

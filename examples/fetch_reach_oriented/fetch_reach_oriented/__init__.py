@@ -1,0 +1,1 @@
+"""The Fetch arm brings its gripper to a point, turned as the goal says."""

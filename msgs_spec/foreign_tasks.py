@@ -1,0 +1,60 @@
+"""Tasks of other packages, named by entry points.
+
+In the group `fetch_hand_sim_tasks.specification` an entry point gives a `TaskSpec` of its own name,
+without importing MuJoCo; in the group `fetch_hand_sim_tasks.simulation` one of the same name gives
+the class that simulates it. A package that is broken costs one warning and its own task, no more.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, TypeVar
+
+SPECS = 'fetch_hand_sim_tasks.specification'
+SIMULATIONS = 'fetch_hand_sim_tasks.simulation'
+
+_Spec = TypeVar('_Spec')
+_LOGGER = logging.getLogger(__name__)
+
+
+def foreign_tasks(accept: Callable[[str, Any], _Spec]) -> dict[str, _Spec]:
+    """The tasks of other packages, by name.
+
+    Args:
+        accept: Returns what an entry point of a name gave, or raises a `ValueError` saying what is
+            wrong with it.
+    """
+    tasks: dict[str, _Spec] = {}
+    for entry_point in entry_points(group=SPECS):
+        name = entry_point.name
+        try:
+            if name in tasks:
+                raise ValueError('another package has a task of this name')
+            tasks[name] = accept(name, entry_point.load())
+        except Exception as error:  # whatever a package of somebody else does
+            _LOGGER.warning('task %s is left out: %s', name, _what_failed(entry_point, error))
+    return tasks
+
+
+def foreign_simulation(name: str) -> Any:
+    """The class that simulates a task of another package.
+
+    Raises:
+        ValueError: If no package has one, or it cannot be imported; the message is one line.
+    """
+    for entry_point in entry_points(group=SIMULATIONS, name=name):
+        try:
+            return entry_point.load()
+        except Exception as error:
+            raise ValueError(f'task {name}: {_what_failed(entry_point, error)}') from error
+    raise ValueError(
+        f'task {name} has no simulation: no installed package names one in the entry points '
+        f'{SIMULATIONS!r}'
+    )
+
+
+def _what_failed(entry_point: EntryPoint, error: Exception) -> str:
+    package = entry_point.dist.name if entry_point.dist is not None else 'a package'
+    return f'{package}: {entry_point.value}: {" ".join(str(error).split()) or type(error).__name__}'

@@ -1,0 +1,186 @@
+"""A fourteenth task from another package, from its entry points to a trained actor on the graph."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from test_nodes import episodes_in, finish
+
+from support import ROOT
+from support.graph import POLICY_NODE, SIM_NODE, ros_args
+from support.shell_lines import commands, shell_lines
+
+Start = Callable[..., subprocess.Popen[str]]
+EXAMPLE = ROOT / 'examples' / 'fetch_reach_oriented'
+TASK = 'FetchReachOriented'
+
+
+@pytest.fixture(scope='module')
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where pip installed the example."""
+    directory = tmp_path_factory.mktemp('site')
+    source = tmp_path_factory.mktemp('source') / EXAMPLE.name
+    # A copy: building writes beside the source.
+    subprocess.run(['cp', '-r', EXAMPLE, source], check=True)
+    options = ['--quiet', '--no-deps', '--no-build-isolation', '--no-index', '--target', directory]
+    subprocess.run([sys.executable, '-m', 'pip', 'install', *options, source], check=True)
+    return directory
+
+
+def environment(site: Path) -> dict[str, str]:
+    return os.environ | {'PYTHONPATH': os.pathsep.join([str(ROOT), str(site)])}
+
+
+def run(site: Path, *command: object) -> subprocess.CompletedProcess[str]:
+    words = [sys.executable, *(str(word) for word in command)]
+    return subprocess.run(words, env=environment(site), capture_output=True, text=True)
+
+
+def test_the_policys_side_reads_it_without_mujoco(site: Path) -> None:
+    code = (
+        'import sys, policy_node.node\n'
+        'from msgs_spec.tasks import TASKS, task_spec\n'
+        'from msgs_spec.topics import topics\n'
+        'print(list(TASKS)[-1], task_spec("FetchReachOriented").robot.action_size)\n'
+        'print(*(t.name for t in topics(TASKS["FetchReachOriented"]) if t.name.endswith("goal")))\n'
+        'assert "mujoco" not in sys.modules and "fetch_hand_sim" not in sys.modules\n'
+    )
+    result = run(site, '-c', code)
+    assert result.stdout.split('\n')[:2] == [
+        f'{TASK} 6',
+        'desired_goal achieved_goal set_goal',
+    ], result.stderr
+
+
+def test_the_pages_command_lines_are_understood(site: Path) -> None:
+    page = (ROOT / 'docs' / 'own_task.md').read_text()
+    lines = [words for line in shell_lines(page) for words in commands(line)]
+    (training,) = [words for words in lines if words[0] == 'train_her']
+    # What comes before `--help` is checked before it.
+    result = run(site, '-m', 'policy_node.training.train_her', *training[1:], '--help')
+    assert result.returncode == 0, result.stderr
+    (node,) = [words for words in lines if words[0] == 'sim_node']
+    assert node[1:] == ros_args(task=TASK)
+
+
+GYMNASIUM = """
+import warnings
+warnings.simplefilter('ignore')
+import gymnasium, numpy as np
+from gymnasium.utils.env_checker import check_env
+from msgs_spec.rotations import quaternion_multiply
+
+name = 'fetch_hand_sim:fetch_hand_sim/FetchReachOriented-v0'
+env = gymnasium.make(name)
+check_env(env.unwrapped, skip_render_check=True)
+batch = gymnasium.make_vec(name, num_envs=4)
+rows, _ = batch.reset(seed=3)
+reached = 0.0
+for tick in range(50):
+    achieved, desired = rows['achieved_goal'], rows['desired_goal']
+    inverse = achieved[:, 3:] * [1, -1, -1, -1]
+    turn = 2.0 * quaternion_multiply(desired[:, 3:], inverse)[:, 1:]
+    action = np.concatenate([10 * (desired - achieved)[:, :3], 2.5 * turn], axis=1)
+    rows, reward, _, _, info = batch.step(action.astype(np.float32))
+print(info['is_success'].sum(), reward.tolist())
+single, _ = env.reset(seed=3)
+first, _ = batch.reset(seed=3)
+print(all((single[key] == first[key][0]).all() for key in single))
+"""
+
+
+def test_gymnasium_the_batch_and_a_controller_of_three_lines(site: Path) -> None:
+    result = run(site, '-c', GYMNASIUM)
+    assert result.stdout.split('\n')[:2] == ['4.0 [0.0, 0.0, 0.0, 0.0]', 'True'], result.stderr
+
+
+def test_it_is_trained_run_by_the_nodes_logged_checked_and_replayed(
+    site: Path, start_process: Start, tmp_path: Path, ros_environment: dict[str, str]
+) -> None:
+    os_environment = ros_environment | {'PYTHONPATH': environment(site)['PYTHONPATH']}
+    few = ['--steps', '800', '--num-envs', '4', '--torch-threads', '1', '--threads', '1']
+    brief = ['updates_per_cycle=2', 'evaluation_episodes=4', 'moved_share=0', 'batch_size=32']
+    settings = [word for each in brief for word in ('--set', each)]
+    trained = run(
+        site,
+        *('-m', 'policy_node.training.train_her', '--task', TASK, '--output', tmp_path / 'run'),
+        *few,
+        *settings,
+        *('--set', 'goal_features=relative'),
+    )
+    assert trained.returncode == 0, trained.stderr
+    actor = next((tmp_path / 'run').glob('*.safetensors'))
+
+    policy = start_process(*POLICY_NODE, *ros_args(checkpoint=actor), env=os_environment)
+    arguments = ros_args(
+        task=TASK,
+        mode='lockstep',
+        episodes=1,
+        wait_for_commands=True,
+        episode_dir=tmp_path / 'episodes',
+    )
+    code, output = finish(start_process(*SIM_NODE, *arguments, env=os_environment), timeout=60.0)
+    assert code == 0, output
+    checked = run(site, '-m', 'fetch_hand_sim.commands.check_episode', tmp_path / 'episodes')
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+
+    (episode,) = episodes_in(tmp_path / 'episodes')
+    replay = (sys.executable, '-m', 'fetch_hand_sim.replay_node')
+    arguments = ros_args(path=episode.path, rate=10.0, wait_for_commands=True)
+    code, output = finish(start_process(*replay, *arguments, env=os_environment), timeout=60.0)
+    assert code == 0, output
+    policy.send_signal(signal.SIGINT)
+    assert finish(policy)[0] == 0
+
+
+BROKEN = {
+    'raises': ("raise RuntimeError('no such\\nrobot')\n", 'Mine', 'no such robot'),
+    'no task': ('Mine = 3\n', 'Mine', 'no TaskSpec but int'),
+    'taken': (
+        'from msgs_spec.tasks import TASKS\nFetchPush = TASKS["FetchPush"]\n',
+        'FetchPush',
+        'one of the thirteen has this name',
+    ),
+    'another name': (
+        'from msgs_spec.tasks import TASKS\nMine = TASKS["FetchPush"]\n',
+        'Mine',
+        "the task calls itself 'FetchPush'",
+    ),
+}
+
+
+@pytest.mark.parametrize('kind', BROKEN)
+def test_a_broken_package_costs_one_warning_and_its_own_task(kind: str, tmp_path: Path) -> None:
+    source, name, reason = BROKEN[kind]
+    (tmp_path / 'broken_task.py').write_text(source)
+    info = tmp_path / 'broken_task-1.dist-info'
+    info.mkdir()
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: broken-task\nVersion: 1\n')
+    entry = f'[fetch_hand_sim_tasks.specification]\n{name} = broken_task:{name}\n'
+    (info / 'entry_points.txt').write_text(entry)
+    result = run(tmp_path, '-c', 'from msgs_spec.tasks import TASKS; print(len(TASKS))')
+    assert result.stdout == '13\n'
+    (line,) = result.stderr.splitlines()
+    expected = f'task {name} is left out: broken-task: broken_task:{name}: {reason}'
+    assert line == expected
+
+
+def test_a_task_without_a_simulation_says_so(site: Path, tmp_path: Path) -> None:
+    subprocess.run(['cp', '-r', f'{site}/.', tmp_path], check=True)
+    (entries,) = tmp_path.glob('*.dist-info/entry_points.txt')
+    entries.write_text(entries.read_text().partition('[fetch_hand_sim_tasks.simulation]')[0])
+    command = (
+        'from fetch_hand_sim.simulation import Simulation\n'
+        'try: Simulation("FetchReachOriented")\n'
+        'except ValueError as error: print(error)\n'
+    )
+    result = run(tmp_path, '-c', command)
+    assert result.stdout.startswith(f'task {TASK} has no simulation: no installed package'), (
+        result.stderr
+    )
