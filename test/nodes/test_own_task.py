@@ -115,7 +115,7 @@ def test_it_is_trained_run_by_the_nodes_logged_checked_and_replayed(
         *('--set', 'goal_features=relative'),
     )
     assert trained.returncode == 0, trained.stderr
-    actor = next((tmp_path / 'run').glob('*.safetensors'))
+    actor = tmp_path / 'run' / 'latest.safetensors'
 
     policy = start_process(*POLICY_NODE, *ros_args(checkpoint=actor), env=os_environment)
     arguments = ros_args(
