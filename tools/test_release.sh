@@ -51,14 +51,10 @@ say 'with ROS and actors: the demo'
 pip_install base "$wheel[ros,actors]"
 "$work/base/bin/fetch_hand_sim" demo --episodes 2
 "$work/base/bin/fetch_hand_sim" episodes check episodes
-<<<<<<< HEAD
 "$work/base/bin/fetch_hand_sim" evaluate --policy FetchReach --episodes 20
-=======
-"$work/base/bin/fetch_hand_sim" evaluate --actor FetchReach --episodes 20
 say "tests and examples of Gymnasium-Robotics, from its repository"
 "$work/base/bin/python" -m pip install --quiet pytest
 suite=0
 "$work/base/bin/python" "$root/tools/gymnasium_robotics_suite.py" || suite=$?
 [ $suite -eq 0 ] || [ $suite -eq 3 ]
->>>>>>> 57096a7 (A task of one's own: other packages add tasks by entry points; the suite of Gymnasium-Robotics as a release check)
 say 'done'

@@ -77,8 +77,7 @@ def _run(options: argparse.Namespace) -> int:
     spec = task_spec(loaded.task)
     seeds = range(options.first_seed, options.first_seed + options.episodes)
     if spec.reference_id is None:
-        print(f'evaluate_reference: {spec.name} is no task of Gymnasium-Robotics', file=sys.stderr)
-        return 2
+        raise UsageError(f'{spec.name} is no task of Gymnasium-Robotics')
     successes = success_in_reference(loaded.policy, spec.reference_id, spec.episode_ticks, seeds)
     lower, upper = wilson_interval(successes, options.episodes)
     result = {

@@ -174,7 +174,9 @@ def test_a_broken_package_costs_one_warning_and_its_own_task(kind: str, tmp_path
 def test_a_task_without_a_simulation_says_so(site: Path, tmp_path: Path) -> None:
     subprocess.run(['cp', '-r', f'{site}/.', tmp_path], check=True)
     (entries,) = tmp_path.glob('*.dist-info/entry_points.txt')
-    entries.write_text(entries.read_text().partition('[fetch_hand_sim_tasks.simulation]')[0])
+    text = entries.read_text()
+    assert '[fetch_hand_sim_tasks.simulation]' in text
+    entries.write_text(text.replace('[fetch_hand_sim_tasks.simulation]', '[something.else]'))
     command = (
         'from fetch_hand_sim.simulation import Simulation\n'
         'try: Simulation("FetchReachOriented")\n'
