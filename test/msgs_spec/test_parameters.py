@@ -175,7 +175,9 @@ def test_help_names_every_parameter_with_its_default_and_what_is_allowed(node):
         assert f'{spec.description} Allowed: {spec.allowed}.' in flowing
 
 
-@pytest.mark.parametrize('module', ['fetch_hand_sim.sim_node', 'policy_node.node'])
+@pytest.mark.parametrize(
+    'module', ['fetch_hand_sim.sim_node', 'fetch_hand_sim.replay_node', 'policy_node.node']
+)
 @pytest.mark.parametrize('arguments', [['--help'], ['-h'], ['--ros-args', '--help']])
 def test_help_is_printed_before_ros_is_loaded(module, arguments):
     program = (
