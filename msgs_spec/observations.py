@@ -49,13 +49,14 @@ def observation(task: TaskSpec, readings: Readings, tick_duration: float) -> Arr
         return task.formulas.observation(readings, tick_duration)
     if task.robot.has_gripper_command:
         return np.concatenate(_fetch_parts(task, readings, tick_duration), axis=-1)
-    position, velocity, _ = np.split(readings['joint_states'], 3, axis=-1)
+    # Positions and velocities; efforts follow them.
+    joints = readings['joint_states'][..., : 2 * len(task.robot.joints)]
     if task.goal is GoalKind.FINGERTIPS:
         # `shadow_dexterous_hand/reach.py` of Gymnasium-Robotics.
-        return np.concatenate([position, velocity, _fingertip_positions(readings)], axis=-1)
+        return np.concatenate([joints, _fingertip_positions(readings)], axis=-1)
     # `shadow_dexterous_hand/manipulate.py`.
-    qpos, qvel = np.split(readings['object_joint'], [7], axis=-1)
-    return np.concatenate([position, velocity, qvel, qpos], axis=-1)
+    free_joint = readings['object_joint']
+    return np.concatenate([joints, free_joint[..., 7:], free_joint[..., :7]], axis=-1)
 
 
 def _fetch_parts(task: TaskSpec, readings: Readings, tick_duration: float) -> list[Array]:
@@ -63,22 +64,23 @@ def _fetch_parts(task: TaskSpec, readings: Readings, tick_duration: float) -> li
 
     Velocities are per tick there, hence `tick_duration`.
     """
-    position, velocity, _ = np.split(readings['joint_states'], 3, axis=-1)
+    count, joints = len(task.robot.joints), readings['joint_states']
+    fingers = joints[..., count - 2 : count]
+    fingers_velocity = joints[..., 2 * count - 2 : 2 * count] * tick_duration
     gripper = readings['end_effector_pose'][..., :3]
     gripper_velocity = readings['end_effector_twist'][..., :3] * tick_duration
-    fingers, fingers_velocity = position[..., -2:], velocity[..., -2:] * tick_duration
     if not task.has_object:
         return [gripper, fingers, gripper_velocity, fingers_velocity]
-    place, quaternion = np.split(readings['object_pose'], [3], axis=-1)
-    linear, angular = np.split(readings['object_twist'] * tick_duration, 2, axis=-1)
+    place, quaternion = readings['object_pose'][..., :3], readings['object_pose'][..., 3:]
+    twist = readings['object_twist'] * tick_duration
     return [
         gripper,
         place,
         place - gripper,
         fingers,
         matrix_to_euler(quaternion_to_matrix(quaternion)),
-        linear - gripper_velocity,
-        angular,
+        twist[..., :3] - gripper_velocity,
+        twist[..., 3:],
         gripper_velocity,
         fingers_velocity,
     ]
