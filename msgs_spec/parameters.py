@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from msgs_spec.robots import JOINT_PREFIX
+from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS, substeps_per_tick
 
 Value = str | int | float | bool
@@ -25,6 +25,7 @@ class ParameterSpec:
         default: Value where none is given.
         description: What it is for, with its unit.
         choices: Allowed strings; empty for any.
+        longest: Characters of a string at most; None for any number.
         lower: Smallest allowed number.
         upper: Largest allowed number.
         or_zero: Whether 0 is allowed too, below the smallest number, to switch something off.
@@ -38,6 +39,7 @@ class ParameterSpec:
     default: Value
     description: str
     choices: tuple[str, ...] = ()
+    longest: int | None = None
     lower: float = -math.inf
     upper: float = math.inf
     or_zero: bool = False
@@ -50,6 +52,8 @@ class ParameterSpec:
         """Allowed values as text."""
         if self.choices:
             return ', '.join(repr(choice) for choice in self.choices)
+        if self.longest is not None:
+            return f'up to {self.longest} characters'
         if self.type in ('string', 'bool'):
             return 'any string' if self.type == 'string' else 'true, false'
         limits = f'{self.lower:.10g} ... {self.upper:.10g}'
@@ -133,6 +137,7 @@ SIM_NODE = (
         'string',
         JOINT_PREFIX,
         'What the names of joints begin with in joint_states and joint_commands, such as rh_.',
+        longest=LONGEST_JOINT_PREFIX,
     ),
     ParameterSpec(
         'wait_for_commands',
@@ -249,7 +254,11 @@ def _is_allowed(spec: ParameterSpec, value: object) -> bool:
     if spec.type == 'bool':
         return isinstance(value, bool)
     if spec.type == 'string':
-        return isinstance(value, str) and (not spec.choices or value in spec.choices)
+        return (
+            isinstance(value, str)
+            and (not spec.choices or value in spec.choices)
+            and (spec.longest is None or len(value) <= spec.longest)
+        )
     kinds = (int,) if spec.type == 'integer' else (int, float)
     if isinstance(value, bool) or not isinstance(value, kinds):
         return False

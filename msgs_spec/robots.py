@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 GRIPPER_STEP = 0.05
 # What the names of joints begin with in the MJCF, and on the network unless another is asked for.
 JOINT_PREFIX = 'robot0:'
+LONGEST_JOINT_PREFIX = 64
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from msgs_spec.robots import JOINT_PREFIX
+from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import TaskSpec, substeps_per_tick, task_spec
 
 Strings = Mapping[str, str]
@@ -18,7 +18,6 @@ Number = TypeVar('Number', int, float)
 
 # Seeds and numbers of episodes are parameters of a node and columns of a table: int64.
 _LARGEST = 2**63 - 1
-_LONGEST_PREFIX = 64
 _SHOWN = 40
 
 
@@ -166,8 +165,10 @@ def integer_or_none(metadata: Strings, name: str) -> int | None:
 
 def _joint_prefix(metadata: Strings) -> str:
     prefix = metadata.get('joint_prefix', JOINT_PREFIX)
-    if len(prefix) > _LONGEST_PREFIX:
-        raise ValueError(f'joint_prefix of {len(prefix)} characters; allowed: {_LONGEST_PREFIX}')
+    if len(prefix) > LONGEST_JOINT_PREFIX:
+        raise ValueError(
+            f'joint_prefix of {len(prefix)} characters; allowed: {LONGEST_JOINT_PREFIX}'
+        )
     return prefix
 
 
