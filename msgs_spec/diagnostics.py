@@ -6,8 +6,9 @@ only.
 
 from __future__ import annotations
 
+import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -66,14 +67,14 @@ class Report:
         return '; '.join(text for _, text in ranked) or self.summary
 
 
-def encode_reports(stamp_ns: int, reports: Sequence[Report]) -> bytes:
-    """Returns the CDR bytes of a DiagnosticArray.
+def encode_reports(*reports: Report) -> bytes:
+    """Returns the CDR bytes of a DiagnosticArray with these statuses, one or more.
 
-    Args:
-        stamp_ns: Wall time, nanoseconds, as REP 107 has it.
-        reports: Its statuses.
+    It is stamped with wall time, as REP 107 has it, whatever clock the node follows: what it says
+    is of that time, and the reports of several nodes can be put in order.
     """
-    messages = [
+    stamp_ns = time.time_ns()
+    message, *others = (
         build_status(
             DIAGNOSTICS,
             stamp_ns,
@@ -84,9 +85,9 @@ def encode_reports(stamp_ns: int, reports: Sequence[Report]) -> bytes:
             hardware_id=report.hardware_id,
         )
         for report in reports
-    ]
-    messages[0].status = [status for message in messages for status in message.status]
-    return serialize(DIAGNOSTICS.type_name, messages[0])
+    )
+    message.status += [status for other in others for status in other.status]
+    return serialize(DIAGNOSTICS.type_name, message)
 
 
 class Durations:

@@ -297,7 +297,7 @@ class SimNode(Node):
         report = self._health.report(surroundings, now)
         self._say_news(surroundings)
         factor = self._factor_codec.encode(0, [self._health.real_time_factor])
-        self._publish([(DIAGNOSTICS, encode_reports(time.time_ns(), [report]))])
+        self._publish([(DIAGNOSTICS, encode_reports(report))])
         self._publish([(REAL_TIME_FACTOR, factor)])
 
     def _surroundings(self) -> Surroundings:

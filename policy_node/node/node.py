@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from msgs_spec.codecs import build_status, decode_status
+from msgs_spec.codecs import build_status, decode_status, message_stamp
 from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports
 from msgs_spec.parameters import POLICY_NODE
 from msgs_spec.ros import (
@@ -60,6 +60,7 @@ class PolicyNode(Node):
         self._settings = declare_parameters(self, POLICY_NODE)
         self._loaded = self._load_ahead()
         self._status: EpisodeStatus | None = None
+        self._status_stamp = 0
         self._responder: Responder | None = None
         self._answered_status: EpisodeStatus | None = None
         self._commands: Publisher | None = None
@@ -149,7 +150,10 @@ class PolicyNode(Node):
         before, now = self._answered_status, self._status
         if before is None or now is None:
             return False
-        return (now.task, now.control_hz) != (before.task, before.control_hz)
+        return any(
+            getattr(now, name) != getattr(before, name)
+            for name in ('task', 'control_hz', 'joint_prefix')
+        )
 
     def _take_policy(self, parameters: list[Parameter]) -> SetParametersResult:
         """Loads another policy at once, so that who sets it hears whether there is one."""
@@ -189,10 +193,10 @@ class PolicyNode(Node):
         self._health.stop()
 
     def _announce(self, commander: Commander) -> None:
-        """Tells the robot's log who commands."""
+        """Tells the robot's log who commands, in the time of the robot's last word about itself."""
         status = topic(commander.spec, 'policy_status')
         values = {'commander': commander.description, 'checkpoint_sha256': commander.sha256}
-        message = build_status(status, 0, NODE_NAME, values)
+        message = build_status(status, self._status_stamp, NODE_NAME, values)
         publisher = self._publisher(status)
         self._of_robot.append(publisher)
         publisher.publish(serialize(status.type_name, message))
@@ -244,7 +248,7 @@ class PolicyNode(Node):
             return
         if self._responder is not None and status.phase == 'waiting':
             self._responder.forget()
-        self._status = status
+        self._status, self._status_stamp = status, message_stamp(message)
 
     def _on_diagnostics(self, message: Any) -> None:
         is_paused = read_pause(message, self.get_namespace())
@@ -259,8 +263,7 @@ class PolicyNode(Node):
         robots = self.count_publishers(self._status_name)
         elsewhere = [] if robots or now < self._elsewhere_from else self._robots_elsewhere()
         report = self._health.report(now, robots, self._is_paused, elsewhere)
-        # REP 107: wall time, also where the clock of the node is simulated.
-        self._diagnostics.publish(encode_reports(time.time_ns(), [report]))
+        self._diagnostics.publish(encode_reports(report))
         for line in self._health.news(report):
             self.get_logger().warning(line)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from pathlib import Path
 
 from rcl_interfaces.msg import Parameter, ParameterValue
@@ -13,7 +14,7 @@ from std_srvs.srv import Trigger
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.codecs import decode_status
+from msgs_spec.codecs import decode_status, message_stamp
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import TickEncoder
@@ -158,9 +159,9 @@ def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
 
 def test_two_commanders_are_named_and_health_is_published(start_process: Start) -> None:
     sim = start_process(*SIM_NODE, *ros_args(real_time_factor=4.0))
-    policy = start_process(*POLICY_NODE, *ros_args(policy='random'))
+    policy = start_process(*POLICY_NODE, *ros_args(policy='random', use_sim_time=True))
     with client(REACH) as robot:
-        robot.subscribe('/diagnostics', 'real_time_factor')
+        robot.subscribe('/diagnostics', 'real_time_factor', 'policy_status', 'joint_states')
         robot.connect('commands')
 
         def status(node: str):
@@ -181,6 +182,11 @@ def test_two_commanders_are_named_and_health_is_published(start_process: Start) 
         assert float(values['tick time p99 (ms)']) > 0.0
         robot.spin_until(lambda: 'commands per second' in message('/policy_node'), 'a policy')
         assert float(decode_status(status('/policy_node'))['inference p50 (ms)']) > 0.0
+        # Both in wall time, though one node follows the simulated; who commands, in the robot's.
+        for node in ('/sim_node', '/policy_node'):
+            assert abs(message_stamp(status(node)) - time.time_ns()) < 10e9
+        (introduction,) = robot.received['policy_status']
+        assert 0 < message_stamp(introduction) < robot.stamps('joint_states')[-1]
         factors = robot.received['real_time_factor']
         robot.spin_until(lambda: any(abs(m.data - 4.0) < 0.4 for m in factors), 'factor of 4')
         changed = Parameter(name='real_time_factor', value=ParameterValue(type=3, double_value=0.1))

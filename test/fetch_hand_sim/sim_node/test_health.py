@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fetch_hand_sim.sim_node.health import Health, Surroundings
+from msgs_spec.codecs import message_stamp
 from msgs_spec.diagnostics import Level, encode_reports
 from msgs_spec.schemas import deserialize
 from msgs_spec.topics import DIAGNOSTICS, topics
@@ -65,7 +67,9 @@ def test_report_of_a_healthy_robot(make):
 def test_report_says_what_is_wrong_around_the_robot(make, changes, level, text):
     report = report_after(make(), replace(FINE, **changes), ticks=26)
     assert (report.level, report.message) == (level, text)
-    status = deserialize(DIAGNOSTICS.type_name, encode_reports(5, [report])).status[0]
+    message = deserialize(DIAGNOSTICS.type_name, encode_reports(report))
+    assert abs(message_stamp(message) - time.time_ns()) < 60e9
+    (status,) = message.status
     assert (status.level, status.name, status.message) == (level, '/sim_node', report.message)
 
 

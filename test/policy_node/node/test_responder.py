@@ -208,7 +208,7 @@ def test_report_says_what_is_wrong(case, episode):
 
 
 def diagnostics(*reports):
-    return deserialize('diagnostic_msgs/msg/DiagnosticArray', encode_reports(0, reports))
+    return deserialize('diagnostic_msgs/msg/DiagnosticArray', encode_reports(*reports))
 
 
 def test_a_paused_robot_is_not_called_silent(case, episode):
