@@ -164,7 +164,10 @@ class PolicyNode(Node):
             status, settings = self._status, self._settings
             task = status.task if status else settings['task'] or None
             try:
-                self._loaded = load_policy(parameter.value, task, trust=settings['trust'])
+                loaded = load_policy(parameter.value, task, trust=settings['trust'])
+                if status is not None:
+                    Commander(loaded, status.control_hz)
+                self._loaded = loaded
             except TaskMissing:
                 self._loaded = None
             except ValueError as error:

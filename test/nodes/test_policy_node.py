@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 
 import pytest
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from std_srvs.srv import SetBool
 
 from msgs_spec.codecs import decode_status
@@ -95,6 +97,27 @@ def test_a_paused_robot_is_no_silent_one_and_acting_needs_no_torch(start_process
         assert abs(reports[-1].header.stamp.sec - time.time()) < 10.0
     assert 'no state' not in end(policy)
     end(sim)
+
+
+def test_a_policy_of_another_rate_is_refused_while_another_acts(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(mode='lockstep', control_hz=50.0))
+    policy = start_process(*POLICY_NODE, *ros_args(policy='random'))
+    with client(REACH) as robot:
+        robot.subscribe('applied_command')
+        commands = robot.received['applied_command']
+        robot.spin_until(lambda: len(commands) > 3, 'commands')
+        wanted = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value='FetchReach')
+        answer = robot.call(
+            SetParameters,
+            'policy_node/set_parameters',
+            parameters=[Parameter(name='policy', value=wanted)],
+        )
+        (result,) = answer.results
+        assert not result.successful
+        assert 'was trained at 25 Hz; the robot runs at 50 Hz' in result.reason
+        count = len(commands)
+        robot.spin_until(lambda: len(commands) > count + 3, 'more of them')
+    end(policy)
 
 
 def test_robots_in_other_namespaces_are_named(start_process: Start) -> None:
