@@ -29,6 +29,8 @@ _TRAIL: Color = (0.15, 0.4, 0.9, 0.35)
 # Opacity of what surrounds a goal: the ball of its threshold, or the shell of a ghost.
 _HALO_OPACITY = 0.16
 _SHELL_SCALE = 1.08
+# Drawn where a pose has no object to show it, metres.
+_POINTER = np.array([0.1, 0.0, 0.0])
 # Where the position of a pose does not count, its ghost stands beside the hand, metres
 # (Gymnasium-Robotics draws it there too).
 GHOST_OFFSET = np.array([0.15, 0.0, 0.0])
@@ -211,6 +213,12 @@ def _point_markers(spec: TaskSpec, frame: Frame, color: Color) -> list[Marker]:
     shapes = [_sphere(goal, 0.02, color), _sphere(goal, spec.distance_threshold, halo)]
     if not spec.has_object:
         shapes.append(_sphere(achieved, 0.012, _ACHIEVED))
+    if spec.goal is GoalKind.POSE:
+        # How both are turned: their x axes.
+        for pose, tint in ((frame.desired_goal, color), (frame.achieved_goal, _ACHIEVED)):
+            axis = np.zeros(3)
+            mujoco.mju_rotVecQuat(axis, _POINTER, pose[3:])
+            shapes += _line([pose[:3], pose[:3] + axis], 0.005, tint)
     return [*shapes, *_line([achieved, goal], 0.002, _LINK)]
 
 

@@ -48,6 +48,8 @@ def introduction(spec: TaskSpec) -> str:
         'FetchPickAndPlace': 'The arm picks the box up and holds it at the red ball.',
         'HandReach': 'The hand brings its fingertips to the red balls: thumb and finger meet.',
     }.get(spec.name)
+    if spec.formulas is not None:
+        what = f'{spec.name} is a task of another package.'
     if what is None:
         thing = next(word for word in ('block', 'egg', 'pen') if word in spec.name.lower())
         how = ' and moves it there' if spec.position_counts else ''

@@ -69,6 +69,33 @@ def test_the_pages_command_lines_are_understood(site: Path) -> None:
     assert node[1:] == ros_args(task=TASK)
 
 
+VIEW = """
+import os
+os.environ['MUJOCO_GL'] = 'egl'
+import gymnasium
+from fetch_hand_sim.view.panels import introduction
+from msgs_spec.tasks import task_spec
+
+print(introduction(task_spec('FetchReachOriented')))
+name = 'fetch_hand_sim:fetch_hand_sim/FetchReachOriented-v0'
+env = gymnasium.make(name, render_mode='rgb_array')
+env.reset(seed=0)
+try:
+    print(env.render().std() > 10.0)
+except RuntimeError as error:
+    print(str(error).startswith('rendering needs OpenGL'))
+"""
+
+
+def test_it_is_shown(site: Path) -> None:
+    pytest.importorskip('mujoco.studio')
+    result = run(site, '-c', VIEW)
+    assert result.stdout.splitlines() == [
+        f'{TASK} is a task of another package. The goal turns green when it is reached.',
+        'True',
+    ], result.stderr
+
+
 GYMNASIUM = """
 import warnings
 warnings.simplefilter('ignore')
