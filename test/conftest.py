@@ -54,6 +54,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Sets the environment of ROS before any message class is imported; children inherit it."""
+    # A shell starts what runs in the background with SIGINT ignored, and children inherit that.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     domain, lock = reserve_domain()
     config.add_cleanup(lock.close)
     log_directory = tempfile.mkdtemp(prefix='ros_log_')
