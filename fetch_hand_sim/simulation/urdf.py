@@ -13,11 +13,11 @@ from typing import Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.tasks import task_asset
-from fetch_hand_sim.simulation.urdf_shapes import add_shapes, numbers
+from fetch_hand_sim.simulation.urdf_shapes import add_origin, add_shapes, numbers
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.rotations import (
     quaternion_conjugate,
@@ -225,21 +225,3 @@ class RobotDescription:
         if joint.kind != 'continuous':
             limit |= {'lower': f'{joint.lower:.9g}', 'upper': f'{joint.upper:.9g}'}
         ElementTree.SubElement(element, 'limit', limit)
-
-
-def add_origin(element: ElementTree.Element, position: ArrayLike, quaternion: ArrayLike) -> None:
-    """Adds an `origin` with URDF's roll, pitch and yaw."""
-    ElementTree.SubElement(
-        element, 'origin', xyz=numbers(position), rpy=numbers(roll_pitch_yaw(quaternion))
-    )
-
-
-def roll_pitch_yaw(quaternion: ArrayLike) -> Array:
-    """URDF's angles (3,), radians, of a unit quaternion wxyz: R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    m = quaternion_to_matrix(quaternion)
-    cosine = np.hypot(m[0, 0], m[1, 0])
-    if cosine > 1e-9:
-        roll, yaw = np.arctan2(m[2, 1], m[2, 2]), np.arctan2(m[1, 0], m[0, 0])
-    else:
-        roll, yaw = np.arctan2(-m[1, 2], m[1, 1]), 0.0
-    return np.array([roll, np.arctan2(-m[2, 0], cosine), yaw])

@@ -35,7 +35,7 @@ def add_shapes(
         for shape, position, quaternion in _shapes(mjcf, model, geom):
             for kind in [*(['visual'] if is_drawn else []), *(['collision'] if touches else [])]:
                 element = ElementTree.SubElement(link, kind)
-                _add_origin(element, position, quaternion)
+                add_origin(element, position, quaternion)
                 ElementTree.SubElement(element, 'geometry').append(shape)
                 if kind == 'visual':
                     _add_color(element, model, geom)
@@ -87,7 +87,19 @@ def _add_color(element: ElementTree.Element, model: mujoco.MjModel, geom: int) -
     ElementTree.SubElement(named, 'color', rgba=numbers(color))
 
 
-def _add_origin(element: ElementTree.Element, position: Array, quaternion: Array) -> None:
-    from fetch_hand_sim.simulation.urdf import add_origin
+def add_origin(element: ElementTree.Element, position: ArrayLike, quaternion: ArrayLike) -> None:
+    """Adds an `origin` with URDF's roll, pitch and yaw."""
+    ElementTree.SubElement(
+        element, 'origin', xyz=numbers(position), rpy=numbers(roll_pitch_yaw(quaternion))
+    )
 
-    add_origin(element, position, quaternion)
+
+def roll_pitch_yaw(quaternion: ArrayLike) -> Array:
+    """URDF's angles (3,), radians, of a unit quaternion wxyz: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    m = quaternion_to_matrix(quaternion)
+    cosine = np.hypot(m[0, 0], m[1, 0])
+    if cosine > 1e-9:
+        roll, yaw = np.arctan2(m[2, 1], m[2, 2]), np.arctan2(m[1, 0], m[0, 0])
+    else:
+        roll, yaw = np.arctan2(-m[1, 2], m[1, 1]), 0.0
+    return np.array([roll, np.arctan2(-m[2, 0], cosine), yaw])
