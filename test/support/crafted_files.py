@@ -321,8 +321,11 @@ class Crafter:
         content.messages += content.messages * int(self.random.integers(1, 50))
 
     def swapped_topics(self, content: Content) -> None:
-        names = self.random.permutation(tuple(content.types))
-        new = dict(zip(content.types, names.tolist(), strict=True))
+        names = list(content.types)
+        new = {
+            name: names[i]
+            for name, i in zip(names, self.random.permutation(len(names)), strict=True)
+        }
         for message in content.messages:
             message.topic = new[message.topic]
 
