@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeLogError, EpisodeWriter
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.recorder import LoggedEpisode, episode_result
+from fetch_hand_sim.episodes.robot_episode import RobotEpisode, sense
 from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS
 from fetch_hand_sim.simulation import Observation, Simulation
 from msgs_spec.actions import clip_command, command_from_action
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.tick import EpisodeStatus, Phase, Tick, TickEncoder
+from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import topic
 
 Array = NDArray[np.float64]
@@ -32,21 +33,12 @@ Act = Callable[[Observation], NDArray[Any]]
 _COMPLETING_THREADS = 4
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Robot:
-    """One of the batch, through one episode."""
+    """One of the batch, through one episode, and what it said and received, tick by tick."""
 
-    episode: int
-    seed: int
-    stamp_ns: int
+    episode: RobotEpisode
     messages: list[tuple[int, list[Any], bytes | None]] = field(default_factory=list)
-    tick: int = 0
-    episode_return: float = 0.0
-    status: EpisodeStatus | None = None
-
-    @property
-    def is_finished(self) -> bool:
-        return self.status is not None and self.status.phase == 'finished'
 
 
 class EpisodeGenerator:
@@ -96,87 +88,47 @@ class EpisodeGenerator:
 
     def _robot(self, episode: int, first_seed: int) -> _Robot:
         ticks = self._simulation.spec.episode_ticks + 1
-        return _Robot(
-            episode, first_seed + episode, FIRST_STAMP_NS + episode * ticks * self._period_ns
-        )
+        stamp_ns = FIRST_STAMP_NS + episode * ticks * self._period_ns
+        return _Robot(RobotEpisode(self._simulation, episode, first_seed + episode, stamp_ns))
 
     def _run(self, robots: Sequence[_Robot], first_seed: int) -> None:
         """Runs one episode in every robot; robots beyond those given run idle."""
         simulation, robot_spec = self._simulation, self._simulation.spec.robot
         simulation.reset(seed=first_seed)
-        observation = self._take(robots, None, None)
+        sensed = sense(simulation)
+        for index, robot in enumerate(robots):
+            self._take(robot, robot.episode.start(sensed, index))
         for _ in range(simulation.spec.episode_ticks):
-            actions = self._act(observation)
+            actions = self._act(simulation.observe_from(sensed.readings))
             commands = np.asarray(command_from_action(robot_spec, actions), dtype=np.float64)
             self._receive(robots, commands)
             applied = clip_command(robot_spec, commands)
-            observation = self._take(robots, applied, simulation.advance(applied))
+            diverged = simulation.advance(applied)
+            sensed = sense(simulation)
+            for index, robot in enumerate(robots):
+                if not robot.episode.is_finished:
+                    has_diverged = bool(diverged[index])
+                    tick = robot.episode.step(sensed, index, applied[index], has_diverged)
+                    self._take(robot, tick)
 
-    def _take(
-        self,
-        robots: Sequence[_Robot],
-        applied: Array | None,
-        diverged: NDArray[np.bool_] | None,
-    ) -> Observation:
-        """Encodes one tick of every robot that is still in its episode; returns what all see."""
-        simulation = self._simulation
-        readings = simulation.readings()
-        observation = simulation.observe_from(readings)
-        achieved, desired = observation['achieved_goal'], observation['desired_goal']
-        reward, success = simulation.metric.evaluate(achieved, desired)
-        for index, robot in enumerate(robots):
-            if robot.is_finished:
-                continue
-            phase: Phase = 'reset'
-            if diverged is not None:
-                robot.tick += 1
-                robot.episode_return += float(reward[index])
-                is_last = diverged[index] or robot.tick >= simulation.spec.episode_ticks
-                phase = 'finished' if is_last else 'running'
-            robot.status = self._status(robot, phase, bool(success[index]))
-            tick = Tick(
-                stamp_ns=robot.stamp_ns,
-                readings={name: values[index] for name, values in readings.items()},
-                desired_goal=desired[index],
-                achieved_goal=achieved[index],
-                reward=None if applied is None else float(reward[index]),
-                is_success=bool(success[index]),
-                applied_command=None if applied is None else applied[index],
-                status=robot.status,
-            )
-            messages = self._encoder.encode(tick, latched=phase != 'running')
-            robot.messages.append((robot.stamp_ns, messages, None))
-            robot.stamp_ns += self._period_ns
-        return observation
+    def _take(self, robot: _Robot, tick: Tick) -> None:
+        """Encodes a tick."""
+        messages = self._encoder.encode(tick, latched=tick.status.phase != 'running')
+        robot.messages.append((tick.stamp_ns, messages, None))
 
     def _receive(self, robots: Sequence[_Robot], commands: Array) -> None:
         """Notes the command that each robot got after its last tick, as `policy_node` sends it."""
         for robot, command in zip(robots, commands, strict=False):
-            if not robot.is_finished:
+            if not robot.episode.is_finished:
                 stamp_ns, messages, _ = robot.messages[-1]
                 robot.messages[-1] = (stamp_ns, messages, self._command_encoder.encode(0, command))
 
-    def _status(self, robot: _Robot, phase: Phase, is_success: bool) -> EpisodeStatus:
-        metric = self._simulation.metric
-        return EpisodeStatus(
-            task=self._simulation.spec.name,
-            episode=robot.episode,
-            seed=robot.seed,
-            tick=robot.tick,
-            phase=phase,
-            control_hz=self._simulation.control_hz,
-            reward_type=metric.reward_type,
-            success_rule=metric.success_rule,
-            episode_return=robot.episode_return,
-            is_success=is_success,
-        )
-
     def _write(self, robot: _Robot) -> EpisodeWriter:
-        assert robot.status is not None
+        status = robot.episode.status
         writer = self._episodes.begin(
-            robot.status.task,
-            robot.seed,
-            self._context.metadata(robot.status),
+            status.task,
+            status.seed,
+            self._context.metadata(status),
             self._context.attachments,
         )
         for stamp_ns, messages, command in robot.messages:
@@ -188,8 +140,8 @@ class EpisodeGenerator:
 
 
 def _complete(writer: EpisodeWriter, robot: _Robot) -> LoggedEpisode:
-    assert robot.status is not None
-    path = writer.finish(episode_result(robot.status))
+    status = robot.episode.status
+    path = writer.finish(episode_result(status))
     if path is None:
-        raise EpisodeLogError(f'episode of seed {robot.seed} could not be written')
-    return LoggedEpisode(robot.status, path, is_complete=True)
+        raise EpisodeLogError(f'episode of seed {status.seed} could not be written')
+    return LoggedEpisode(status, path, is_complete=True)

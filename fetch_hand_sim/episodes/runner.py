@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fetch_hand_sim.episodes.robot_episode import RobotEpisode, sense
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.observations import achieved_goal
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import task_spec
-from msgs_spec.tick import EpisodeStatus, Phase, Tick
+from msgs_spec.tick import EpisodeStatus, Tick
 
 Array = NDArray[np.float64]
 
@@ -61,14 +61,13 @@ class EpisodeRunner:
         self._first_seed = first_seed
         self._episodes = episodes
         self._period_ns = round(simulation.tick_duration * 1e9)
-        self._first_stamp_ns = self._next_stamp_ns = self._reset_stamp_ns = first_stamp_ns
+        self._first_stamp_ns = first_stamp_ns
+        self._stamp_ns = first_stamp_ns - self._period_ns
         self._first_episode = self._episode = first_episode
         self._series_seed = first_seed
         self._new_first_seed: int | None = None
-        self._tick = 0
-        self._return = 0.0
         self.is_between_episodes = True
-        self.has_diverged = False
+        self._current = self._make_episode(first_stamp_ns)
 
     @property
     def is_done(self) -> bool:
@@ -90,26 +89,31 @@ class EpisodeRunner:
     @property
     def tick(self) -> int:
         """Steps of the running or last episode so far."""
-        return self._tick
+        return self._current.tick
+
+    @property
+    def has_diverged(self) -> bool:
+        """Whether MuJoCo gave the running or last episode up."""
+        return self._current.has_diverged
 
     @property
     def stamp_ns(self) -> int:
         """Simulated time of the last tick; one period before the first if there is none."""
-        return self._next_stamp_ns - self._period_ns
+        return self._stamp_ns
 
     @property
     def reset_stamp_ns(self) -> int:
         """Simulated time of tick 0 of the running or last episode."""
-        return self._reset_stamp_ns
+        return self._current.first_stamp_ns
 
     @property
     def has_started(self) -> bool:
         """Whether there has been a tick."""
-        return self._next_stamp_ns > self._first_stamp_ns
+        return self._stamp_ns >= self._first_stamp_ns
 
     def waiting_status(self) -> EpisodeStatus:
         """What to say of the first episode before it starts."""
-        return self._status('waiting', is_success=False)
+        return self._make_episode(self._stamp_ns).status
 
     def resting_command(self) -> Array:
         """The command (action size,) that leaves the robot as it is."""
@@ -151,62 +155,29 @@ class EpisodeRunner:
         return self._step(command)
 
     def _reset(self) -> Tick:
-        self._tick = 0
-        self._reset_stamp_ns = self._next_stamp_ns
-        self._return = 0.0
-        self.has_diverged = False
+        stamp_ns = self.stamp_ns + self._period_ns
         if self._new_first_seed is not None:
             self._first_seed, self._new_first_seed = self._new_first_seed, None
         self.is_between_episodes = False
         self.simulation.reset(seed=self.seed)
-        return self._make_tick('reset', None)
+        self._current = self._make_episode(stamp_ns)
+        return self._emitted(self._current.start(sense(self.simulation), 0))
 
     def _step(self, command: Array) -> Tick:
         (diverged,) = self.simulation.advance(command[None])
-        self._tick += 1
-        self.has_diverged = bool(diverged)
-        is_last = self.has_diverged or self._tick >= self.spec.episode_ticks
-        tick = self._make_tick('finished' if is_last else 'running', command.copy())
-        if is_last:
+        sensed = sense(self.simulation)
+        tick = self._current.step(sensed, 0, command.copy(), bool(diverged))
+        if self._current.is_finished:
             self._finish()
-        return tick
+        return self._emitted(tick)
 
     def _finish(self) -> None:
         self.is_between_episodes = True
         self._episode += 1
 
-    def _make_tick(self, phase: Phase, command: Array | None) -> Tick:
-        """Reads the sensors, once, into the tick that follows a reset (None) or a command."""
-        readings = self.simulation.readings()
-        achieved = achieved_goal(self.spec, readings)
-        (reward,), (success,) = self.simulation.metric.evaluate(achieved, self.simulation.goals)
-        if command is not None:
-            self._return += float(reward)
-        stamp_ns = self._next_stamp_ns
-        self._next_stamp_ns += self._period_ns
-        return Tick(
-            stamp_ns=stamp_ns,
-            readings={name: values[0] for name, values in readings.items()},
-            desired_goal=self.simulation.goals[0].copy(),
-            achieved_goal=achieved[0],
-            reward=None if command is None else float(reward),
-            is_success=bool(success),
-            applied_command=command,
-            status=self._status(phase, is_success=bool(success)),
-        )
+    def _emitted(self, tick: Tick) -> Tick:
+        self._stamp_ns = tick.stamp_ns
+        return tick
 
-    def _status(self, phase: Phase, *, is_success: bool) -> EpisodeStatus:
-        metric = self.simulation.metric
-        return EpisodeStatus(
-            task=self.spec.name,
-            episode=self._episode,
-            seed=self.seed,
-            tick=self._tick,
-            phase=phase,
-            control_hz=self.simulation.control_hz,
-            reward_type=metric.reward_type,
-            success_rule=metric.success_rule,
-            episode_return=self._return,
-            is_success=is_success,
-            joint_prefix=self._joint_prefix,
-        )
+    def _make_episode(self, stamp_ns: int) -> RobotEpisode:
+        return RobotEpisode(self.simulation, self._episode, self.seed, stamp_ns, self._joint_prefix)
