@@ -126,6 +126,11 @@ def _twist(values: Array) -> Any:
     return _geometry('Twist', linear=linear, angular=angular)
 
 
+def _wrench(values: Array) -> Any:
+    force, torque = _xyz('Vector3', values[:3]), _xyz('Vector3', values[3:])
+    return _geometry('Wrench', force=force, torque=torque)
+
+
 def _read_xyz(*parts: Any) -> list[float]:
     return [value for part in parts for value in (part.x, part.y, part.z)]
 
@@ -219,6 +224,10 @@ _CODECS: dict[str, tuple[_Builder, _Reader]] = {
     'geometry_msgs/msg/TwistStamped': (
         lambda _, values: {'twist': _twist(values)},
         lambda _, message: _read_xyz(message.twist.linear, message.twist.angular),
+    ),
+    'geometry_msgs/msg/WrenchStamped': (
+        lambda _, values: {'wrench': _wrench(values)},
+        lambda _, message: _read_xyz(message.wrench.force, message.wrench.torque),
     ),
     'std_msgs/msg/Float64': (
         lambda _, values: {'data': float(values[0])},

@@ -62,6 +62,9 @@ class ParameterSpec:
 
 _LARGEST_SEED = 2**32 - 1
 
+# More than that throws the robots apart, N.
+LARGEST_PERTURBATION = 100.0
+
 SIM_NODE = (
     ParameterSpec('task', 'string', 'FetchReach', 'Task to run.', choices=tuple(TASKS)),
     ParameterSpec(
@@ -150,6 +153,15 @@ SIM_NODE = (
         'bool',
         True,
         'Whether to publish /clock; one robot per graph should.',
+    ),
+    ParameterSpec(
+        'perturb_limit',
+        'double',
+        0.0,
+        'Largest force, N, that `perturb` may apply, and ten times the largest torque, N m; 0 '
+        'refuses all.',
+        lower=0.0,
+        upper=LARGEST_PERTURBATION,
     ),
     ParameterSpec(
         'episode_dir',

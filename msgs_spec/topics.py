@@ -40,6 +40,7 @@ _POSITION = VectorPart('position', 3, 'm')
 _QUATERNION = VectorPart('orientation', 4, 'quaternion')
 _POSE = (_POSITION, _QUATERNION)
 _TWIST = (VectorPart('linear', 3, 'm/s'), VectorPart('angular', 3, 'rad/s'))
+_WRENCH = (VectorPart('force', 3, 'N'), VectorPart('torque', 3, 'N m'))
 _FREE_JOINT = (
     *_POSE,
     VectorPart('linear', 3, 'm/s'),
@@ -193,6 +194,12 @@ def _command_topics(task: TaskSpec) -> list[TopicSpec]:
     type_name, goal_layout = _GOAL_TYPES[task.goal]
     text = 'Replaces the goal of the running episode from the next tick on.'
     specs.append(_subscribed('set_goal', type_name, text, goal_layout, frame=WORLD))
+    wrench = 'geometry_msgs/msg/WrenchStamped'
+    text = (
+        'Pushes a body during the next tick, where `perturb_limit` allows it: `frame_id` names the '
+        'body, force and torque are along the axes of the world, at its centre of mass.'
+    )
+    specs.append(_subscribed('perturb', wrench, text, _WRENCH))
     text = 'Who commands: checkpoint and its SHA-256 as key/value pairs, for the log.'
     status = 'diagnostic_msgs/msg/DiagnosticArray'
     specs.append(_subscribed('policy_status', status, text, (), qos=LATCHED))

@@ -37,6 +37,7 @@ def episode_metadata(
     model_sha256: str,
     source_revision: str | None = None,
     checkpoint_sha256: str | None = None,
+    perturb_limit: float = 0.0,
     started: str | None = None,
 ) -> dict[str, str]:
     """Returns the contents of the record `episode`.
@@ -53,6 +54,8 @@ def episode_metadata(
         model_sha256: Fingerprint of the compiled model, see `model_sha256`.
         source_revision: Revision of this project, if known.
         checkpoint_sha256: Fingerprint of the actor that gives the commands, if known.
+        perturb_limit: Largest force, N, by which the robot lets itself be pushed; recorded where it
+            does at all, because such an episode is no plain one.
         started: Wall-clock time of the start, ISO 8601. The one value that differs between equal
             runs; leave it out for files that are equal byte by byte.
     """
@@ -73,6 +76,7 @@ def episode_metadata(
         'model_sha256': model_sha256,
         'source_revision': source_revision,
         'checkpoint_sha256': checkpoint_sha256,
+        'perturb_limit': repr(float(perturb_limit)) if perturb_limit else None,
         'started': started,
         'python_version': platform.python_version(),
         **{f'{package}_version': _version(package) for package in _PACKAGES},

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
+from msgs_spec.parameters import LARGEST_PERTURBATION
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import TaskSpec, substeps_per_tick, task_spec
 
@@ -34,6 +35,7 @@ class EpisodeRecord:
         control_hz: Ticks per simulated second.
         joint_prefix: What the names of joints begin with.
         interface_version: What its messages mean, see `INTERFACE_VERSION`.
+        perturb_limit: Largest force of a push, N; 0 where none was taken.
     """
 
     task: TaskSpec
@@ -44,6 +46,7 @@ class EpisodeRecord:
     control_hz: float
     joint_prefix: str
     interface_version: int
+    perturb_limit: float = 0.0
 
     @classmethod
     def parse(cls, metadata: Strings) -> EpisodeRecord:
@@ -61,6 +64,7 @@ class EpisodeRecord:
             control_hz=parse_control_hz(metadata),
             joint_prefix=_joint_prefix(metadata),
             interface_version=_integer(metadata, 'interface_version', default='1'),
+            perturb_limit=_perturb_limit(metadata),
         )
 
 
@@ -183,6 +187,15 @@ def _integer(content: Strings, name: str, default: str | None = None) -> int:
     value = _number_or_none(text, int)
     if value is None or not 0 <= value <= _LARGEST:
         raise ValueError(f'{name} {text[:_SHOWN]!r}; allowed: 0 ... {_LARGEST}')
+    return value
+
+
+def _perturb_limit(metadata: Strings) -> float:
+    text = _text({'perturb_limit': '0', **metadata}, 'perturb_limit')
+    value = _number_or_none(text, float)
+    if value is None or not 0.0 <= value <= LARGEST_PERTURBATION:
+        allowed = f'0 ... {LARGEST_PERTURBATION:g}'
+        raise ValueError(f'perturb_limit {text[:_SHOWN]!r}; allowed: {allowed}')
     return value
 
 

@@ -19,6 +19,7 @@ from fetch_hand_sim.episode_log.reader import DAMAGED
 from fetch_hand_sim.episode_log.ticks import LoggedTick, TickMessage, split_ticks
 from fetch_hand_sim.episodes.context import source_revision
 from fetch_hand_sim.episodes.goals import accept_goal
+from fetch_hand_sim.episodes.perturbations import accept_perturbation
 from fetch_hand_sim.episodes.recorder import episode_result
 from fetch_hand_sim.episodes.runner import Array, EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
@@ -108,7 +109,7 @@ class EpisodeChecker:
             _require_goals(episode)
             runner = self._runner(record, ticks)
             result = CheckResult(episode.path, changed=self._changes(episode, runner))
-            _compare(runner, ticks, episode, record.interface_version, result)
+            _compare(runner, ticks, episode, record, result)
         except DAMAGED as error:
             raise EpisodeReadError(
                 f'{episode.path}: cannot be run again ({one_line(error)})'
@@ -161,7 +162,7 @@ def _compare(
     runner: EpisodeRunner,
     ticks: list[LoggedTick],
     episode: Episode,
-    version: int,
+    record: EpisodeRecord,
     result: CheckResult,
 ) -> None:
     """Runs the episode and notes how far it is the recorded one."""
@@ -179,7 +180,7 @@ def _compare(
             )
             return
         tick = runner.advance(command)
-        if version == 1 and 'fingertip_poses' in tick.readings:
+        if record.interface_version == 1 and 'fingertip_poses' in tick.readings:
             tick = _without_orientations(tick)
         has_status = logged.find('episode_status') is not None
         expected = encoder.encode(tick, latched=has_status or tick.status.phase != 'running')
@@ -189,14 +190,15 @@ def _compare(
             return
         result.ticks += 1
         result.messages += len(logged.published)
-        _set_goals(runner, logged, version)
+        _take_received(runner, logged, record)
     result.difference = _result_difference(ticks[-1], tick.status, runner, episode)
 
 
 def _require_goals(episode: Episode) -> None:
-    """Raises `ValueError` if goals were received that the file could not take."""
-    if 'set_goal' in episode.outcome.received_not_logged:
-        raise ValueError('more goals were set than the file holds')
+    """Raises `ValueError` if goals or pushes were received that the file could not take."""
+    for name, what in (('set_goal', 'goals were set'), ('perturb', 'pushes came')):
+        if name in episode.outcome.received_not_logged:
+            raise ValueError(f'more {what} than the file holds')
 
 
 def _without_orientations(tick: Tick) -> Tick:
@@ -234,13 +236,17 @@ def _decoded(message: TickMessage) -> Array:
     return decode(message.topic, deserialize(message.topic.type_name, message.data))
 
 
-def _set_goals(runner: EpisodeRunner, logged: LoggedTick, version: int) -> None:
-    """Does what the node did with the goals it received."""
+def _take_received(runner: EpisodeRunner, logged: LoggedTick, record: EpisodeRecord) -> None:
+    """Does what the node did with the goals and pushes it received."""
     for message in logged.received:
         if message.topic.name == 'set_goal':
             with suppress(ValueError):
                 goal = deserialize(message.topic.type_name, message.data)
-                accept_goal(runner, message.topic, goal, reads_header=version >= 2)
+                accept_goal(runner, message.topic, goal, reads_header=record.interface_version >= 2)
+        elif message.topic.name == 'perturb':
+            with suppress(ValueError):
+                push = deserialize(message.topic.type_name, message.data)
+                accept_perturbation(runner, message.topic, push, record.perturb_limit)
 
 
 def _tick_difference(

@@ -23,16 +23,23 @@ class RecordingContext:
         checkpoint_sha256: Fingerprint of the actor that commands the robot, if one told.
     """
 
-    def __init__(self, simulation: Simulation, *, with_compiled_model: bool = True) -> None:
+    def __init__(
+        self,
+        simulation: Simulation,
+        *,
+        with_compiled_model: bool = True,
+        perturb_limit: float = 0.0,
+    ) -> None:
         """Fingerprints the model.
 
         Args:
             simulation: Whose episodes are logged.
             with_compiled_model: Whether to store the compiled model, meshes and all, 3 MB per
-            episode; its
-                MJCF text is stored in any case.
+                episode; its MJCF text is stored in any case.
+            perturb_limit: Largest force, N, by which the robot lets itself be pushed.
         """
         self._simulation = simulation
+        self._perturb_limit = perturb_limit
         self._model_sha256 = model_sha256(simulation.model)
         # Asked for now: it starts a process, which can hold up a robot that runs.
         self._source_revision = source_revision()
@@ -54,6 +61,7 @@ class RecordingContext:
             model_sha256=self._model_sha256,
             source_revision=self._source_revision,
             checkpoint_sha256=self.checkpoint_sha256,
+            perturb_limit=self._perturb_limit,
             started=datetime.now(UTC).isoformat(timespec='milliseconds'),
         )
 

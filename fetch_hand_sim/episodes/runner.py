@@ -133,6 +133,14 @@ class EpisodeRunner:
         """
         self.simulation.set_goal(goal[None])
 
+    def perturb(self, body: str, wrench: Array) -> None:
+        """Pushes a body during the next tick of the running episode.
+
+        Raises:
+            ValueError: If there is no such body, or the numbers are none.
+        """
+        self.simulation.perturb(body, wrench)
+
     def end_episode(self) -> None:
         """Gives the running episode up: the next tick starts another."""
         if not self.is_between_episodes:

@@ -130,6 +130,7 @@ class Health:
             'episodes finished': str(counters.episodes),
             'episodes successful': str(counters.successes),
             'episodes given up': str(counters.given_up),
+            'perturb limit (N)': f'{robot.perturb_limit:g}',
             'divergences': str(robot.runner.simulation.divergences),
             'log': surroundings.log,
             'commanders': ', '.join(surroundings.commanders) or '-',

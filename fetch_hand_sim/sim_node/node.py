@@ -119,12 +119,14 @@ class SimNode(Node):
         pacer = RealTimePacer(
             simulation.tick_duration, values['real_time_factor'], time.monotonic()
         )
-        return Robot(
+        robot = Robot(
             runner,
             CommandBuffer(runner.spec.robot, values['command_timeout']),
             TickSchedule(values['mode'], pacer),
             self._emit,
         )
+        robot.perturb_limit = values['perturb_limit']
+        return robot
 
     def _open_topics(self) -> dict[str, Publisher]:
         receivers = Receivers(self._robot, self._recorder, self._on_commander, self._warn)
@@ -146,6 +148,7 @@ class SimNode(Node):
         self._recording_context = context = RecordingContext(
             self._robot.runner.simulation,
             with_compiled_model=self._settings['log_compiled_model'],
+            perturb_limit=self._settings['perturb_limit'],
         )
         try:
             leftovers = find_leftovers(Path(directory))

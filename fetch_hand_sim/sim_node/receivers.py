@@ -50,6 +50,7 @@ class Receivers:
                 message.name, message.position
             ),
             'set_goal': robot.set_goal,
+            'perturb': robot.perturb,
             'policy_status': self._policy_status,
         }
 
@@ -84,7 +85,7 @@ class Receivers:
     def _drop(self, spec: TopicSpec, reason: str, line: str) -> None:
         if spec.name == 'set_goal':
             self._robot.counters.goals_rejected += 1
-        elif spec.name != 'policy_status':
+        elif spec.name.endswith('commands'):
             self._robot.buffer.count_rejection(reason, line)
         self._warn(f'{spec.name} dropped: {line}')
 

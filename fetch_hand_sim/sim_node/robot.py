@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fetch_hand_sim.episodes.goals import accept_goal
+from fetch_hand_sim.episodes.perturbations import accept_perturbation
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.schedule import TickSchedule
@@ -71,6 +72,7 @@ class Robot:
         buffer: As above.
         schedule: As above.
         counters: What the robot has done.
+        perturb_limit: Largest force of a push, N; 0 refuses all.
         last_messages: Those of the last tick; whoever hears them again can tell by the stamp.
     """
 
@@ -86,6 +88,7 @@ class Robot:
         self.buffer = buffer
         self.schedule = schedule
         self.counters = Counters()
+        self.perturb_limit = 0.0
         self._emit = emit
         self._clock = clock
         self._encoder = TickEncoder(runner.spec)
@@ -170,6 +173,18 @@ class Robot:
             self.counters.goals_rejected += 1
             raise
         self.counters.goals_set += 1
+
+    def perturb(self, topic: TopicSpec, message: Any) -> None:
+        """Pushes a body during the next tick.
+
+        Args:
+            topic: `perturb` of the task.
+            message: What was received.
+
+        Raises:
+            ValueError: If it is refused, see `accept_perturbation`.
+        """
+        accept_perturbation(self.runner, topic, message, self.perturb_limit)
 
     # Services and parameters
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from gymnasium.utils import seeding
 from mujoco import mjtWarning
@@ -117,6 +118,8 @@ class Simulation:
         self.goals = np.zeros((num_envs, self.spec.goal.size))
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._all = np.arange(num_envs)
+        self._pushes: Array | None = None
+        self._is_pushed = False
 
     @property
     def task(self) -> Task:
@@ -259,6 +262,28 @@ class Simulation:
             wanted[flipped, 3:] *= -1.0
         self.goals[selected] = wanted
 
+    def perturb(self, body: str, wrench: ArrayLike, index: int = 0) -> None:
+        """Pushes a body of one simulation during the next step.
+
+        Args:
+            body: Its name in the model.
+            wrench: (6,) force in N and torque in N m, world axes, at the centre of mass.
+            index: Which simulation.
+
+        Raises:
+            ValueError: If there is no such body that can move, or a value is not finite.
+        """
+        values = np.asarray(wrench, dtype=np.float64)
+        if values.shape != (6,) or not np.isfinite(values).all():
+            raise ValueError(f'a wrench is six finite numbers, not {values.tolist()}')
+        number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY.value, body)
+        if number < 1 or not self.model.body_weldid[number]:
+            raise ValueError(f'no body {body[:40]!r} that can move')
+        if self._pushes is None:
+            self._pushes = self._task.batch.bind('xfrc_applied')
+        self._pushes[index, number] = values
+        self._is_pushed = True
+
     def resting_commands(self) -> Array:
         """Commands (N, action size) that let the robots stay as they are."""
         return self._task.resting_commands()
@@ -314,6 +339,9 @@ class Simulation:
             failed = np.zeros(self.num_envs, dtype=bool)
         except SimulationError as error:
             failed = np.isin(self._all, error.ids)
+        if self._is_pushed and self._pushes is not None:
+            self._pushes[:] = 0.0
+            self._is_pushed = False
         diverged = failed | self._has_diverged()
         if diverged.any():
             self._restart(diverged)

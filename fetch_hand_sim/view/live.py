@@ -24,6 +24,7 @@ from fetch_hand_sim.view.messages import (
     Facts,
     LatestRequest,
     Picture,
+    Push,
     ReleaseGoal,
     Request,
     Reset,
@@ -36,9 +37,10 @@ from fetch_hand_sim.view.messages import (
 )
 from fetch_hand_sim.view.remote_node import RemoteNode
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.codecs import decode_status
+from msgs_spec.codecs import build_message, decode_status
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.ros import rclpy_profile, ros_message_class
+from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, QosSpec, TopicSpec, topic
@@ -92,6 +94,7 @@ class LiveRobot:
             ReleaseGoal: self._release_goal,
             SetCommanding: self._set_commanding,
             SetCommand: self._command,
+            Push: self._push,
         }
         status = topic(_ANY_TASK, 'episode_status')
         self._subscribe(status, status.qos, self._on_status)
@@ -240,6 +243,7 @@ class LiveRobot:
                     rate=_number(values.get('rate (Hz)')),
                     missed_ticks=int(_number(values.get('missed ticks'))),
                     commander=values.get('commanders', '-'),
+                    push_limit=_number(values.get('perturb limit (N)')),
                 )
                 self._is_new = True
 
@@ -304,6 +308,13 @@ class LiveRobot:
         if self._facts.is_commanding:
             self._publish('commands', request.values)
 
+    def _push(self, request: Push) -> None:
+        spec = self.spec
+        if spec is not None:
+            message = build_message(topic(spec, 'perturb'), 0, request.wrench)
+            message.header.frame_id = request.body
+            self._send('perturb', serialize(topic(spec, 'perturb').type_name, message))
+
     def _reset(self, request: Reset) -> None:
         seed = request.seed
         if seed is None:
@@ -325,13 +336,17 @@ class LiveRobot:
         spec = self.spec
         if spec is None:
             return
-        target = topic(spec, name)
+        # Without a stamp a goal is for the episode that runs when it arrives.
+        self._send(name, TopicCodec(topic(spec, name)).encode(0, values))
+
+    def _send(self, name: str, data: bytes) -> None:
+        assert self.spec is not None
+        target = topic(self.spec, name)
         if name not in self._publishers:
             self._publishers[name] = self._node.create_publisher(
                 ros_message_class(target.type_name), target.name, rclpy_profile(target.qos)
             )
-        # Without a stamp a goal is for the episode that runs when it arrives.
-        self._publishers[name].publish(TopicCodec(target).encode(0, values))
+        self._publishers[name].publish(data)
 
     def _withdraw(self, name: str) -> None:
         """Leaves a topic: who publishes commands counts as a commander."""

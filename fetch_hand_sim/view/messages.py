@@ -33,7 +33,7 @@ class Facts:
         speed: Simulated seconds per second, asked for.
         rate: Ticks per second, measured; 0 if unknown.
         missed_ticks: Since the robot started.
-        may_push: Whether the robot accepts pushes.
+        push_limit: Largest force of a push, N; 0 where the robot takes none.
         may_command: Whether this page may act at all.
         actors: Actors to choose from; empty where there is no policy.
         is_commanding: Whether the page sends commands.
@@ -52,7 +52,7 @@ class Facts:
     speed: float = 1.0
     rate: float = 0.0
     missed_ticks: int = 0
-    may_push: bool = False
+    push_limit: float = 0.0
     may_command: bool = True
     actors: tuple[str, ...] = ()
     is_commanding: bool = False
@@ -202,13 +202,11 @@ class Push(LatestRequest):
 
     Attributes:
         body: Name of the body.
-        force: (3,) N, world axes, at the centre of mass.
-        torque: (3,) N m, world axes.
+        wrench: (6,) N and N m, world axes, at the centre of mass.
     """
 
     body: str
-    force: Array
-    torque: Array
+    wrench: Array
 
 
 @dataclass(frozen=True)

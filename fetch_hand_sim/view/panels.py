@@ -24,6 +24,7 @@ from fetch_hand_sim.view.messages import (
     StepOnce,
 )
 from fetch_hand_sim.view.plots import draw_plots
+from fetch_hand_sim.view.push_panel import PushPanel
 from fetch_hand_sim.view.timeline import draw_timeline
 from msgs_spec.actions import resting_command
 from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
@@ -69,6 +70,7 @@ class Panels:
         self._command: Array | None = None
         self._task = ''
         self._hidden: set[str] = set()
+        self._push_panel = PushPanel(send)
         self.keeps_goal = True
 
     def draw(self, picture: Picture | None) -> None:
@@ -135,6 +137,8 @@ class Panels:
         self._draw_time(facts)
         self._draw_goal(spec, picture)
         self._draw_commands(spec, picture)
+        if facts.push_limit and imgui.CollapsingHeader('Push it'):
+            self._push_panel.draw(spec, facts.push_limit)
         if facts.notice:
             imgui.Separator()
             _say(facts.notice)

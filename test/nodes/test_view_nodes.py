@@ -16,7 +16,7 @@ import rclpy
 
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from fetch_hand_sim.view.live import LiveRobot
-from fetch_hand_sim.view.messages import ChooseActor, Reset, SetGoal, SetPaused, StepOnce
+from fetch_hand_sim.view.messages import ChooseActor, Push, Reset, SetGoal, SetPaused, StepOnce
 from msgs_spec.codecs import decode
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic
@@ -45,7 +45,7 @@ class Follower:
 
 
 def test_what_the_page_asks_for_happens(start_process: Start) -> None:
-    start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    start_process(*SIM_NODE, *ros_args(task='FetchReach', perturb_limit=20.0))
     with client(REACH) as connection:
         connection.subscribe('desired_goal')
         follower = Follower(connection)
@@ -61,6 +61,16 @@ def test_what_the_page_asks_for_happens(start_process: Start) -> None:
         )
         follower.robot.perform(Reset(seed=77))
         follower.until(lambda p: p.facts.seed == 77, 'episode of that seed')
+        # Nobody commands, so only a push moves the gripper.
+        before = follower.picture.frame.achieved_goal
+        connection.spin(0.2)
+
+        def is_pushed(picture):
+            follower.robot.perform(Push('robot0:gripper_link', np.array([0, 0, 19.0, 0, 0, 0])))
+            return np.abs(picture.frame.achieved_goal - before).max() > 1e-3
+
+        assert follower.picture.facts.push_limit == 20.0
+        follower.until(is_pushed, 'gripper that was pushed')
         # New episodes keep the goal of the page.
         follower.until(lambda p: np.allclose(p.frame.desired_goal, goal), 'goal in the new episode')
         follower.robot.perform(SetPaused(True))

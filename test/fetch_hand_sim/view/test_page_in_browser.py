@@ -88,7 +88,7 @@ def place_of(task: str, point: np.ndarray) -> tuple[float, float]:
 
 
 def is_red(pixel: np.ndarray) -> bool:
-    return pixel[0] > 110 and pixel[0] > 1.6 * max(pixel[1], pixel[2])
+    return pixel[0] > 110 and pixel[0] > 1.3 * max(pixel[1], pixel[2])
 
 
 def is_green(pixel: np.ndarray) -> bool:

@@ -1,0 +1,132 @@
+"""Pushes: off unless asked for, bounded, a tick long, marked in the log, repeated by its check."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.commands.check_episode import main as check_episode
+from fetch_hand_sim.episode_log import read_episode
+from fetch_hand_sim.episodes.context import RecordingContext
+from fetch_hand_sim.episodes.perturbations import accept_perturbation
+from fetch_hand_sim.episodes.recorder import EpisodeRecorder
+from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.codecs import build_message
+from msgs_spec.schemas import serialize
+from msgs_spec.tasks import TASKS
+from msgs_spec.tick import TickEncoder
+from msgs_spec.topics import topic
+
+LIMIT = 10.0
+
+
+@pytest.fixture(scope='module')
+def simulation():
+    return Simulation('FetchPush', num_threads=1)
+
+
+def push(task, body, *values):
+    """The message of a push; what is not given is 0."""
+    wrench = np.zeros(6)
+    wrench[: len(values)] = values
+    message = build_message(topic(TASKS[task], 'perturb'), 0, wrench)
+    message.header.frame_id = body
+    return message
+
+
+def started(simulation):
+    runner = EpisodeRunner(simulation)
+    runner.advance(runner.resting_command())
+    return runner
+
+
+def object_path(simulation, pushes):
+    """Positions of the object while nothing is commanded; a push before some ticks."""
+    runner, found = started(simulation), []
+    for number in range(10):
+        if number in pushes:
+            accept_perturbation(runner, topic(simulation.spec, 'perturb'), pushes[number], LIMIT)
+        found.append(runner.advance(runner.resting_command()).readings['object_pose'][:3])
+    return np.array(found)
+
+
+def test_a_push_moves_the_object_during_one_tick_and_nothing_remains(simulation):
+    plain = object_path(simulation, {})
+    pushed = object_path(simulation, {3: push('FetchPush', 'object0', 0.0, 0.0, LIMIT)})
+    np.testing.assert_array_equal(pushed[:3], plain[:3])
+    assert np.abs(pushed[4:] - plain[4:]).max() > 1e-5
+    np.testing.assert_array_equal(object_path(simulation, {}), plain)
+
+
+@pytest.mark.parametrize('task', ['FetchReach', 'HandReach', 'HandManipulatePenFull'])
+def test_every_robot_can_be_pushed(task):
+    body = 'robot0:palm' if task.startswith('Hand') else 'robot0:gripper_link'
+    if task.startswith('HandM'):
+        body = 'object'
+    simulation = Simulation(task, num_threads=1)
+    runner = started(simulation)
+    accept_perturbation(runner, topic(simulation.spec, 'perturb'), push(task, body, 5.0), LIMIT)
+    joints = runner.advance(runner.resting_command()).readings['joint_states']
+    other = started(simulation)
+    assert (other.advance(other.resting_command()).readings['joint_states'] != joints).any()
+
+
+@pytest.mark.parametrize(
+    ('message', 'limit', 'line'),
+    [
+        (push('FetchPush', 'object0', 1.0), 0.0, 'off'),
+        (push('FetchPush', 'object0', 10.1), LIMIT, 'allowed: up to 10 N'),
+        (push('FetchPush', 'object0', 8.0, 8.0), LIMIT, 'allowed: up to 10 N'),
+        (push('FetchPush', 'object0', 0, 0, 0, 1.1), LIMIT, 'and 1 N m'),
+        (push('FetchPush', 'object0', np.nan), LIMIT, 'allowed'),
+        (push('FetchPush', 'object0', np.inf), LIMIT, 'allowed'),
+        (push('FetchPush', 'nosuch', 1.0), LIMIT, 'nosuch'),
+        (push('FetchPush', '', 1.0), LIMIT, 'no body'),
+        (push('FetchPush', 'table0', 1.0), LIMIT, 'table0'),
+    ],
+)
+def test_what_is_refused_moves_nothing(simulation, message, limit, line):
+    runner, other = started(simulation), None
+    with pytest.raises(ValueError, match=line):
+        accept_perturbation(runner, topic(simulation.spec, 'perturb'), message, limit)
+    found = runner.advance(runner.resting_command()).readings['object_pose']
+    other = started(simulation)
+    np.testing.assert_array_equal(
+        other.advance(other.resting_command()).readings['object_pose'], found
+    )
+
+
+def test_between_episodes_nothing_is_pushed(simulation):
+    runner = EpisodeRunner(simulation)
+    with pytest.raises(ValueError, match='no episode'):
+        accept_perturbation(
+            runner, topic(simulation.spec, 'perturb'), push('FetchPush', 'object0', 1.0), LIMIT
+        )
+
+
+def test_a_logged_episode_says_so_and_the_check_pushes_as_well(simulation, tmp_path, capsys):
+    context = RecordingContext(simulation, with_compiled_model=False, perturb_limit=LIMIT)
+    failures = []
+    recorder = EpisodeRecorder(
+        tmp_path,
+        metadata=context.metadata,
+        on_error=failures.append,
+        on_logged=lambda episode: None,
+    )
+    runner, encoder = EpisodeRunner(simulation), TickEncoder(simulation.spec)
+    source = topic(simulation.spec, 'perturb')
+    wrench = push('FetchPush', 'object0', 3.0, 0.0, 6.0)
+    while not runner.has_started or not runner.is_between_episodes:
+        tick = runner.advance(runner.resting_command())
+        recorder.record(tick, encoder.encode(tick, latched=tick.status.phase != 'running'))
+        if tick.status.tick in (5, 6, 20) and tick.status.phase == 'running':
+            accept_perturbation(runner, source, wrench, LIMIT)
+            recorder.record_received(source, serialize(source.type_name, wrench))
+    recorder.close('end')
+    assert failures == []
+    (path,) = tmp_path.iterdir()
+    episode = read_episode(path)
+    assert episode.metadata['perturb_limit'] == '10.0'
+    assert len(episode.topics['/perturb'].messages) == 3
+    assert check_episode([str(path)]) == 0, capsys.readouterr()
