@@ -104,9 +104,22 @@ class Job:
     @property
     def env_steps(self) -> float:
         """Environment steps logged so far."""
-        path = self.folder / PROGRESS_FILE
-        rows = read_progress(path) if path.is_file() else []
+        rows = self._rows()
         return rows[-1].get('env_steps', 0.0) if rows else 0.0
+
+    @property
+    def status(self) -> str:
+        """How far it is, in one line."""
+        rows, steps, total = self._rows(), self.env_steps, self.config.total_steps
+        evaluated = [row['eval_success'] for row in rows if 'eval_success' in row]
+        success = f'{evaluated[-1]:.3f}' if evaluated else '-'
+        speed = rows[-1].get('steps_per_second', 0.0) if rows else 0.0
+        left = f'{(total - steps) / speed / 3600:.1f} h' if speed else '-'
+        return f'{self.name}: {steps:,.0f} of {total:,} steps, eval {success}, ETA {left}'
+
+    def _rows(self) -> list[dict[str, float]]:
+        path = self.folder / PROGRESS_FILE
+        return read_progress(path) if path.is_file() else []
 
     def check_configuration(self) -> None:
         """Refuses a folder whose run was configured otherwise.

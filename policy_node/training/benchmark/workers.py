@@ -21,6 +21,8 @@ from policy_node.training.benchmark.jobs import Job, JobError, JobTakenError, ru
 
 LOG_FILE = 'log.txt'
 _SET_PARENT_DEATH_SIGNAL = 1
+# Seconds between two lines about each running job.
+_STATUS_SECONDS = 600.0
 
 
 class Outcome(Enum):
@@ -151,7 +153,10 @@ class Processes:
 
     def wait(self) -> tuple[Job, Outcome]:
         """Waits for one of the processes."""
-        sentinel = next(iter(wait(list(self._running))))
+        while not (over := wait(list(self._running), timeout=_STATUS_SECONDS)):
+            for job, _ in self._running.values():
+                print(job.status, flush=True)
+        sentinel = over[0]
         assert isinstance(sentinel, int)
         job, process = self._running.pop(sentinel)
         process.join()

@@ -156,10 +156,12 @@ class Trainer:
         self.experience.generator = self._seed(self.counters.env_steps)
         limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
         self._refill = self.workers.share(min(limits))
+        file = self._folder.replay_file(self.workers.rank)
         try:
-            load_replay(self._folder.replay_file(self.workers.rank), self.experience.replay)
+            load_replay(file, self.experience.replay)
         except ValueError as error:
-            complain(NAME, error)
+            if file.exists():
+                complain(NAME, error)
             complain(NAME, f'{self._refill:,} steps fill the replay before learning goes on')
 
     def _let_critic_learn_first(self) -> None:

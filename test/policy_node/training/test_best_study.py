@@ -57,6 +57,16 @@ def test_a_task_alone_starts_from_nothing(tmp_path: Path) -> None:
     assert job.after is None and job.config.init_from == ''
 
 
+def test_the_status_of_a_job_says_how_far_it_is_and_how_long_it_will_take(tmp_path: Path) -> None:
+    (job,) = jobs_of('--tasks', 'FetchPush', '--output', str(tmp_path), '--steps', '1000000')
+    name = 'FetchPush/best/seed0'
+    assert job.status == f'{name}: 0 of 1,000,000 steps, eval -, ETA -'
+    job.folder.mkdir(parents=True)
+    lines = ['env_steps,eval_success,steps_per_second', '200000,0.25,90', '280000,,100']
+    (job.folder / 'progress.csv').write_text('\n'.join(lines))
+    assert job.status == f'{name}: 280,000 of 1,000,000 steps, eval 0.250, ETA 2.0 h'
+
+
 class Recorder:
     """A place where jobs take no time; some of them fail."""
 
