@@ -141,7 +141,7 @@ def test_launch_files_name_installed_executables_and_files(prefix, executables):
     launch_files = list((prefix / 'share' / PACKAGE / 'launch').glob('*.launch.xml'))
     for path in launch_files:
         text = path.read_text()
-        launched = ElementTree.fromstring(text).findall('node')
+        launched = list(ElementTree.fromstring(text).iter('node'))
         assert {node.get('pkg') for node in launched} == {PACKAGE}
         assert {node.get('exec') for node in launched} <= executables
         for part in text.split(f'$(find-pkg-share {PACKAGE})/')[1:]:
