@@ -98,6 +98,7 @@ setup(
         'rosbags>=0.10',
         'safetensors>=0.4',
         'shtab>=1.7',
+        'threadpoolctl>=3',
         'zstandard>=0.20',
     ],
     extras_require={

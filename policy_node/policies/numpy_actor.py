@@ -3,15 +3,20 @@
 It computes in float64 with the float32 weights and rounds the action to float32, so that neither
 the size of a batch nor the order in which a library adds changes more than, rarely, the last bit.
 torch computes in float32 throughout; `docs/training.md` has the difference.
+
+One thread: matrices of this size gain nothing from more, and the threads of a BLAS wait busily, on
+cores that the simulation needs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from policy_node.policies import checkpoint
 from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
@@ -56,13 +61,18 @@ class NumpyActor:
         # Rounded to float32 first, as in training.
         state = observation_part(observation, 'observation', shape.observation_size)
         goal = observation_part(observation, 'desired_goal', shape.goal_size)
-        layer = self._features(state.astype(np.float64), goal.astype(np.float64))
+        features = self._features(state.astype(np.float64), goal.astype(np.float64))
+        with _blas().limit(limits=1):
+            return np.tanh(self._forward(features)).astype(np.float32), None
+
+    def _forward(self, layer: Array) -> Array:
+        shape = self.shape
         for index, name in enumerate(shape.layer_names):
             layer = self._linear(name, layer)
             if shape.layer_norm:
                 layer = self._norm(shape.norm_names[index], layer)
             layer = np.maximum(layer, 0.0)
-        return np.tanh(self._linear('network.output', layer)).astype(np.float32), None
+        return self._linear('network.output', layer)
 
     def _features(self, state: Array, goal: Array) -> Array:
         normalized = (
@@ -87,6 +97,12 @@ class NumpyActor:
         variance = np.square(centred).mean(axis=-1, keepdims=True)
         scaled = centred / np.sqrt(variance + _NORM_EPSILON)
         return np.asarray(scaled * self._values[f'{name}.weight'] + self._values[f'{name}.bias'])
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """The libraries behind NumPy's matrix products."""
+    return ThreadpoolController().select(user_api='blas')
 
 
 def load_checkpoint(path: Path, task: str | None = None) -> LoadedPolicy:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from threadpoolctl import threadpool_info
 
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from policy_node import load_policy
@@ -93,6 +94,23 @@ def test_a_batch_is_answered_as_its_rows() -> None:
     rows = [policy.predict({k: v[i] for k, v in observation.items()})[0] for i in range(64)]
     # In float64 first: all but the rare last bit.
     np.testing.assert_allclose(batch, rows, rtol=2e-7, atol=1e-9)
+
+
+def test_acting_takes_one_thread_and_leaves_the_rest_as_it_was() -> None:
+    seen = []
+
+    class Watched(NumpyActor):
+        def _forward(self, layer: np.ndarray) -> np.ndarray:
+            seen.extend(library['num_threads'] for library in threadpool_info())
+            return super()._forward(layer)
+
+    found = checkpoint.read(shipped_actors()['FetchPush'])
+    before = threadpool_info()
+    Watched(found.info.shape, found.tensors).predict(observations(task_spec('FetchPush'), 64))
+    blas = [library for library in before if library['user_api'] == 'blas']
+    assert blas and len(seen) == len(before)
+    assert seen.count(1) >= len(blas)
+    assert threadpool_info() == before
 
 
 @pytest.mark.parametrize('task', ['FetchReach', 'HandReach'])
