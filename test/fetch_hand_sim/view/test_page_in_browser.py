@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -20,6 +21,7 @@ from PIL import Image
 from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.view.ray import mouse_ray
+from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode
 from msgs_spec.tasks import TASKS
 from msgs_spec.topics import topic
@@ -72,6 +74,14 @@ def wait_for_scene(browser: Browser, seconds: float = 60.0) -> np.ndarray:
             browser.wait(2.0)
             return browser.screenshot()
     raise AssertionError('nothing is drawn')
+
+
+def wait_for(browser: Browser, condition: Callable[[np.ndarray], bool], what: str) -> None:
+    """Waits until the page looks as it should."""
+    end = time.monotonic() + 60.0
+    while not condition(browser.screenshot()):
+        assert time.monotonic() < end, f'no {what}'
+        browser.wait(0.5)
 
 
 def place_of(task: str, point: np.ndarray) -> tuple[float, float]:
@@ -137,12 +147,19 @@ def test_dragging_the_goal_moves_it_and_the_actor_gets_there(browser, start_proc
     url = address_of(start_process(*VIEW))
     browser.open(url)
     wait_for_scene(browser)
+    # Before the robot, as the camera sees it.
+    goal = np.array([1.45, 0.6, 0.65])
+    target = topic(robot.spec, 'set_goal')
+    robot.connect('set_goal')
+
+    def is_there():
+        robot.publisher('set_goal').publish(TopicCodec(target).encode(0, goal))
+        return np.allclose(latest(robot, 'desired_goal'), goal)
+
+    robot.spin_until(is_there, 'goal in view')
     robot.call(SetBool, '/sim_node/pause', data=True)
-    robot.spin(0.5)
-    goal = latest(robot, 'desired_goal')
     x, y = place_of('FetchReach', goal)
-    picture = browser.screenshot()
-    assert is_red(picture[round(y), round(x)]), picture[round(y), round(x)]
+    wait_for(browser, lambda picture: is_red(picture[round(y), round(x)]), 'goal on the page')
     for offset in (3.0, 0.0):
         browser.move(x + offset, y)
         browser.wait(0.5)
