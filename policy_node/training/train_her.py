@@ -115,6 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace, command: str) -> int:
     require_extra('train')
+    from policy_node.training.learning.distributed import is_first_worker
     from policy_node.training.learning.run import train_run
 
     try:
@@ -128,10 +129,11 @@ def _run(options: argparse.Namespace, command: str) -> int:
     ending = train_run(config, output, resume=resume, command=command, experience=experience)
     counters = ending.counters
     best = f'{counters.best_success:.3f}' if counters.best_success >= 0 else 'not evaluated'
-    print(
-        f'{ending.reason}: {counters.env_steps:,} steps, {counters.updates:,} updates, '
-        f'{counters.seconds:.0f} s, best success {best}; output in {output}'
-    )
+    if is_first_worker():
+        print(
+            f'{ending.reason}: {counters.env_steps:,} steps, {counters.updates:,} updates, '
+            f'{counters.seconds:.0f} s, best success {best}; output in {output}'
+        )
     return EXIT_SIGNAL + ending.signal if ending.signal else EXIT_SUCCESS
 
 

@@ -70,6 +70,11 @@ class Workers:
         return bool(self.sum(torch.tensor([float(flag)])).item() > 0)
 
 
+def is_first_worker() -> bool:
+    """Whether this process will be worker 0; known before the workers have joined."""
+    return os.environ.get('RANK', '0') == '0'
+
+
 def join_workers(device: torch.device) -> Workers:
     """Joins the workers that `torchrun` started; a single process is alone."""
     world_size = int(os.environ.get('WORLD_SIZE', '1'))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import os
 import signal
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from fetch_hand_sim.episodes.context import source_revision
 from msgs_spec.command_line import CommandError, UsageError, complain, require_extra
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.ddpg import choose_device
-from policy_node.training.learning.distributed import join_workers, leave_workers
+from policy_node.training.learning.distributed import is_first_worker, join_workers, leave_workers
 from policy_node.training.learning.initial_networks import (
     InitialNetworks,
     read_initial_networks,
@@ -70,8 +69,7 @@ def train_run(
     """
     require_extra('train')
     networks = _initial_networks(config) if config.init_from and not resume else None
-    is_first = os.environ.get('RANK', '0') == '0'
-    with lock_run(output) if is_first else contextlib.nullcontext():
+    with lock_run(output) if is_first_worker() else contextlib.nullcontext():
         if not resume and (output / STATE_FILE).exists():
             raise UsageError(f'{output} holds a run; continue it with --resume or choose another')
         try:
