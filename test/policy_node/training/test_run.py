@@ -278,13 +278,3 @@ def test_a_full_disk_leaves_no_partial_file_and_the_checkpoint_before(
         assert (tmp_path / STATE).read_bytes() == before[STATE]
     trainer.save()
     assert json.loads(read_tensors(tmp_path / STATE)[1]['counters'])['updates'] == 20
-
-
-def test_only_the_first_of_several_workers_reports(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    arguments = ['--task', 'FetchReach', *SET, '--steps', '400']
-    for rank, reports in (('0', 1), ('1', 0)):
-        monkeypatch.setenv('RANK', rank)
-        assert main([*arguments, '--output', str(tmp_path / rank)]) == 0
-        assert capsys.readouterr().out.count('400 environment steps done') == reports
