@@ -13,3 +13,13 @@ def script_environment(environment: dict[str, str] | None = None) -> dict[str, s
     """The environment in which a script of this folder finds this folder and the packages."""
     paths = os.pathsep.join(str(path) for path in (ROOT, SUPPORT.parent))
     return dict(os.environ if environment is None else environment) | {'PYTHONPATH': paths}
+
+
+def peak_memory() -> int:
+    """Most memory this process has held since its program started, bytes.
+
+    Not `ru_maxrss`: that of a process starts at what its parent held when it was forked.
+    """
+    status = Path('/proc/self/status').read_text()
+    (line,) = (line for line in status.splitlines() if line.startswith('VmHWM'))
+    return int(line.split()[1]) * 1024

@@ -40,6 +40,7 @@ from fetch_hand_sim.commands import (
 from fetch_hand_sim.episode_log import EpisodeReadError, load_episodes, read_episode
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
 from msgs_spec.schemas import schema_text
+from support import peak_memory
 
 MEMORY_BYTES = 500 * 10**6
 CPU_SECONDS = 2.0
@@ -470,7 +471,7 @@ def main() -> int:
             'recover_episodes': 'exit 0',
         }
         expected = attack.outside()
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        before = peak_memory()
         maker.submit(int).result()
         mapped = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (mapped + MEMORY_BYTES,) * 2)
@@ -491,7 +492,7 @@ def main() -> int:
                     raise
                 slowest = max(slowest, (seconds, f'{name}, file {number} ({kind})'))
                 signal.alarm(0)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    peak = peak_memory()
     report = {
         'outcomes': outcomes,
         'slowest_s': slowest[0],

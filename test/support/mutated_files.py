@@ -43,6 +43,7 @@ from fetch_hand_sim.episode_log import (
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays
 from fetch_hand_sim.episode_log.summary import EpisodeSummary
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
+from support import peak_memory
 
 # Beyond what the interpreter with all libraries has mapped when the first file is read.
 MEMORY_BYTES = 768 * 2**20
@@ -316,7 +317,7 @@ def main() -> int:
                     raise
                 slowest = max(slowest, time.process_time() - began)
                 signal.alarm(0)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    peak = peak_memory()
     print(json.dumps({'outcomes': counts, 'slowest_s': slowest, 'peak_bytes': peak}))
     return 0
 
