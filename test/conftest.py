@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -11,6 +10,8 @@ import tempfile
 from collections.abc import Callable, Iterator
 
 import pytest
+
+from support.run_guard import start_guard
 
 # Low domains are what people set by hand; above 101 the ports of DDS meet Linux' ephemeral ones.
 DOMAINS = range(40, 102)
@@ -58,9 +59,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     domain, lock = reserve_domain()
-    config.add_cleanup(lock.close)
     log_directory = tempfile.mkdtemp(prefix='ros_log_')
-    config.add_cleanup(lambda: shutil.rmtree(log_directory, ignore_errors=True))
+    start_guard(lock, log_directory)
     os.environ.update(
         ROS_DOMAIN_ID=str(domain),
         ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',

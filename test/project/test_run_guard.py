@@ -1,0 +1,80 @@
+"""A test run that is killed leaves no node behind, and its ROS domain is free again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from conftest import DOMAIN_LOCK_PORT
+
+from support import ROOT, script_environment
+from support.run_guard import processes_of
+
+# What the run starts, and what that starts in a session of its own.
+TEST = """
+import os, sys, time
+
+def test_for_ever(start_process):
+    command = (sys.executable, '-m', 'fetch_hand_sim', 'demo', '--episodes', '100')
+    start_process(*command, cwd={folder!r})
+    print(os.environ['ROS_DOMAIN_ID'], os.environ['ROS_LOG_DIR'], flush=True)
+    time.sleep(600)
+"""
+TIMEOUT = 30.0
+
+
+def wait_until(condition: Callable[[], bool], what: str) -> None:
+    end = time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < end, f'{what} after {TIMEOUT} s'
+        time.sleep(0.05)
+
+
+def is_reserved(domain: int) -> bool:
+    with socket.socket() as lock:
+        try:
+            lock.bind(('', DOMAIN_LOCK_PORT + domain))
+        except OSError:
+            return True
+    return False
+
+
+def is_running(process: int) -> bool:
+    try:
+        state = Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()[0]
+    except OSError:
+        return False
+    return state != 'Z'
+
+
+def test_a_killed_run_takes_its_nodes_along(tmp_path):
+    test = tmp_path / 'test_for_ever.py'
+    test.write_text(TEST.format(folder=str(tmp_path)))
+    command = [sys.executable, '-m', 'pytest', '-s', '-q', '-p', 'conftest', str(test)]
+    options = [f'--rootdir={tmp_path}', '-c', os.devnull]
+    run = subprocess.Popen(
+        command + options,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=script_environment(),
+    )
+    try:
+        words = run.stdout.readline().split()
+        domain, log_directory = int(words[0]), words[1]
+        # The demo, the robot and its policy.
+        wait_until(lambda: len(processes_of(log_directory)) >= 3, 'too few processes')
+        started = processes_of(log_directory)
+        assert is_reserved(domain)
+    finally:
+        run.send_signal(signal.SIGKILL)
+        run.communicate()
+    wait_until(lambda: not any(is_running(process) for process in started), 'a node left')
+    wait_until(lambda: not is_reserved(domain), 'a domain still reserved')
+    wait_until(lambda: not Path(log_directory).exists(), 'a folder of logs left')
