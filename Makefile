@@ -9,7 +9,7 @@ EPISODES ?= 5
 SECONDS ?= 60
 
 PACKAGES := msgs_spec fetch_hand_sim policy_node
-PYTHON_FILES := $(PACKAGES) bench examples test tools setup.py
+PYTHON_FILES := $(PACKAGES) bench docs/conf.py examples test tools setup.py
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.complete
 
@@ -17,7 +17,7 @@ STAMP := $(VENV)/.complete
 # not leak in.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo pictures test test-browser lint format twin bench-sim bench-view bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
+.PHONY: help env demo docs tables pictures test test-browser lint format twin bench-sim bench-view bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -26,6 +26,8 @@ help:
 	@echo 'make test-browser  the page in an installed Chromium'
 	@echo 'make lint       ruff and mypy only'
 	@echo 'make format     let ruff rewrite the code'
+	@echo 'make docs       the documentation as pages: build/docs/index.html'
+	@echo 'make tables     what pages say in numbers, from the package and the shipped actors'
 	@echo 'make pictures   the film of the README and a picture of every task, from logged episodes'
 	@echo 'make twin       the long comparison with Gymnasium-Robotics, 20 seeds per task'
 	@echo 'make bench-sim  simulation speed against its peers'
@@ -73,6 +75,15 @@ format: env
 twin: env
 	$(BIN)/python -m pytest --twin-seeds 20 --timeout 0 test/fetch_hand_sim/simulation/test_twin.py
 
+docs: env
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs
+	@echo 'build/docs/index.html'
+
+tables: env
+	$(BIN)/python tools/interface_table.py --write docs/interface.md
+	$(BIN)/python tools/readme_tables.py --write README.md docs/simulation.md
+	$(BIN)/python tools/task_pages.py --write
+
 pictures: env
 	$(BIN)/python tools/make_pictures.py
 
@@ -112,7 +123,7 @@ bench-episodes: env
 	$(BIN)/python bench/bench_episode_log.py
 
 clean:
-	rm -rf build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf build docs/generated install log *.egg-info .mypy_cache .ruff_cache .pytest_cache
 	find $(PYTHON_FILES) -name __pycache__ -prune -exec rm -rf {} +
 
 distclean: clean

@@ -30,6 +30,8 @@ EXTRAS = {
     # `benchmark --ray`.
     'cluster': [*ACTORS, 'matplotlib>=3.8', 'ray>=2.10'],
 }
+# `make docs`; docutils 0.23 is too new for Sphinx 9.0.
+DOCS = ['furo>=2025.12', 'myst-parser>=5', 'sphinx>=9,<10']
 # What test/ needs beyond all of that. An extra called `test` makes `colcon test` use pytest.
 TEST = [
     'colcon-core',
@@ -104,6 +106,7 @@ setup(
     extras_require={
         **EXTRAS,
         'all': sorted({each for needed in EXTRAS.values() for each in needed}),
+        'docs': DOCS,
         'test': TEST,
         'dev': [*TEST, 'mypy', 'pymcap-cli', 'ruff', 'types-PyYAML'],
     },

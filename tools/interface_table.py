@@ -48,7 +48,7 @@ def interface_markdown() -> str:
         ('Parameters', _parameter_table()),
         ('Services', _service_table()),
     ]
-    return '\n\n'.join(f'### {title}\n\n{text}' for title, text in parts)
+    return '\n\n'.join(f'## {title}\n\n{text}' for title, text in parts)
 
 
 def replace_section(text: str) -> str:

@@ -43,4 +43,4 @@ pip_install pip setuptools
 # The pinned setuptools builds the package, not whichever is newest on the day. Its advice about
 # editable installations is for other layouts.
 PYTHONWARNINGS=ignore:::setuptools.command.editable_wheel \
-    pip_install --no-build-isolation --editable '.[ros,train,data,onnx,sb3,film,cluster,dev]'
+    pip_install --no-build-isolation --editable '.[ros,train,data,onnx,sb3,film,cluster,docs,dev]'

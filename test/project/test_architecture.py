@@ -62,7 +62,8 @@ def test_only_the_first_column_of_a_folders_table_counts(page: str, named: list[
 
 def pages() -> list[Path]:
     """The documentation, without the history in the changelog."""
-    return sorted([ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *(ROOT / 'docs').rglob('*.md')])
+    docs = [path for path in (ROOT / 'docs').rglob('*.md') if path.parent.name != 'generated']
+    return sorted([ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *docs])
 
 
 def lost_files(page: str) -> list[str]:
@@ -85,6 +86,20 @@ def test_files_named_by_the_documentation_exist(page: Path) -> None:
 def test_links_between_pages_lead_somewhere(page: Path) -> None:
     targets = re.findall(r'\]\(([^)#:\s]+)(?:#[^)]*)?\)', page.read_text())
     assert [each for each in targets if not (page.parent / each).exists()] == []
+
+
+def test_every_page_is_in_the_documentation() -> None:
+    """What no table of contents names, Sphinx would warn of; GitHub's readers would not find it."""
+    listed: set[Path] = set()
+    for page in pages():
+        for block in re.findall(
+            r'^```{toctree}\n(.*?)^```', page.read_text(), re.DOTALL | re.MULTILINE
+        ):
+            names = (line for line in block.splitlines() if line and not line.startswith(':'))
+            listed |= {(page.parent / f'{name}.md').resolve() for name in names}
+    docs = {page for page in pages() if ROOT / 'docs' in page.parents} - {ROOT / 'docs/index.md'}
+    assert docs - listed == set()
+    assert {path for path in listed - docs if path.parent.name != 'generated'} == set()
 
 
 @pytest.mark.parametrize('path', ['fetch_hand_sim/episode_check.py', 'rewards_of_old.py'])

@@ -1,0 +1,73 @@
+"""What docs/promises.md promises to stay, name by name, as it was in version 1.0."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from importlib.metadata import distribution
+
+from gymnasium.envs.registration import registry
+
+from fetch_hand_sim.commands.main import COMMANDS, Command
+from fetch_hand_sim.gym_envs.registration import reference_ids
+from msgs_spec.parameters import NODES
+from msgs_spec.services import SERVICES
+from msgs_spec.tasks import TASKS
+from msgs_spec.tick import PHASES, EpisodeStatus
+from msgs_spec.topics import MONITORING, topics
+from policy_node.training.learning.config import TrainConfig
+from support import ROOT
+
+# One promise per line, written by `write` when 1.0 was released. Lines may be added, never changed.
+PROMISED = ROOT / 'test' / 'data' / 'promises_1_0.txt'
+
+
+def present() -> Iterator[str]:
+    """Everything of the kinds that are promised, as it is now."""
+    for name, task in TASKS.items():
+        parts = ' '.join(f'{part.name}:{part.size}' for part in task.observation)
+        limits = f'{task.distance_threshold:g} m, {task.rotation_threshold or 0:g} rad'
+        yield f'task {name}: {task.goal.name} {task.episode_ticks} ticks, {limits}'
+        yield f'observation {name}: {parts}'
+        yield f'joints {name}: {" ".join(task.robot.joints)}'
+        commands = (f'{p.name}:{p.lower:g}:{p.upper:g}' for p in task.robot.command)
+        yield f'command {name}: {" ".join(commands)}'
+        for topic in (*topics(task), *MONITORING):
+            quality = f'{topic.qos.reliability} {topic.qos.durability}'
+            yield f'topic {name}: {topic.direction} {topic.name} {topic.type_name} {quality}'
+    yield from (f'service {spec.node}: {spec.name} {spec.type_name}' for spec in SERVICES)
+    for node, parameters in NODES.items():
+        yield from (f'parameter {node}: {p.name} {p.type} {p.default!r}' for p in parameters)
+    yield from (f'episode_status: {field.name}' for field in dataclasses.fields(EpisodeStatus))
+    yield from (f'phase: {phase}' for phase in PHASES)
+    yield from (f'command line: {words}' for words in command_lines(COMMANDS))
+    scripts = distribution('fetch_hand_sim').entry_points.select(group='console_scripts')
+    yield from (f'executable: {script.name}' for script in scripts)
+    yield from (f'training field: {field.name}' for field in dataclasses.fields(TrainConfig))
+    own = (name for name in registry if name.startswith('fetch_hand_sim/'))
+    yield from (f'environment: {name}' for name in (*own, *reference_ids()))
+
+
+def command_lines(commands: dict[str, Command], before: str = '') -> Iterator[str]:
+    """The commands of the one command, with what comes before each."""
+    for name, command in commands.items():
+        yield f'{before}{name}'
+        yield from command_lines(command.commands, f'{before}{name} ')
+
+
+def test_nothing_promised_is_gone() -> None:
+    promised = set(PROMISED.read_text(encoding='utf-8').splitlines())
+    assert len(promised) > 300
+    gone = sorted(promised - set(present()))
+    assert not gone, 'promised for all of 1.x in docs/promises.md, and gone: ' + '\n'.join(gone)
+
+
+def test_a_changed_default_would_be_noticed() -> None:
+    (line,) = (line for line in present() if line.startswith('parameter sim_node: control_hz '))
+    assert line == 'parameter sim_node: control_hz double 25.0'
+    assert line in PROMISED.read_text(encoding='utf-8').splitlines()
+
+
+def write() -> None:
+    """Writes the promises of a release: for the next major version."""
+    PROMISED.write_text('\n'.join(sorted(set(present()))) + '\n', encoding='utf-8')
