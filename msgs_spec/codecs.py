@@ -216,6 +216,11 @@ _CODECS: dict[str, tuple[_Builder, _Reader]] = {
         lambda _, values: {'point': _xyz('Point', values)},
         lambda _, message: _read_xyz(message.point),
     ),
+    # Vectors of one number.
+    'geometry_msgs/msg/Vector3Stamped': (
+        lambda _, values: {'vector': _xyz('Vector3', np.array([values[0], 0.0, 0.0]))},
+        lambda _, message: [message.vector.x],
+    ),
     'geometry_msgs/msg/PoseStamped': (
         lambda _, values: {'pose': _pose(values[:3], values[3:])},
         lambda _, message: _read_pose(message.pose.position, message.pose.orientation),

@@ -17,12 +17,17 @@ from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS, GoalKind, TaskSpec, VectorPart
 from msgs_spec.tick import PHASES, EpisodeStatus
 from msgs_spec.topics import MONITORING, QosSpec, TopicSpec, topics
+from msgs_spec.view_topics import view_topics
 
 START, END = '<!-- interface table -->', '<!-- /interface table -->'
 
 _PUBLISHING = (
     'All messages of a tick carry one stamp. `reward` and `applied_command` start with the first\n'
     'step of an episode; `episode_status` is sent when it changes, `desired_goal` every tick.'
+)
+_VIEWING = (
+    'None of them is logged. The scalars of a tick carry its stamp, for plots: '
+    '`scalars/distance/vector/x`.'
 )
 _FAMILIES: dict[str, Callable[[TaskSpec], bool]] = {
     'all': lambda task: True,
@@ -35,14 +40,19 @@ _FAMILIES: dict[str, Callable[[TaskSpec], bool]] = {
     ),
     'HandReach': lambda task: task.goal is GoalKind.FINGERTIPS,
     'HandManipulate*': lambda task: task.goal is GoalKind.POSE,
+    'whose position counts': lambda task: task.position_counts,
 }
 
 
 def interface_markdown() -> str:
     """Returns the section as GitHub Markdown."""
     parts = [
-        ('Topics published by `sim_node`', f'{_topic_table("published")}\n\n{_PUBLISHING}'),
-        ('Topics `sim_node` subscribes to', _topic_table('subscribed')),
+        ('Topics published by `sim_node`', f'{_topic_table(_published)}\n\n{_PUBLISHING}'),
+        ('Topics `sim_node` subscribes to', _topic_table(_subscribed)),
+        (
+            'Topics published by `visualization_node`',
+            f'{_topic_table(view_topics)}\n\n{_VIEWING}',
+        ),
         ('Order of values', _orders()),
         ('Observation vectors', _observation_table()),
         ('Parameters', _parameter_table()),
@@ -83,26 +93,32 @@ def _family(tasks: Iterable[TaskSpec]) -> str:
     raise LookupError(f'no name for the tasks {", ".join(sorted(names))}')
 
 
-def _topic_names() -> list[str]:
+def _published(task: TaskSpec) -> list[TopicSpec]:
+    return [s for s in (*topics(task), *MONITORING) if s.direction == 'published']
+
+
+def _subscribed(task: TaskSpec) -> list[TopicSpec]:
+    return [s for s in topics(task) if s.direction == 'subscribed']
+
+
+def _topic_names(topics_of: Callable[[TaskSpec], Iterable[TopicSpec]]) -> list[str]:
     """Names of the topics of all tasks, in an order that agrees with that of each task."""
     names: list[str] = []
     for task in TASKS.values():
         place = 0
-        for spec in topics(task):
+        for spec in topics_of(task):
             if spec.name not in names:
                 names.insert(place, spec.name)
             place = names.index(spec.name) + 1
     return names
 
 
-def _topic_table(direction: str) -> str:
+def _topic_table(topics_of: Callable[[TaskSpec], Iterable[TopicSpec]]) -> str:
     tasks: dict[TopicSpec, list[TaskSpec]] = {}
     for task in TASKS.values():
-        for spec in topics(task):
+        for spec in topics_of(task):
             tasks.setdefault(spec, []).append(task)
-    names = _topic_names()
-    ordered = [*sorted(tasks, key=lambda spec: names.index(spec.name)), *MONITORING]
-    tasks |= {spec: list(TASKS.values()) for spec in MONITORING}
+    names = _topic_names(topics_of)
     return _table(
         ('topic', 'type', 'tasks', 'values', 'unit', 'frame', 'QoS', 'content'),
         (
@@ -116,8 +132,7 @@ def _topic_table(direction: str) -> str:
                 _qos(spec.qos),
                 spec.description,
             )
-            for spec in ordered
-            if spec.direction == direction
+            for spec in sorted(tasks, key=lambda spec: names.index(spec.name))
         ),
     )
 

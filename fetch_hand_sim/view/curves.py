@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
-from fetch_hand_sim.view.messages import Series
+from fetch_hand_sim.view.messages import Graphs, Series
 from msgs_spec.tasks import TaskSpec
 
 Array = NDArray[np.float64]
@@ -29,10 +29,6 @@ class Curves:
             for part in spec.robot.command
         ]
 
-    def clear(self) -> None:
-        """Forgets everything."""
-        self._count = 0
-
     def add(self, time: float, frame: Frame, reward: float | None, command: Array | None) -> None:
         """Appends a tick.
 
@@ -49,31 +45,16 @@ class Curves:
         row[4:] = np.concatenate([nothing if command is None else command, self._positions(frame)])
         self._count += 1
 
-    @property
-    def distance(self) -> Series | None:
-        """Distance to the goal, metres; None where it does not count."""
-        counts = self._spec.rotation_threshold is None or self._spec.position_counts
-        return self._series(1) if counts else None
-
-    @property
-    def rotation(self) -> Series | None:
-        """Rotation to the goal, radians; None where there is none."""
-        return None if self._spec.rotation_threshold is None else self._series(2)
-
-    @property
-    def reward(self) -> Series:
-        """Reward of each tick."""
-        return self._series(3)
-
-    @property
-    def commands(self) -> Series:
-        """Commands, (ticks, action size)."""
-        return self._series(slice(4, 4 + len(self._commanded)))
-
-    @property
-    def positions(self) -> Series:
-        """The joints that the commands move, rad; for Fetch the gripper's path in x 0.05 m."""
-        return self._series(slice(4 + len(self._commanded), None))
+    def graphs(self) -> Graphs:
+        """What is kept, in the order of time."""
+        commands = len(self._commanded)
+        return Graphs(
+            distance=self._series(1) if self._spec.position_counts else None,
+            rotation=None if self._spec.rotation_threshold is None else self._series(2),
+            reward=self._series(3),
+            commands=self._series(slice(4, 4 + commands)),
+            positions=self._series(slice(4 + commands, None)),
+        )
 
     def _positions(self, frame: Frame) -> Array:
         """What the commands move; a gripper's axes are no joints and stay out."""

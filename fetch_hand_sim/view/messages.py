@@ -5,7 +5,7 @@ Snapshots are replaced by newer ones, events all arrive (`mujoco.studio.messages
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from mujoco.studio import messages
@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.scene import Frame, Scene
 
 Array = NDArray[np.float64]
+
+# How much of the way of an object is drawn.
+TRAIL_TICKS = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +69,35 @@ class Series:
     times: Array
     values: Array
 
+    def until(self, time: float) -> Series:
+        """The curve up to a time."""
+        known = self.times <= time + 1e-9
+        return Series(self.times[known], self.values[known])
+
+
+@dataclass(frozen=True, slots=True)
+class Graphs:
+    """The curves of the page; None for what the task does not have.
+
+    Attributes:
+        distance: To the goal, m.
+        rotation: To the goal, rad.
+        reward: Of each tick.
+        commands: One column per command: (ticks,) times and (ticks, commands) values.
+        positions: The joints that the commands drive, likewise; NaN for a gripper's path.
+    """
+
+    distance: Series | None = None
+    rotation: Series | None = None
+    reward: Series | None = None
+    commands: Series | None = None
+    positions: Series | None = None
+
+    def until(self, time: float) -> Graphs:
+        """The curves up to a time."""
+        series = (getattr(self, each.name) for each in fields(self))
+        return Graphs(*(each.until(time) if each is not None else None for each in series))
+
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
@@ -98,11 +130,7 @@ class Picture(messages.Snapshot):
         stamp_ns: Simulated time of the frame, nanoseconds.
         trail: Where the object or gripper was before.
         facts: In words.
-        distance: Distance to the goal, m, as a curve.
-        rotation: Rotation to the goal, rad, likewise.
-        reward: Likewise.
-        commands: One curve per command: (ticks,) times and (ticks, commands) values.
-        positions: The joints that the commands drive, likewise; for Fetch the gripper.
+        graphs: What it did before, as curves.
         command: The last applied command.
         timeline: Where a file is being played; None for a running robot.
     """
@@ -112,11 +140,7 @@ class Picture(messages.Snapshot):
     stamp_ns: int = 0
     trail: tuple[Array, ...] = ()
     facts: Facts = field(default_factory=Facts)
-    distance: Series | None = None
-    rotation: Series | None = None
-    reward: Series | None = None
-    commands: Series | None = None
-    positions: Series | None = None
+    graphs: Graphs = field(default_factory=Graphs)
     command: Array | None = None
     timeline: Timeline | None = None
 

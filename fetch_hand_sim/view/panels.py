@@ -86,7 +86,7 @@ class Panels:
             self._draw_robot(spec, picture)
             imgui.End()
         if self._begin('Curves###curves', size.x - _WIDTH - _MARGIN):
-            draw_plots(spec, picture, _WIDTH)
+            draw_plots(spec, picture.graphs, _WIDTH)
             imgui.End()
         if picture.timeline is not None:
             _place(_MARGIN, size.y - 84.0, size.x - 2.0 * _MARGIN, 74.0)
@@ -220,11 +220,12 @@ def _draw_state(spec: TaskSpec, picture: Picture) -> None:
         imgui.TextColored(_GREEN, 'Goal reached')
     else:
         imgui.TextColored(_RED, 'Not at the goal')
-    if picture.distance is not None and len(picture.distance.values):
-        distance = 1e3 * picture.distance.values[-1]
+    distances, rotations = picture.graphs.distance, picture.graphs.rotation
+    if distances is not None and len(distances.values):
+        distance = 1e3 * distances.values[-1]
         imgui.Text(f'distance  {distance:6.1f} mm   (below {1e3 * spec.distance_threshold:g})')
-    if picture.rotation is not None and len(picture.rotation.values):
-        degrees = np.degrees(picture.rotation.values[-1])
+    if rotations is not None and len(rotations.values):
+        degrees = np.degrees(rotations.values[-1])
         limit = np.degrees(spec.rotation_threshold or 0.0)
         imgui.Text(f'rotation  {degrees:6.1f} deg  (below {limit:.1f})')
     imgui.Text(f'episode {facts.episode}   seed {facts.seed}   step {facts.tick}/{facts.ticks}')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ from fetch_hand_sim.films.recording import Recording, load_recording
 from fetch_hand_sim.simulation.scene import tracked_position
 from fetch_hand_sim.view.curves import Curves
 from fetch_hand_sim.view.messages import (
+    TRAIL_TICKS,
     ChangeEpisode,
     Facts,
     LatestRequest,
@@ -29,7 +29,6 @@ from fetch_hand_sim.view.messages import (
 
 Array = NDArray[np.float64]
 
-_TRAIL_TICKS = 40
 # Seconds the last frame stays before the episode starts again.
 _PAUSE_AT_END = 1.0
 
@@ -121,12 +120,13 @@ class Player:
         self._number = number
         self._position = 0.0
         arrays = recording.arrays
-        self._curves = Curves(recording.spec, recording.metric, length=len(recording.frames))
+        curves = Curves(recording.spec, recording.metric, length=len(recording.frames))
         for tick, frame in enumerate(recording.frames):
             step = tick - 1
             reward = float(arrays.rewards[step]) if tick else None
             command = arrays.commands[step] if tick else None
-            self._curves.add(float(recording.times[tick]), frame, reward, command)
+            curves.add(float(recording.times[tick]), frame, reward, command)
+        self._graphs = curves.graphs()
 
     def _advance(self) -> None:
         now = self._clock()
@@ -139,29 +139,25 @@ class Player:
 
     def _make_picture(self) -> Picture:
         recording, index = self._recording, self.index
-        frames, arrays, curves = recording.frames, recording.arrays, self._curves
-        trail = [tracked_position(f) for f in frames[max(0, index - _TRAIL_TICKS) : index + 1]]
-        picture = Picture(
+        frames, arrays = recording.frames, recording.arrays
+        trail = [tracked_position(f) for f in frames[max(0, index - TRAIL_TICKS) : index + 1]]
+        time = float(recording.times[index])
+        return Picture(
             task=recording.spec.name,
             frame=frames[index],
             trail=tuple(trail),
             facts=self._facts(index),
-            distance=curves.distance,
-            rotation=curves.rotation,
-            reward=curves.reward,
-            commands=curves.commands,
-            positions=curves.positions,
+            graphs=self._graphs.until(time),
             command=arrays.commands[index - 1] if index else None,
             timeline=Timeline(
                 index=index,
                 frames=len(frames),
-                time=float(recording.times[index]),
+                time=time,
                 title=recording.title,
                 number=self._number,
                 count=len(self._paths),
             ),
         )
-        return _until(picture, float(recording.times[index]))
 
     def _facts(self, index: int) -> Facts:
         arrays = self._recording.arrays
@@ -178,19 +174,6 @@ class Player:
             speed=self._speed,
             notice=self._notice,
         )
-
-
-def _until(picture: Picture, time: float) -> Picture:
-    """The curves up to a time."""
-    cut = {}
-    for name in ('distance', 'rotation', 'reward', 'commands', 'positions'):
-        series = getattr(picture, name)
-        if series is not None:
-            known = series.times <= time + 1e-9
-            cut[name] = dataclasses.replace(
-                series, times=series.times[known], values=series.values[known]
-            )
-    return dataclasses.replace(picture, **cut)
 
 
 def _number(text: str | None) -> int:

@@ -7,7 +7,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 from numpy.typing import NDArray
 
-from fetch_hand_sim.view.messages import Picture, Series
+from fetch_hand_sim.view.messages import Graphs, Series
 from msgs_spec.tasks import TaskSpec
 
 Array = NDArray[np.float64]
@@ -16,21 +16,21 @@ _HEIGHT = 130.0
 _SECONDS = 8.0
 
 
-def draw_plots(spec: TaskSpec, picture: Picture, width: float) -> None:
+def draw_plots(spec: TaskSpec, graphs: Graphs, width: float) -> None:
     """Draws distances with their thresholds, the reward, and commands against joints."""
-    if picture.distance is not None:
-        curves = {'distance (m)': picture.distance}
+    if graphs.distance is not None:
+        curves = {'distance (m)': graphs.distance}
         _plot('Distance', curves, width, threshold=spec.distance_threshold)
-    if picture.rotation is not None:
-        curves = {'rotation (rad)': picture.rotation}
+    if graphs.rotation is not None:
+        curves = {'rotation (rad)': graphs.rotation}
         _plot('Rotation', curves, width, threshold=spec.rotation_threshold)
-    if picture.reward is not None:
-        _plot('Reward', {'reward': picture.reward}, width)
-    if picture.commands is not None and imgui.CollapsingHeader('Commands and joints'):
+    if graphs.reward is not None:
+        _plot('Reward', {'reward': graphs.reward}, width)
+    if graphs.commands is not None and imgui.CollapsingHeader('Commands and joints'):
         for index, part in enumerate(spec.robot.command):
-            curves = {'command': _column(picture.commands, index)}
-            if picture.positions is not None and not spec.robot.has_gripper_command:
-                curves['joint'] = _column(picture.positions, index)
+            curves = {'command': _column(graphs.commands, index)}
+            if graphs.positions is not None and not spec.robot.has_gripper_command:
+                curves['joint'] = _column(graphs.positions, index)
             _plot(f'{part.name.removeprefix("robot0:")} ({part.unit})', curves, width)
 
 

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import time
-from importlib import import_module
 from typing import Any
 
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import String
-from visualization_msgs.msg import MarkerArray
 
-from fetch_hand_sim.simulation.scene import Frame, Scene
-from fetch_hand_sim.view.live import LiveRobot
-from fetch_hand_sim.view.messages import Picture
+from fetch_hand_sim.simulation.scene import Scene
+from fetch_hand_sim.view.robot_watch import RobotWatch, SeenTick
 from fetch_hand_sim.visualization_node import NODE_NAME
 from fetch_hand_sim.visualization_node.camera import Camera
 from fetch_hand_sim.visualization_node.messages import (
@@ -22,7 +17,13 @@ from fetch_hand_sim.visualization_node.messages import (
     marker_array,
     transform_messages,
 )
-from fetch_hand_sim.visualization_node.transforms import Transforms, frame_prefix, view_transform
+from fetch_hand_sim.visualization_node.scalars import Scalars
+from fetch_hand_sim.visualization_node.transforms import (
+    Transform,
+    Transforms,
+    frame_prefix,
+    view_transform,
+)
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.ros import (
     BEAT,
@@ -30,14 +31,20 @@ from msgs_spec.ros import (
     StopSignals,
     declare_parameters,
     rclpy_profile,
+    ros_message_class,
 )
-from msgs_spec.topics import LATCHED, STATE
+from msgs_spec.tasks import TaskSpec
+from msgs_spec.tick import EpisodeStatus
+from msgs_spec.topics import TopicSpec
+from msgs_spec.view_topics import SHOWN, scalar_topics
 
 _CAMERA_FRAME = 'camera'
+# Callbacks served before a picture is drawn, which takes as long as some ticks do.
+_SERVED_FIRST = 200
 
 
 class VisualizationNode(Node):
-    """Publishes `robot_description`, `/tf`, `/tf_static`, `goal_markers` and `camera/*`."""
+    """Publishes the topics of `msgs_spec.view_topics`."""
 
     def __init__(self) -> None:
         """Opens its topics and listens for a robot.
@@ -47,23 +54,22 @@ class VisualizationNode(Node):
         """
         super().__init__(NODE_NAME)
         settings = declare_parameters(self, VISUALIZATION_NODE)
-        self._robot = LiveRobot(self, may_command=False)
         self._scene: Scene | None = None
         self._transforms: Transforms | None = None
-        self._shown = -1
+        self._scalars: Scalars | None = None
+        self._success_rule = ''
+        self._latest: SeenTick | None = None
         self._prefix = frame_prefix(self.get_namespace())
-        latched, state = rclpy_profile(LATCHED), rclpy_profile(STATE)
-        self._description = self.create_publisher(String, 'robot_description', latched)
-        self._markers = self.create_publisher(MarkerArray, 'goal_markers', state)
-        self._image = self.create_publisher(Image, 'camera/image_raw', state)
-        self._camera_info = self.create_publisher(CameraInfo, 'camera/camera_info', state)
+        self._outputs: dict[str, Any] = {}
+        for source in SHOWN:
+            self._open(source)
         self._camera = Camera(
             settings['camera_width'],
             settings['camera_height'],
             settings['camera_hz'],
             time.monotonic,
         )
-        self._tf, self._tf_static = self._open_transforms()
+        self._watch = RobotWatch(self, self._on_status, self._on_tick)
 
     def run(self, stop: StopSignals) -> None:
         """Serves until told to stop."""
@@ -71,61 +77,87 @@ class VisualizationNode(Node):
         try:
             while not stop:
                 loop.wait(BEAT)
-                picture = self._robot.picture()
-                if picture is not None:
-                    self._take(picture)
+                loop.serve_pending(_SERVED_FIRST)
+                self._show_latest()
         finally:
             self._camera.close()
             loop.close()
 
-    def _open_transforms(self) -> tuple[Any, Any]:
-        """Publishers of transforms; None where tf2_msgs is missing, as it is on PyPI."""
+    def _open(self, source: TopicSpec) -> None:
+        """Opens a topic, unless its messages are missing, as those of tf2 are on PyPI."""
         try:
-            message = import_module('tf2_msgs.msg').TFMessage
+            message_class = ros_message_class(source.type_name)
         except ImportError:
-            self.get_logger().warning('tf2_msgs is not installed: no /tf; a sourced ROS has it')
-            return None, None
-        return (
-            self.create_publisher(message, '/tf', rclpy_profile(STATE)),
-            self.create_publisher(message, '/tf_static', rclpy_profile(LATCHED)),
+            package = source.type_name.partition('/')[0]
+            self.get_logger().warning(
+                f'{package} is not installed: no {source.name}; a sourced ROS has it'
+            )
+            return
+        self._outputs[source.name] = self.create_publisher(
+            message_class, source.name, rclpy_profile(source.qos)
         )
 
-    def _take(self, picture: Picture) -> None:
-        if self._scene is None or self._scene.spec.name != picture.task:
-            self._begin(picture.task)
-        # A picture may also tell something new about the same tick.
-        if picture.frame is not None and picture.stamp_ns != self._shown:
-            self._shown = picture.stamp_ns
-            self._show(picture.frame, picture.stamp_ns)
+    def _has_listener(self, name: str) -> bool:
+        return bool(self._outputs[name].get_subscription_count())
 
-    def _begin(self, task: str) -> None:
+    def _on_status(self, status: EpisodeStatus) -> None:
+        spec = self._watch.spec
+        assert spec is not None
+        if self._scene is None or self._scene.spec.name != spec.name:
+            self._begin(spec)
+        if self._scalars is None or self._success_rule != status.success_rule:
+            self._success_rule = status.success_rule
+            self._scalars = Scalars(spec, status.success_rule)
+
+    def _begin(self, spec: TaskSpec) -> None:
+        """Takes another robot."""
         self._camera.close()
-        self._scene = Scene(task)
-        self._transforms = Transforms(task, self._prefix)
-        urdf = self._transforms.description.to_xml(self._prefix, self._robot.joint_prefix)
-        self._description.publish(String(data=urdf))
-        if self._tf_static is not None:
-            camera = view_transform(self._scene.view, self._prefix + _CAMERA_FRAME)
-            messages = transform_messages([*self._transforms.fixed(), camera], 0)
-            self._tf_static.publish(self._tf_static.msg_type(transforms=messages))
+        self._latest = self._scalars = None
+        self._scene = Scene(spec.name)
+        self._transforms = Transforms(spec.name, self._prefix)
+        for source in scalar_topics(spec):
+            if source.name not in self._outputs:
+                self._open(source)
+        urdf = self._transforms.description.to_xml(self._prefix, self._watch.joint_prefix)
+        description = self._outputs['robot_description']
+        description.publish(description.msg_type(data=urdf))
+        camera = view_transform(self._scene.view, self._prefix + _CAMERA_FRAME)
+        self._send_transforms('/tf_static', [*self._transforms.fixed(), camera], 0)
 
-    def _show(self, frame: Frame, stamp_ns: int) -> None:
-        assert self._scene is not None and self._transforms is not None
-        if self._tf is not None:
-            messages = transform_messages(self._transforms.moving(frame), stamp_ns)
-            self._tf.publish(self._tf.msg_type(transforms=messages))
-        if self._markers.get_subscription_count():
-            self._markers.publish(marker_array(self._scene.markers(frame), stamp_ns))
-        if self._image.get_subscription_count() and self._camera.is_due:
-            self._take_photo(self._scene, frame, stamp_ns)
+    def _on_tick(self, tick: SeenTick) -> None:
+        if self._transforms is None or self._scalars is None:
+            return
+        if '/tf' in self._outputs:
+            self._send_transforms('/tf', self._transforms.moving(tick.frame), tick.stamp_ns)
+        for name, data in self._scalars.messages(tick).items():
+            self._outputs[name].publish(data)
+        self._latest = tick
 
-    def _take_photo(self, scene: Scene, frame: Frame, stamp_ns: int) -> None:
+    def _send_transforms(self, name: str, transforms: list[Transform], stamp_ns: int) -> None:
+        output = self._outputs.get(name)
+        if output is not None:
+            output.publish(output.msg_type(transforms=transform_messages(transforms, stamp_ns)))
+
+    def _show_latest(self) -> None:
+        """Sends what need not come with every tick: markers and pictures."""
+        tick, scene = self._latest, self._scene
+        if tick is None or scene is None:
+            return
+        self._latest = None
+        if self._has_listener('goal_markers'):
+            markers = marker_array(scene.markers(tick.frame), tick.stamp_ns)
+            self._outputs['goal_markers'].publish(markers)
+        if self._has_listener('camera/image_raw') and self._camera.is_due:
+            self._take_photo(scene, tick)
+
+    def _take_photo(self, scene: Scene, tick: SeenTick) -> None:
         try:
-            picture = self._camera.render(scene, frame)
+            picture = self._camera.render(scene, tick.frame)
         except RuntimeError as error:
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
         name = self._prefix + _CAMERA_FRAME
         camera, fovy = self._camera, float(scene.model.vis.global_.fovy)
-        self._image.publish(image_message(picture, name, stamp_ns))
-        self._camera_info.publish(camera_info(camera.width, camera.height, fovy, name, stamp_ns))
+        info = camera_info(camera.width, camera.height, fovy, name, tick.stamp_ns)
+        self._outputs['camera/image_raw'].publish(image_message(picture, name, tick.stamp_ns))
+        self._outputs['camera/camera_info'].publish(info)

@@ -15,12 +15,15 @@ import pytest
 import rclpy
 
 from fetch_hand_sim.simulation.opengl import prepare_opengl
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.messages import ChooseActor, Push, Reset, SetGoal, SetPaused, StepOnce
-from msgs_spec.codecs import decode
+from msgs_spec.codecs import decode, message_stamp
+from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic
-from support.graph import POLICY_NODE, SIM_NODE, client, ros_args
+from msgs_spec.view_topics import scalar_topics
+from support.graph import POLICY_NODE, SIM_NODE, client, end, ros_args
 
 Start = Callable[..., subprocess.Popen[str]]
 REACH = task_spec('FetchReach')
@@ -51,7 +54,7 @@ def test_what_the_page_asks_for_happens(start_process: Start) -> None:
         follower = Follower(connection)
         follower.until(lambda p: p.frame is not None and p.facts.rate > 20.0, 'picture')
         assert follower.picture.facts.missed_ticks == 0 or follower.picture.facts.rate > 0
-        assert follower.picture.distance.values[-1] > 0.0
+        assert follower.picture.graphs.distance.values[-1] > 0.0
         goal = np.array([1.3, 0.8, 0.6])
         follower.robot.perform(SetGoal(goal))
         desired = topic(REACH, 'desired_goal')
@@ -140,7 +143,6 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
     from std_msgs.msg import String
     from visualization_msgs.msg import MarkerArray
 
-    from msgs_spec.ros import rclpy_profile
     from msgs_spec.topics import LATCHED, STATE
 
     start_process(*SIM_NODE, *ros_args(task='FetchReach'))
@@ -174,6 +176,51 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
         assert picture.std() > 10.0
     node.send_signal(signal.SIGINT)
     assert node.wait(10) == 0
+
+
+def test_scalars_are_those_of_the_tick_with_their_stamp(start_process: Start) -> None:
+    spec = task_spec('HandManipulateBlockFull')
+    metric = GoalMetric(spec)
+    start_process(*SIM_NODE, *ros_args(task=spec.name))
+    node = start_process(*VISUALIZATION)
+    with client(spec) as connection:
+        connection.subscribe('achieved_goal', 'desired_goal')
+        seen: dict[str, dict[int, float]] = {}
+
+        def subscribe(source):
+            def keep(message):
+                stamp = message_stamp(message)
+                seen.setdefault(source.name, {})[stamp] = decode(source, message)[0]
+
+            connection.node.create_subscription(
+                ros_message_class(source.type_name), source.name, keep, rclpy_profile(source.qos)
+            )
+
+        for source in scalar_topics(spec):
+            subscribe(source)
+        # The reward comes with the first step of an episode, everything else with its reset too.
+        connection.spin_until(lambda: len(seen.get('scalars/reward', {})) > 120, 'scalars', 60.0)
+        assert set(seen) == {s.name for s in scalar_topics(spec)}
+        goals = {
+            name: {
+                message_stamp(m): decode(topic(spec, name), m) for m in connection.received[name]
+            }
+            for name in ('achieved_goal', 'desired_goal')
+        }
+    end(node)
+    stamps = sorted(set(seen['scalars/distance']) & set(goals['achieved_goal']))
+    # A tick is 40 ms, and all come; a machine that is busy may lose one of them.
+    assert len(stamps) > 0.95 * (stamps[-1] - stamps[0]) / 40e6 > 95.0
+    for stamp in stamps[:-1]:
+        achieved, desired = goals['achieved_goal'][stamp], goals['desired_goal'][stamp]
+        distance, rotation = metric.distances(achieved, desired)
+        assert seen['scalars/distance'][stamp] == distance
+        assert seen['scalars/rotation'][stamp] == rotation
+        assert seen['scalars/is_success'][stamp] == metric.success(achieved, desired)
+        if stamp in seen['scalars/reward']:
+            assert seen['scalars/reward'][stamp] == metric.reward(achieved, desired)
+    resets = len(stamps) - len(set(stamps) & set(seen['scalars/reward']))
+    assert 1 <= resets <= 3
 
 
 @pytest.mark.parametrize(

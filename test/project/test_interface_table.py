@@ -12,6 +12,7 @@ from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import PHASES
 from msgs_spec.topics import topics
+from msgs_spec.view_topics import view_topics
 from support import ROOT
 
 PAGE = ROOT / 'docs' / 'interface.md'
@@ -32,7 +33,7 @@ def test_the_page_holds_the_generated_section():
 def test_everything_has_its_row():
     lines = interface_markdown().splitlines()
     for task in TASKS.values():
-        for spec in topics(task):
+        for spec in (*topics(task), *view_topics(task)):
             type_name = spec.type_name.replace('/msg/', '/')
             assert any(line.startswith(f'| `{spec.name}` | {type_name} |') for line in lines)
     for node, specs in NODES.items():

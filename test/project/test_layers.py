@@ -33,6 +33,8 @@ NODES = (
     'fetch_hand_sim.view.live',
     'fetch_hand_sim.view.live_session',
     'fetch_hand_sim.view.remote_node',
+    'fetch_hand_sim.view.robot_requests',
+    'fetch_hand_sim.view.robot_watch',
     'fetch_hand_sim.visualization_node.messages',
     'fetch_hand_sim.visualization_node.node',
     'policy_node.node',

@@ -89,7 +89,7 @@ def test_pause_steps_and_seeking(player, clock):
     for beyond, end in ((-5, 0), (10**9, 50)):
         player.perform(Seek(beyond))
         assert player.index == end
-    assert len(player.picture().distance.times) == 51
+    assert len(player.picture().graphs.distance.times) == 51
 
 
 def test_it_starts_again_after_the_end(player, clock):
@@ -121,7 +121,8 @@ def test_what_cannot_be_read_is_skipped_and_said(folder, tmp_path, clock):
 def test_curves_end_at_the_playhead(player):
     player.perform(Seek(10))
     picture = player.picture()
-    for series in (picture.distance, picture.reward, picture.commands):
+    graphs = picture.graphs
+    for series in (graphs.distance, graphs.reward, graphs.commands):
         assert len(series.times) == len(series.values) == 11
     assert dataclasses.asdict(picture.timeline)['frames'] == 51
 

@@ -1,0 +1,180 @@
+"""What the page asks of a running robot: topics, services and parameters that anybody may use."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.node import Node
+
+from fetch_hand_sim.view.messages import (
+    ChooseActor,
+    LatestRequest,
+    Push,
+    ReleaseGoal,
+    Request,
+    Reset,
+    SetCommand,
+    SetCommanding,
+    SetGoal,
+    SetPaused,
+    SetSpeed,
+    StepOnce,
+)
+from fetch_hand_sim.view.remote_node import RemoteNode
+from msgs_spec.cdr import TopicCodec
+from msgs_spec.codecs import build_message
+from msgs_spec.ros import rclpy_profile, ros_message_class
+from msgs_spec.schemas import serialize
+from msgs_spec.tasks import TaskSpec
+from msgs_spec.topics import topic
+
+Array = NDArray[np.float64]
+
+# Seconds a goal is shown before the robot confirms it.
+_GOAL_PATIENCE = 0.5
+
+
+class RobotRequests:
+    """Passes on what the page asks for."""
+
+    def __init__(self, node: Node, tell: Callable[..., None]) -> None:
+        """Connects to the nodes in the namespace of ours.
+
+        Args:
+            node: Of this process.
+            tell: Gets changed fields of `Facts`, by name.
+        """
+        self._node = node
+        self._tell = tell
+        self._sim = RemoteNode(node, 'sim_node', self._notice)
+        self._policy = RemoteNode(node, 'policy_node', self._notice)
+        self._spec: TaskSpec | None = None
+        self._is_commanding = False
+        self._kept_goal: Array | None = None
+        self._asked_goal: tuple[float, Array] | None = None
+        self._publishers: dict[str, Any] = {}
+        self._actions: dict[type, Callable[[Any], None]] = {
+            SetPaused: self._pause,
+            StepOnce: self._step,
+            Reset: self._reset,
+            SetSpeed: self._set_speed,
+            ChooseActor: self._choose_actor,
+            SetGoal: self._set_goal,
+            ReleaseGoal: self._release_goal,
+            SetCommanding: self._set_commanding,
+            SetCommand: self._command,
+            Push: self._push,
+        }
+
+    @property
+    def has_policy(self) -> bool:
+        """Whether there is a policy to talk to."""
+        return self._policy.is_there()
+
+    def take_task(self, spec: TaskSpec) -> None:
+        """Takes the task of the robot; a goal of another one is forgotten."""
+        if self._spec is not None and self._spec.name != spec.name:
+            self._kept_goal = None
+        self._spec = spec
+
+    def begin_episode(self) -> None:
+        """Sends an episode that has begun the goal that people keep."""
+        if self._kept_goal is not None:
+            self._send_goal(self._kept_goal)
+
+    def perform(self, request: Request | LatestRequest) -> None:
+        """Does what the page asks for; what only files understand is nothing to a robot."""
+        action = self._actions.get(type(request))
+        if action is not None and self._spec is not None:
+            action(request)
+
+    def shown_goal(self, goal: Array) -> Array:
+        """The goal (goal size,) the page asked for a moment ago, or the robot's."""
+        if self._asked_goal is not None:
+            at, asked = self._asked_goal
+            if time.monotonic() - at < _GOAL_PATIENCE and not np.allclose(goal, asked):
+                return asked
+            self._asked_goal = None
+        return goal
+
+    def _pause(self, request: SetPaused) -> None:
+        self._sim.call('pause', 'std_srvs/srv/SetBool', data=request.is_paused)
+        self._tell(is_paused=request.is_paused)
+
+    def _step(self, request: StepOnce) -> None:
+        del request
+        self._sim.call('step', 'std_srvs/srv/Trigger')
+
+    def _reset(self, request: Reset) -> None:
+        seed = request.seed
+        if seed is None:
+            self._sim.call('reset', 'std_srvs/srv/Trigger')
+        else:
+            # The seed holds for the next episode, so it has to be there first.
+            self._sim.set_parameter(
+                'seed', seed, lambda: self._sim.call('reset', 'std_srvs/srv/Trigger')
+            )
+
+    def _set_speed(self, request: SetSpeed) -> None:
+        self._sim.set_parameter('real_time_factor', float(request.factor))
+        self._tell(speed=request.factor)
+
+    def _choose_actor(self, request: ChooseActor) -> None:
+        self._policy.set_parameter('policy', request.name)
+
+    def _set_goal(self, request: SetGoal) -> None:
+        self._kept_goal = request.values if request.is_kept else None
+        self._send_goal(request.values)
+
+    def _release_goal(self, request: ReleaseGoal) -> None:
+        del request
+        self._kept_goal = None
+        self._notice('the next episode draws its own goal')
+
+    def _set_commanding(self, request: SetCommanding) -> None:
+        self._is_commanding = request.is_commanding
+        self._tell(is_commanding=request.is_commanding)
+        if not request.is_commanding:
+            self._withdraw('commands')
+
+    def _command(self, request: SetCommand) -> None:
+        if self._is_commanding:
+            self._publish('commands', request.values)
+
+    def _push(self, request: Push) -> None:
+        assert self._spec is not None
+        target = topic(self._spec, 'perturb')
+        message = build_message(target, 0, request.wrench)
+        message.header.frame_id = request.body
+        self._send('perturb', serialize(target.type_name, message))
+
+    def _send_goal(self, goal: Array) -> None:
+        self._asked_goal = (time.monotonic(), goal)
+        self._publish('set_goal', goal)
+
+    def _publish(self, name: str, values: Array) -> None:
+        assert self._spec is not None
+        # Without a stamp a goal is for the episode that runs when it arrives.
+        self._send(name, TopicCodec(topic(self._spec, name)).encode(0, values))
+
+    def _send(self, name: str, data: bytes) -> None:
+        assert self._spec is not None
+        target = topic(self._spec, name)
+        if name not in self._publishers:
+            self._publishers[name] = self._node.create_publisher(
+                ros_message_class(target.type_name), target.name, rclpy_profile(target.qos)
+            )
+        self._publishers[name].publish(data)
+
+    def _withdraw(self, name: str) -> None:
+        """Leaves a topic: who publishes commands counts as a commander."""
+        publisher = self._publishers.pop(name, None)
+        if publisher is not None:
+            self._node.destroy_publisher(publisher)
+
+    def _notice(self, text: str) -> None:
+        self._tell(notice=text)

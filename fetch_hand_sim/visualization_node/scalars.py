@@ -1,0 +1,42 @@
+"""Numbers of a tick that are worth a plot."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from fetch_hand_sim.simulation.rewards import GoalMetric, SuccessRule
+from fetch_hand_sim.view.robot_watch import SeenTick
+from msgs_spec.cdr import TopicCodec
+from msgs_spec.tasks import TaskSpec
+from msgs_spec.view_topics import scalar_topics
+
+
+class Scalars:
+    """Makes the messages of `scalars/*` for one task."""
+
+    def __init__(self, spec: TaskSpec, success_rule: str) -> None:
+        """Takes what tells how far a goal is.
+
+        Args:
+            spec: The task.
+            success_rule: `gymnasium` or `paper`.
+        """
+        self._metric = GoalMetric(spec, success_rule=cast('SuccessRule', success_rule))
+        self._codecs = {source.name: TopicCodec(source) for source in scalar_topics(spec)}
+
+    def messages(self, tick: SeenTick) -> dict[str, bytes]:
+        """Returns the CDR bytes of each topic; a reset has no reward."""
+        frame = tick.frame
+        distance, rotation = self._metric.distances(frame.achieved_goal, frame.desired_goal)
+        numbers = {
+            'distance': float(distance),
+            'rotation': float(rotation),
+            'reward': tick.reward,
+            'is_success': float(frame.is_success),
+        }
+        found = {}
+        for name, codec in self._codecs.items():
+            number = numbers[codec.topic.layout[0].name]
+            if number is not None:
+                found[name] = codec.encode(tick.stamp_ns, [number])
+        return found
