@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
-from policy_node.training.evaluation.episodes import wilson_interval
+from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
 
-FIRST_SEED = 2_000_000_000
 _STARTS, _STEPS, _DAMPING = 6, 120, 1e-5
 
 Array = NDArray[np.float64]

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler
-from policy_node.training.evaluation.episodes import wilson_interval
+from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
 
 TASKS = ('HandManipulatePenRotate', 'HandManipulatePenFull')
-FIRST_SEED = 2_000_000_000
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
@@ -28,7 +26,13 @@ from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import EpisodeReadError, EpisodeRecord, read_episode
 from msgs_spec.codecs import decode_status
-from msgs_spec.command_line import EXIT_SUCCESS, FormerOption, complain, run_command
+from msgs_spec.command_line import (
+    EXIT_SUCCESS,
+    FormerOption,
+    complain,
+    require_extra,
+    run_command,
+)
 from msgs_spec.ros import StopSignals, keep_discovery_local, rclpy_profile, ros_message_class
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
@@ -82,6 +86,9 @@ class Watcher:
 
     def __init__(self, spec: TaskSpec) -> None:
         """Subscribes to the robot of a task."""
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
         self.status: EpisodeStatus | None = None
         self.ticks = 0
         self._node = rclpy.create_node('demo')
@@ -257,6 +264,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    require_extra('ros')
+    import rclpy
+
     keep_discovery_local()
     os.environ.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
     stop = StopSignals()

@@ -28,7 +28,6 @@ class Command:
         help: What it does.
         executable: The executable it stands for; '' if there is none.
         module: What it runs where there is no executable: the `main` of this module.
-        extras: Extras that the module needs.
         is_node: Whether the executable takes ROS parameters instead of options.
         commands: Commands of its own, by name.
     """
@@ -36,7 +35,6 @@ class Command:
     help: str
     executable: str = ''
     module: str = ''
-    extras: tuple[str, ...] = ()
     is_node: bool = False
     commands: dict[str, Command] = field(default_factory=dict)
 
@@ -45,7 +43,6 @@ COMMANDS = {
     'demo': Command(
         'a robot and its actor in two processes, every episode logged',
         module='fetch_hand_sim.commands.demo',
-        extras=('ros',),
     ),
     'view': Command('a robot or episodes in the browser', 'view'),
     'sim': Command('the simulated robot, a ROS node', 'sim_node', is_node=True),
@@ -149,7 +146,7 @@ def _add_commands(parser: argparse.ArgumentParser, commands: dict[str, Command])
 
 def _start(command: Command, name: str) -> int:
     if command.module:
-        return start_command(name, command.module, *command.extras)
+        return start_command(name, command.module)
     try:
         point = find_executable(command.executable)
     except UnknownExecutableError as error:

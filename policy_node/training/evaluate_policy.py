@@ -8,11 +8,8 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.command_line import (
@@ -24,14 +21,18 @@ from msgs_spec.command_line import (
     run_command,
 )
 from policy_node.policies.policy import Policy
-from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, summarize
+from policy_node.training.evaluation.episodes import (
+    FIRST_SEED,
+    EpisodeOutcomes,
+    evaluate,
+    summarize,
+)
+from policy_node.training.evaluation.table import print_table
 from policy_node.training.policy_options import add_policy_options, load_chosen_policy
 
 _NAME = 'evaluate_policy'
 # What `--json` without a file means.
 _STDOUT = Path('-')
-# Far from the seeds of training and of its evaluations.
-FIRST_SEED = 2_000_000_000
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -126,35 +127,6 @@ def _simulation(options: argparse.Namespace, task: str) -> Simulation:
         reward_type=options.reward_type,
         success_rule=options.success_rule,
     )
-
-
-_DIAGNOSES = {
-    'stay': 'success at the next tick, given success at this one',
-    'long_way': 'success where the goal is the long way round',
-    'dropped': 'object below the palm at the end',
-    'distance': 'median distance at the end, m',
-    'rotation': 'median rotation at the end, rad',
-}
-
-
-def print_table(report: dict[str, Any]) -> None:
-    """Prints rates with their 95 % intervals."""
-    title = f'{report["task"]}: {report["policy"]}, {report["episodes"]} episodes'
-    table = Table('measure', 'value', '95 % interval', title=title)
-    names = {
-        'success_gymnasium': 'success at the last step, gymnasium rule',
-        'success_paper': 'success at the last step, paper rule',
-        'touched': 'goal touched at least once',
-    }
-    for name, label in names.items():
-        low, high = report[f'{name}_interval_95']
-        table.add_row(label, f'{report[name]:.4f}', f'{low:.4f} ... {high:.4f}')
-    for name, label in _DIAGNOSES.items():
-        if name in report:
-            table.add_row(label, f'{report[name]:.4f}', '')
-    table.add_row('mean return', f'{report["mean_return"]:.3f}', '')
-    table.add_row('diverged episodes', str(report['diverged']), '')
-    Console().print(table)
 
 
 def write_csv(outcomes: EpisodeOutcomes, path: Path) -> None:

@@ -17,8 +17,7 @@ from typing import Any
 from msgs_spec.command_line import EXIT_SUCCESS, UsageError, run_command
 from msgs_spec.tasks import task_spec
 from policy_node.policies.policy import Policy
-from policy_node.training.evaluate_policy import FIRST_SEED
-from policy_node.training.evaluation.episodes import wilson_interval
+from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
 from policy_node.training.policy_options import add_policy_options, load_chosen_policy
 
 

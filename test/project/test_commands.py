@@ -14,6 +14,7 @@ import pytest
 
 from fetch_hand_sim.commands.executables import executable, find_executable
 from msgs_spec.command_line import EXTRAS
+from support import ROOT, script_environment
 
 NODES = {'sim_node', 'policy_node', 'replay_node', 'visualization_node'}
 # What each executable needs beyond the base installation.
@@ -73,6 +74,62 @@ def test_a_missing_extra_is_one_line_that_says_what_to_install(name, module, run
     assert (code, output) == (2, '')
     line = rf"{name}: {module} missing: .*pip install 'fetch_hand_sim\[\w+\]'\n"
     assert re.fullmatch(line, error)
+
+
+# Runs modules as `python -m` does, each in a fork: what all of them load is loaded once.
+WITHOUT_EXTRAS = """
+import os, runpy, sys, traceback
+
+sys.modules.update(dict.fromkeys({extras!r}))
+import fetch_hand_sim.episodes.generator, msgs_spec.ros, rich.progress, rich.table, shtab
+
+for module in {modules!r}:
+    print(f'== {{module}}', file=sys.stderr, flush=True)
+    if os.fork() == 0:
+        sys.argv = [module]
+        code = 1
+        try:
+            runpy.run_module(module, run_name='__main__', alter_sys=True)
+        except SystemExit as exit_:
+            code = exit_.code
+        except BaseException:
+            traceback.print_exc()
+        sys.stdout.flush()
+        os._exit(code)
+    print(f'exit {{os.waitstatus_to_exitcode(os.wait()[1])}}', file=sys.stderr, flush=True)
+"""
+
+
+def started_as_modules() -> list[str]:
+    """What `python -m` can start."""
+    found = []
+    for package in ('fetch_hand_sim', 'policy_node'):
+        for path in sorted((ROOT / package).rglob('*.py')):
+            parts = path.relative_to(ROOT).with_suffix('').parts
+            if parts == ('policy_node', 'policies', 'onnx'):
+                continue  # A child that tries a file out; nobody else starts it.
+            if path.name == '__main__.py':
+                found.append('.'.join(parts[:-1]))
+            elif "__name__ == '__main__'" in path.read_text():
+                found.append('.'.join(parts))
+    return found
+
+
+def test_modules_without_any_extra_end_without_traceback(tmp_path):
+    modules = started_as_modules()
+    assert len(modules) > 15 and 'policy_node.training.train_her' in modules
+    extras = sorted({module for needed in EXTRAS.values() for module in needed})
+    code = WITHOUT_EXTRAS.format(extras=extras, modules=modules)
+    command = [sys.executable, '-c', code]
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=tmp_path, env=script_environment()
+    )
+    assert 'Traceback' not in done.stderr, done.stderr
+    for said in done.stderr.split('== ')[1:]:
+        *lines, code = said.splitlines()[1:]
+        assert code in ('exit 0', 'exit 2'), said
+        assert len(lines) <= 1 or lines[0].startswith('usage: '), said
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize('name', sorted(set(NEEDS) - NODES))

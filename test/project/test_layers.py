@@ -27,7 +27,6 @@ FORBIDDEN = {
 }
 # The shells on the ROS graph; all else runs without ROS.
 NODES = (
-    'fetch_hand_sim.commands.demo',
     'fetch_hand_sim.replay_node',
     'fetch_hand_sim.sim_node',
     'fetch_hand_sim.view.live',

@@ -2,6 +2,6 @@
 
 import sys
 
-from policy_node.training.benchmark.command import main
+from policy_node.training.commands import benchmark
 
-sys.exit(main())
+sys.exit(benchmark())

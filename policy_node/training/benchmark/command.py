@@ -36,9 +36,9 @@ from policy_node.training.benchmark.jobs import ARMS, Job
 from policy_node.training.benchmark.results import write_report
 from policy_node.training.benchmark.studies import STUDIES, best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
+from policy_node.training.evaluation.shipping import ship
 from policy_node.training.learning.config import RECIPES, parse_assignment
 from policy_node.training.learning.run_folder import BEST_FILE
-from policy_node.training.ship_actor import ship
 
 _NAME = 'benchmark'
 ACTORS_TABLE = 'actors.md'

@@ -15,6 +15,8 @@ from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
 from policy_node.policies.policy import Policy
 
+# Far from the seeds of training and of its evaluations.
+FIRST_SEED = 2_000_000_000
 # Two-sided 95 % quantile of the standard normal distribution.
 _Z95 = 1.959963984540054
 

@@ -12,8 +12,8 @@ import onnx
 import pytest
 from test_loading import fresh_actor
 
-from policy_node.policies.export_actor import export
 from policy_node.policies.loading import load_policy
+from policy_node.policies.onnx_export import export
 
 # What stands in the metadata of files by people who mean harm, or cannot count.
 VALUES = [

@@ -1,0 +1,104 @@
+"""Puts an actor of a run into the package: evaluation, critic and curve beside it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node.policies import checkpoint
+from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, summarize
+from policy_node.training.evaluation.table import print_table
+from policy_node.training.learning.run_folder import BEST_FILE, STATE_FILE, companion_file
+from policy_node.training.learning.run_log import draw_curve, read_progress
+from policy_node.training.learning.training_state import TrainingState, read_state, write_state
+
+
+def ship(
+    run: Path,
+    actors: Path,
+    *,
+    episodes: int,
+    num_envs: int = 100,
+    threads: int = 0,
+    name: str = BEST_FILE,
+) -> bool:
+    """Evaluates and, if it is better than the shipped actor, copies what belongs to an actor.
+
+    An actor that is the shipped one, evaluated on as many episodes, is left as it is.
+
+    Args:
+        run: Folder of the run.
+        actors: Where actors go.
+        episodes: Fresh episodes.
+        num_envs: Simulations in the batch.
+        threads: Simulation threads; 0 is all cores.
+        name: File of the actor in the run.
+
+    Returns:
+        Whether the actor of the run is the shipped one now.
+
+    Raises:
+        ValueError: If there is no such actor.
+    """
+    actor, info = checkpoint.load(run / name)
+    shipped, digest = actors / f'{info.task}.json', checkpoint.checkpoint_hash(run / name)
+    old = json.loads(shipped.read_text()) if shipped.is_file() else {}
+    if (old.get('run_sha256'), old.get('episodes')) == (digest, episodes):
+        return True
+    simulation = Simulation(
+        info.task,
+        num_envs=min(num_envs, episodes),
+        num_threads=threads,
+        control_hz=info.control_hz,
+    )
+    summary = summarize(evaluate(simulation, actor, episodes, FIRST_SEED))
+    print_table({'policy': str(run), 'task': info.task, **summary})
+    if old and not is_better(summary, old):
+        print(f'ship_actor: the actor in {actors} is at least as good; nothing changed')
+        return False
+    target = actors / f'{info.task}.safetensors'
+    command = commands_of(run) or info.command
+    checkpoint.save(target, actor, replace(info, success=summary, command=command))
+    report = {
+        'actor': info.task,
+        'sha256': checkpoint.checkpoint_hash(target),
+        'run_sha256': digest,
+        'env_steps': info.env_steps,
+        'command': command,
+        'init_from': info.init_from,
+        'source_revision': info.source_revision,
+        **summary,
+    }
+    if (run / STATE_FILE).is_file():
+        ship_critic(run / STATE_FILE, target)
+    title = f'{info.task}, {info.config["recipe"]} recipe, seed {info.seed}'
+    draw_curve(read_progress(run / 'progress.csv'), title, target.with_suffix('.png'))
+    shipped.write_text(json.dumps(report, indent=2) + '\n')
+    return True
+
+
+def ship_critic(state_file: Path, actor: Path) -> None:
+    """Puts the critic of a run beside its shipped actor, so that training can go on from there.
+
+    The actor holds its normalisers itself; optimisers start fresh.
+    """
+    state = read_state(state_file)
+    tensors = {name: value for name, value in state.tensors.items() if name.startswith('critic.')}
+    extra = {'config': state.extra['config'], 'actor_sha256': checkpoint.checkpoint_hash(actor)}
+    write_state(companion_file(actor), TrainingState(tensors, state.counters, extra))
+
+
+def commands_of(run: Path) -> str:
+    """Every command of a run in order, the first and those that resumed it; '' if unknown."""
+    path = run / 'command.txt'
+    # The same command again goes on where it stopped: once is enough to say it.
+    return ' && '.join(dict.fromkeys(path.read_text().splitlines())) if path.is_file() else ''
+
+
+def is_better(new: dict[str, Any], old: dict[str, Any]) -> bool:
+    """Whether an evaluation is better: by last-step success, then by return."""
+    keys = ('success_gymnasium', 'mean_return')
+    return [new[key] for key in keys] > [old[key] for key in keys]
