@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,17 @@ def sense(simulation: Simulation) -> Sensed:
     achieved, desired = achieved_goal(simulation.spec, readings), simulation.goals.copy()
     reward, success = simulation.metric.evaluate(achieved, desired)
     return Sensed(readings, achieved, desired, reward, success)
+
+
+def has_ended(ticks: Any, episode_ticks: int, has_diverged: Any) -> Any:
+    """Whether an episode is over: time is up or MuJoCo gave it up.
+
+    Args:
+        ticks: Steps so far; of many episodes an array.
+        episode_ticks: Steps after which time is up.
+        has_diverged: Whether MuJoCo gave it up in this step; of many an array.
+    """
+    return has_diverged | (ticks >= episode_ticks)
 
 
 class RobotEpisode:
@@ -105,7 +117,7 @@ class RobotEpisode:
         self.tick += 1
         self._return += float(sensed.reward[index])
         self.has_diverged = has_diverged
-        is_last = has_diverged or self.tick >= self._simulation.spec.episode_ticks
+        is_last = has_ended(self.tick, self._simulation.spec.episode_ticks, has_diverged)
         return self._make_tick('finished' if is_last else 'running', sensed, index, command)
 
     def _make_tick(self, phase: Phase, sensed: Sensed, index: int, command: Array | None) -> Tick:

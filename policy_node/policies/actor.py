@@ -52,7 +52,8 @@ def _linear(input_size: int, output_size: int) -> nn.Linear:
 class Normalizer(nn.Module):
     """Clips, centres and scales inputs with statistics that belong to the checkpoint.
 
-    `training.normalizer.RunningStatistics` writes `mean` and `std` while training.
+    `RunningStatistics` (`policy_node.training.learning.normalizer`) writes `mean` and `std` while
+    training.
     """
 
     mean: Tensor
@@ -91,7 +92,7 @@ class Actor(nn.Module):
         normalized = self.observation_normalizer(observation), self.goal_normalizer(goal)
         if self.shape.goal_features is None:
             return torch.cat(normalized, dim=-1)
-        inputs: Tensor = self.shape.goal_features.inputs(observation, goal, *normalized)
+        inputs: Tensor = self.shape.goal_features.inputs((observation, goal), normalized)
         return inputs
 
     def forward(self, features: Tensor) -> Tensor:

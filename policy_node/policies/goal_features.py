@@ -20,6 +20,8 @@ from msgs_spec.tasks import GoalKind, TaskSpec
 
 # A NumPy array or a torch tensor; functions return what they are given.
 Array = Any
+# Observation (..., observation size) and goal (..., goal size).
+Seen = tuple[Array, Array]
 
 GOAL_FEATURES = ('plain', 'relative', 'symmetric')
 
@@ -39,14 +41,8 @@ class GoalFeatures(Protocol):
         """Number of inputs."""
         ...
 
-    def inputs(
-        self,
-        observation: Array,
-        goal: Array,
-        normalized_observation: Array,
-        normalized_goal: Array,
-    ) -> Array:
-        """Inputs (..., size), from both in the units of the task and both normalised."""
+    def inputs(self, seen: Seen, normalized: Seen) -> Array:
+        """Inputs (..., size), from what is seen in the units of the task and normalised."""
         ...
 
 
@@ -83,16 +79,9 @@ class RelativeGoal:
         """Observation, goal and the difference."""
         return observation_size + goal_size + self.difference_size
 
-    def inputs(
-        self,
-        observation: Array,
-        goal: Array,
-        normalized_observation: Array,
-        normalized_goal: Array,
-    ) -> Array:
+    def inputs(self, seen: Seen, normalized: Seen) -> Array:
         """Normalised observation and goal, then the difference."""
-        difference = self.difference(observation, goal)
-        return _concatenate(normalized_observation, normalized_goal, difference)
+        return _concatenate(*normalized, self.difference(*seen))
 
     def difference(self, observation: Array, goal: Array) -> Array:
         """The difference (..., difference_size) of both in the units of the task."""
@@ -135,15 +124,9 @@ class SymmetricObject:
         shape_size = 15 if self.symmetry == 'cube' else 6
         return observation_size - 7 + shape_size + 3 + self.relative.difference_size
 
-    def inputs(
-        self,
-        observation: Array,
-        goal: Array,
-        normalized_observation: Array,
-        normalized_goal: Array,
-    ) -> Array:
+    def inputs(self, seen: Seen, normalized: Seen) -> Array:
         """Inputs (..., size); the object's velocity must precede its pose in the observation."""
-        del normalized_goal
+        (observation, goal), (normalized_observation, _) = seen, normalized
         start = self.relative.start
         rotation = _rotation_matrix(observation[..., start + 3 : start + 7])
         angular_velocity = (rotation @ observation[..., start - 3 : start, None]).squeeze(-1)

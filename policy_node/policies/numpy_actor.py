@@ -81,7 +81,7 @@ class NumpyActor:
         )
         if self.shape.goal_features is None:
             return np.concatenate(normalized, axis=-1)
-        return np.asarray(self.shape.goal_features.inputs(state, goal, *normalized))
+        return np.asarray(self.shape.goal_features.inputs((state, goal), normalized))
 
     def _normalize(self, name: str, values: Array) -> Array:
         mean, std = self._values[f'{name}.mean'], self._values[f'{name}.std']

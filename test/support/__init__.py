@@ -15,8 +15,13 @@ def script_environment(environment: dict[str, str] | None = None) -> dict[str, s
     return dict(os.environ if environment is None else environment) | {'PYTHONPATH': paths}
 
 
+def reset_peak_memory() -> None:
+    """Lets `peak_memory` count from now on: earlier tests may have held more."""
+    Path('/proc/self/clear_refs').write_text('5')
+
+
 def peak_memory() -> int:
-    """Most memory this process has held since its program started, bytes.
+    """Most memory this process has held since its program or the last reset, bytes.
 
     Not `ru_maxrss`: that of a process starts at what its parent held when it was forked.
     """

@@ -116,7 +116,7 @@ def _pose_inputs(task: str, pose: np.ndarray, angular: np.ndarray, goal: np.ndar
     start = spec.achieved_goal_start
     observation[start - 3 : start] = torch.from_numpy(angular)
     arguments = observation, torch.from_numpy(goal)
-    return features.inputs(*arguments, *arguments).numpy()
+    return features.inputs(arguments, arguments).numpy()
 
 
 def _cube_rotations() -> list[np.ndarray]:

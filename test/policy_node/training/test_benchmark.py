@@ -232,6 +232,11 @@ def test_another_budget_in_the_same_folder_is_refused(
         (['--set', 'strategy=none'], '--set strategy=none is not possible: choose --arms'),
         (['--seeds', '-1'], 'seed -1; allowed: 0 ... '),
         (['--steps', '0'], 'total_steps 0; allowed: 1 ... '),
+        (['--study', 'best', '--arms', 'her_sparse'], '--arms belongs to --study paper'),
+        (['--study', 'best', '--full'], '--full belongs to --study paper'),
+        (['--episodes', '10'], '--episodes belongs to --study best'),
+        (['--jobs', '0'], '--jobs 0; allowed: 1 or more'),
+        (['--set', 'init_from=FetchReach'], '--set init_from is not possible'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(

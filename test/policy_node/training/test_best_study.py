@@ -154,21 +154,3 @@ def test_two_at_once_are_stopped_resumed_and_shipped(tmp_path: Path) -> None:
     assert main(arguments) == 0
     assert before == {path: path.read_bytes() for path in tmp_path.rglob('progress.csv')}
     assert (tmp_path / 'actors' / 'FetchReach.training.safetensors').is_file()
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'message'),
-    [
-        (['--study', 'best', '--arms', 'her_sparse'], '--arms belongs to --study paper'),
-        (['--study', 'best', '--full'], '--full belongs to --study paper'),
-        (['--episodes', '10'], '--episodes belongs to --study best'),
-        (['--jobs', '0'], '--jobs 0; allowed: 1 or more'),
-        (['--set', 'init_from=FetchReach'], '--set init_from is not possible'),
-    ],
-)
-def test_bad_usage_is_one_line_and_exit_status_2(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert main([*arguments, '--output', str(tmp_path / 'runs')]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count('\n') == 1
