@@ -18,6 +18,12 @@ from msgs_spec.tick import EpisodeStatus
 class RecordingContext:
     """Makes metadata and attachments for the episodes of one simulation.
 
+    Args:
+        simulation: Whose episodes are logged.
+        with_compiled_model: Whether to store the compiled model, meshes and all, 3 MB per
+            episode; its MJCF text is stored in any case.
+        perturb_limit: Largest force, N, by which the robot lets itself be pushed.
+
     Attributes:
         attachments: The model, stored with every episode.
         checkpoint_sha256: Fingerprint of the actor that commands the robot, if one told.
@@ -30,14 +36,6 @@ class RecordingContext:
         with_compiled_model: bool = True,
         perturb_limit: float = 0.0,
     ) -> None:
-        """Fingerprints the model.
-
-        Args:
-            simulation: Whose episodes are logged.
-            with_compiled_model: Whether to store the compiled model, meshes and all, 3 MB per
-                episode; its MJCF text is stored in any case.
-            perturb_limit: Largest force, N, by which the robot lets itself be pushed.
-        """
         self._simulation = simulation
         self._perturb_limit = perturb_limit
         self._model_sha256 = model_sha256(simulation.model)

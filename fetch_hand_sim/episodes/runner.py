@@ -27,6 +27,18 @@ class EpisodeRunner:
     Each reset takes a tick of its own: `advance` starts an episode when `is_between_episodes`, and
     steps it otherwise. Episode i has the seed `first_seed + i` until `set_next_seed` is called.
     Stamps grow by one period per tick and never go back.
+
+    Args:
+        simulation: With `num_envs` 1.
+        first_seed: Seed of the first episode.
+        episodes: How many episodes to run; 0 for no end.
+        first_episode: Index of the first episode, which has the seed `first_seed` plus it; to
+            run an episode from the middle of a series again.
+        first_stamp_ns: Simulated time of the first tick, likewise.
+        joint_prefix: What the names of joints begin with on the network.
+
+    Raises:
+        ValueError: If the simulation holds more than one robot.
     """
 
     def __init__(
@@ -39,20 +51,6 @@ class EpisodeRunner:
         first_stamp_ns: int = FIRST_STAMP_NS,
         joint_prefix: str = JOINT_PREFIX,
     ) -> None:
-        """Prepares the first episode.
-
-        Args:
-            simulation: With `num_envs` 1.
-            first_seed: Seed of the first episode.
-            episodes: How many episodes to run; 0 for no end.
-            first_episode: Index of the first episode, which has the seed `first_seed` plus it; to
-                run an episode from the middle of a series again.
-            first_stamp_ns: Simulated time of the first tick, likewise.
-            joint_prefix: What the names of joints begin with on the network.
-
-        Raises:
-            ValueError: If the simulation holds more than one robot.
-        """
         if simulation.num_envs != 1:
             raise ValueError(f'one robot is run at a time, not {simulation.num_envs}')
         self.simulation = simulation

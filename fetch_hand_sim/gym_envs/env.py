@@ -27,6 +27,22 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     Episodes never terminate; `gymnasium.make` truncates them after the task's number of steps. Give
     it the keyword arguments of this class. `pickle` and `copy.deepcopy` keep the state: both go on
     to the same bits.
+
+    Args:
+        task: One of the tasks (`msgs_spec.tasks.TASKS`).
+        reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
+        success_rule: `gymnasium` (released code) or `paper` (its text).
+        control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
+        render_mode: One of `metadata['render_modes']` or None.
+        width: Pixels of a picture.
+        height: Pixels of a picture.
+        default_camera_config: Attributes of `mujoco.MjvCamera`, such as `distance` (m),
+            `azimuth`, `elevation` (degrees) and `lookat` (m); None for the task's view.
+        distance_threshold: Success within this distance, metres; None for the task's own.
+        rotation_threshold: Success within this rotation, radians; None for the task's own.
+
+    Raises:
+        ValueError: If an argument is not allowed; the message says what is.
     """
 
     metadata = {  # noqa: RUF012 - as in gymnasium.Env
@@ -47,24 +63,6 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         distance_threshold: float | None = None,
         rotation_threshold: float | None = None,
     ) -> None:
-        """Compiles the model.
-
-        Args:
-            task: One of the tasks (`msgs_spec.tasks.TASKS`).
-            reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
-            success_rule: `gymnasium` (released code) or `paper` (its text).
-            control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
-            render_mode: One of `metadata['render_modes']` or None.
-            width: Pixels of a picture.
-            height: Pixels of a picture.
-            default_camera_config: Attributes of `mujoco.MjvCamera`, such as `distance` (m),
-                `azimuth`, `elevation` (degrees) and `lookat` (m); None for the task's view.
-            distance_threshold: Success within this distance, metres; None for the task's own.
-            rotation_threshold: Success within this rotation, radians; None for the task's own.
-
-        Raises:
-            ValueError: If an argument is not allowed; the message says what is.
-        """
         check_render_mode(render_mode)
         self.simulation = Simulation(
             task,

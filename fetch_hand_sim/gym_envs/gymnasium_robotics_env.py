@@ -235,6 +235,12 @@ class HandReachEnv(RobotEnv):
 class ManipulateEnv(RobotEnv):
     """`shadow_dexterous_hand/manipulate.py`: block, egg and pen.
 
+    Args:
+        task: The task.
+        target_position: `random` or `ignore`; None for the task's own.
+        target_rotation: `z`, `parallel` or `xyz`; None for the task's own.
+        **arguments: As `FetchHandEnv` has them.
+
     Attributes:
         target_position: `random` where the position counts, else `ignore`.
         target_rotation: Which rotations goals have: `z`, `parallel` or `xyz`.
@@ -244,6 +250,9 @@ class ManipulateEnv(RobotEnv):
         randomize_initial_position: Always.
         randomize_initial_rotation: Whether the object starts turned.
         relative_control: Never.
+
+    Raises:
+        ValueError: If no task has such goals for this object; the message lists what is.
     """
 
     def __init__(
@@ -253,17 +262,6 @@ class ManipulateEnv(RobotEnv):
         target_rotation: str | None = None,
         **arguments: Any,
     ) -> None:
-        """Compiles the model.
-
-        Args:
-            task: The task.
-            target_position: `random` or `ignore`; None for the task's own.
-            target_rotation: `z`, `parallel` or `xyz`; None for the task's own.
-            **arguments: As `FetchHandEnv` has them.
-
-        Raises:
-            ValueError: If no task has such goals for this object; the message lists what is.
-        """
         task = _task_with_goals(task, target_position, target_rotation)
         super().__init__(task, **arguments)
         physics = self.simulation.task

@@ -28,7 +28,17 @@ RENDER_MODES = ['human', 'rgb_array', 'depth_array']
 
 
 class Pictures:
-    """Draws copies of a simulation; opens OpenGL or a window at the first picture."""
+    """Draws copies of a simulation; opens OpenGL or a window at the first picture.
+
+    Args:
+        simulation: What to draw.
+        width: Pixels.
+        height: Pixels.
+        camera: Attributes of `mujoco.MjvCamera`; None for the task's view.
+
+    Raises:
+        ValueError: If the size is not positive or the camera has no such attribute.
+    """
 
     def __init__(
         self,
@@ -37,17 +47,6 @@ class Pictures:
         height: int = HEIGHT,
         camera: Mapping[str, Any] | None = None,
     ) -> None:
-        """Keeps what pictures are to be like.
-
-        Args:
-            simulation: What to draw.
-            width: Pixels.
-            height: Pixels.
-            camera: Attributes of `mujoco.MjvCamera`; None for the task's view.
-
-        Raises:
-            ValueError: If the size is not positive or the camera has no such attribute.
-        """
         for name, side in (('width', width), ('height', height)):
             if side < 1:
                 raise ValueError(f'{name} must be at least 1 pixel, not {side}')

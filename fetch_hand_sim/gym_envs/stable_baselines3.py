@@ -22,21 +22,19 @@ class FetchHandVecEnv(VecEnv):
     same step, its last observation is `info['terminal_observation']`. Put a `VecMonitor` around it
     for the episodes' returns.
 
+    Args:
+        task: One of the tasks (`msgs_spec.tasks.TASKS`).
+        num_envs: Number of copies N.
+        **arguments: As `FetchHandVectorEnv` has them, but `autoreset_mode`.
+
     Attributes:
         batch: The environments.
+
+    Raises:
+        ValueError: If an argument is not allowed; the message says what is.
     """
 
     def __init__(self, task: str, num_envs: int = 1, **arguments: Any) -> None:
-        """Compiles the model and prepares the copies.
-
-        Args:
-            task: One of the tasks (`msgs_spec.tasks.TASKS`).
-            num_envs: Number of copies N.
-            **arguments: As `FetchHandVectorEnv` has them, but `autoreset_mode`.
-
-        Raises:
-            ValueError: If an argument is not allowed; the message says what is.
-        """
         self.batch = FetchHandVectorEnv(
             task, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **arguments
         )

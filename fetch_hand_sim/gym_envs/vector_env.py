@@ -35,6 +35,25 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     (`NEXT_STEP`), in the step that ends an episode, whose last observation is `info['final_obs']`
     (`SAME_STEP`), or by `reset_mask` only (`DISABLED`). `pickle` and `copy.deepcopy` keep the
     state.
+
+    Args:
+        task: One of the tasks (`msgs_spec.tasks.TASKS`).
+        num_envs: Number of copies N.
+        max_episode_steps: Steps per episode; None for the task's own number.
+        num_threads: Threads that step them; 0 for all processors.
+        reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
+        success_rule: `gymnasium` (released code) or `paper` (its text).
+        control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
+        autoreset_mode: When an ended episode is followed by the next.
+        render_mode: `rgb_array`, `depth_array` or None.
+        width: Pixels of a picture.
+        height: Pixels of a picture.
+        default_camera_config: Attributes of `mujoco.MjvCamera`; None for the task's view.
+        distance_threshold: Success within this distance, metres; None for the task's own.
+        rotation_threshold: Success within this rotation, radians; None for the task's own.
+
+    Raises:
+        ValueError: If an argument is not allowed; the message says what is.
     """
 
     metadata = {  # noqa: RUF012 - as in gymnasium.vector.VectorEnv
@@ -60,27 +79,6 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         distance_threshold: float | None = None,
         rotation_threshold: float | None = None,
     ) -> None:
-        """Compiles the model and prepares the copies.
-
-        Args:
-            task: One of the tasks (`msgs_spec.tasks.TASKS`).
-            num_envs: Number of copies N.
-            max_episode_steps: Steps per episode; None for the task's own number.
-            num_threads: Threads that step them; 0 for all processors.
-            reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
-            success_rule: `gymnasium` (released code) or `paper` (its text).
-            control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
-            autoreset_mode: When an ended episode is followed by the next.
-            render_mode: `rgb_array`, `depth_array` or None.
-            width: Pixels of a picture.
-            height: Pixels of a picture.
-            default_camera_config: Attributes of `mujoco.MjvCamera`; None for the task's view.
-            distance_threshold: Success within this distance, metres; None for the task's own.
-            rotation_threshold: Success within this rotation, radians; None for the task's own.
-
-        Raises:
-            ValueError: If an argument is not allowed; the message says what is.
-        """
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(f'max_episode_steps must be at least 1, not {max_episode_steps}')
         check_render_mode(render_mode, _RENDER_MODES)

@@ -33,14 +33,13 @@ _CLOCK = '/clock'
 
 
 class ReplayNode(Node):
-    """Publishes an episode, once or in a loop."""
+    """Publishes an episode, once or in a loop.
+
+    Raises:
+        UsageError: If a parameter is not allowed or the episode cannot be read.
+    """
 
     def __init__(self) -> None:
-        """Reads the episode and opens its topics.
-
-        Raises:
-            UsageError: If a parameter is not allowed or the episode cannot be read.
-        """
         super().__init__(NODE_NAME)
         self._settings = declare_parameters(self, REPLAY_NODE)
         self._schedule = self._read_schedule()

@@ -122,17 +122,16 @@ def _require_readable(path: Path, spec: TopicSpec, message: ReplayMessage) -> No
 
 
 class Playhead:
-    """Position in an episode over time. `now` is seconds of any steady clock."""
+    """Position in an episode over time. `now` is seconds of any steady clock.
+
+    Args:
+        position_ns: Log time.
+        rate: Recorded seconds per second.
+        now: The time now.
+        is_paused: Whether to stand still until `resume`.
+    """
 
     def __init__(self, position_ns: int, rate: float, now: float, is_paused: bool) -> None:
-        """Starts at a position.
-
-        Args:
-            position_ns: Log time.
-            rate: Recorded seconds per second.
-            now: The time now.
-            is_paused: Whether to stand still until `resume`.
-        """
         self._position_ns = position_ns
         self._since = now
         self._rate = rate

@@ -58,14 +58,13 @@ _LAST_WORDS_TIMEOUT = 1.0
 
 
 class SimNode(Node):
-    """Publishes the state of one robot at every tick and applies the commands it receives."""
+    """Publishes the state of one robot at every tick and applies the commands it receives.
+
+    Raises:
+        UsageError: If a parameter is not allowed.
+    """
 
     def __init__(self) -> None:
-        """Compiles the model and opens all topics and services.
-
-        Raises:
-            UsageError: If a parameter is not allowed.
-        """
         super().__init__(NODE_NAME)
         self._settings = declare_parameters(self, SIM_NODE)
         self._refuse_simulated_time()

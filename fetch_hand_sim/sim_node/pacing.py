@@ -4,16 +4,17 @@ from __future__ import annotations
 
 
 class RealTimePacer:
-    """Says when the next tick is due. Times are seconds of any steady clock."""
+    """Says when the next tick is due. Times are seconds of any steady clock.
+
+    The first tick is due at once.
+
+    Args:
+        tick_duration: Simulated seconds per tick.
+        real_time_factor: Simulated seconds per second; 0 is as fast as possible.
+        now: The time now.
+    """
 
     def __init__(self, tick_duration: float, real_time_factor: float, now: float) -> None:
-        """Starts with the first tick due now.
-
-        Args:
-            tick_duration: Simulated seconds per tick.
-            real_time_factor: Simulated seconds per second; 0 is as fast as possible.
-            now: The time now.
-        """
         self._tick_duration = tick_duration
         self._due = now
         self.missed_ticks = 0

@@ -11,15 +11,14 @@ Mode = Literal['realtime', 'lockstep']
 
 
 class TickSchedule:
-    """Decides, and never looks at a clock itself. Times are seconds of any steady one."""
+    """Decides, and never looks at a clock itself. Times are seconds of any steady one.
+
+    Args:
+        mode: `realtime` follows the pacer, `lockstep` the commands.
+        pacer: With its first tick due at the start.
+    """
 
     def __init__(self, mode: Mode, pacer: RealTimePacer) -> None:
-        """Starts running.
-
-        Args:
-            mode: `realtime` follows the pacer, `lockstep` the commands.
-            pacer: With its first tick due at the start.
-        """
         self.mode = mode
         self.pacer = pacer
         self.is_paused = False

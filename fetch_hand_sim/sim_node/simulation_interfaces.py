@@ -30,15 +30,14 @@ FEATURES = (
 
 
 class SimulationInterfaces:
-    """One method per service, with the signature of rclpy's service callbacks."""
+    """One method per service, with the signature of rclpy's service callbacks.
+
+    Args:
+        robot: What is controlled.
+        simulator_features: The class `simulation_interfaces.msg.SimulatorFeatures`.
+    """
 
     def __init__(self, robot: Robot, simulator_features: Any) -> None:
-        """Connects.
-
-        Args:
-            robot: What is controlled.
-            simulator_features: The class `simulation_interfaces.msg.SimulatorFeatures`.
-        """
         self._robot = robot
         found = (getattr(simulator_features, name, None) for name in FEATURES)
         self._features = [value for value in found if value is not None]

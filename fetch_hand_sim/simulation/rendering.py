@@ -20,7 +20,21 @@ LARGEST_SIDE = 4096
 
 
 class SceneRenderer:
-    """Draws frames of a scene without a display."""
+    """Draws frames of a scene without a display.
+
+    Opens an OpenGL context.
+
+    Args:
+        scene: What to draw.
+        width: Pixels.
+        height: Pixels.
+        camera: A camera of the model by name, or attributes of `mujoco.MjvCamera` that differ
+            from the scene's own view; None for that view.
+
+    Raises:
+        ValueError: If the model has no such camera or the size is not allowed.
+        RuntimeError: If there is no OpenGL.
+    """
 
     def __init__(
         self,
@@ -29,19 +43,6 @@ class SceneRenderer:
         height: int = HEIGHT,
         camera: str | Mapping[str, Any] | None = None,
     ) -> None:
-        """Opens an OpenGL context.
-
-        Args:
-            scene: What to draw.
-            width: Pixels.
-            height: Pixels.
-            camera: A camera of the model by name, or attributes of `mujoco.MjvCamera` that differ
-                from the scene's own view; None for that view.
-
-        Raises:
-            ValueError: If the model has no such camera or the size is not allowed.
-            RuntimeError: If there is no OpenGL.
-        """
         for side in (width, height):
             if not 1 <= side <= LARGEST_SIDE:
                 raise ValueError(f'size {width}x{height}; allowed: 1 ... {LARGEST_SIDE} pixels')

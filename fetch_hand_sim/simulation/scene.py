@@ -124,14 +124,12 @@ class Scene:
         spec: The task.
         model: The compiled `mujoco.MjModel`, for looking at only.
         data: Its `mujoco.MjData`, posed as the last frame.
+
+    Raises:
+        ValueError: If there is no such task.
     """
 
     def __init__(self, task: str) -> None:
-        """Compiles the model.
-
-        Raises:
-            ValueError: If there is no such task.
-        """
         self.spec = task_spec(task)
         mjcf = load_spec(task_asset(task))
         _dress(mjcf)

@@ -61,6 +61,18 @@ class StepResult:
 class Simulation:
     """N copies of one task on a pool of threads; pickled and copied with its state.
 
+    Call `reset` before `step`.
+
+    Args:
+        task: One of the thirteen tasks (`msgs_spec.tasks.TASKS`).
+        num_envs: Number of copies N.
+        num_threads: Threads that step them; 0 for all processors.
+        reward_type: `sparse` or `dense`.
+        success_rule: `gymnasium` (released code) or `paper` (its text).
+        control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
+        keeps_data: Whether each copy keeps an `MjData` of its own, which `read_data` then
+            gives as MuJoCo left it.
+
     Attributes:
         spec: The task as data.
         num_envs: Number of copies N.
@@ -68,6 +80,9 @@ class Simulation:
         metric: What rewards and success are; it may be replaced between steps.
         goals: (N, goal size) the desired goals, live: what is written counts from the next step.
         divergences: How often MuJoCo has lost a simulation.
+
+    Raises:
+        ValueError: If an argument is not allowed; the message says what is.
     """
 
     def __init__(
@@ -80,21 +95,6 @@ class Simulation:
         control_hz: float = DEFAULT_CONTROL_HZ,
         keeps_data: bool = False,
     ) -> None:
-        """Compiles the model and prepares the copies; call `reset` before `step`.
-
-        Args:
-            task: One of the thirteen tasks (`msgs_spec.tasks.TASKS`).
-            num_envs: Number of copies N.
-            num_threads: Threads that step them; 0 for all processors.
-            reward_type: `sparse` or `dense`.
-            success_rule: `gymnasium` (released code) or `paper` (its text).
-            control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
-            keeps_data: Whether each copy keeps an `MjData` of its own, which `read_data` then
-                gives as MuJoCo left it.
-
-        Raises:
-            ValueError: If an argument is not allowed; the message says what is.
-        """
         if num_envs < 1:
             raise ValueError(f'num_envs must be at least 1, not {num_envs}')
         if num_threads < 0:

@@ -98,14 +98,12 @@ class RobotDescription:
 
     Attributes:
         joints: From the root outwards: parents come before their children.
+
+    Raises:
+        ValueError: If there is no such task.
     """
 
     def __init__(self, task: str) -> None:
-        """Compiles the model.
-
-        Raises:
-            ValueError: If there is no such task.
-        """
         self._spec = task_spec(task)
         self._mjcf = load_spec(task_asset(task))
         self._model = self._mjcf.compile()

@@ -12,17 +12,16 @@ from fetch_hand_sim.simulation.scene import Frame, Scene
 
 
 class Camera:
-    """Pictures of one scene."""
+    """Pictures of one scene.
+
+    Args:
+        width: Pixels.
+        height: Pixels.
+        hz: Pictures per second of the clock, at most; 0 for none.
+        clock: A steady clock, seconds.
+    """
 
     def __init__(self, width: int, height: int, hz: float, clock: Callable[[], float]) -> None:
-        """Draws nothing yet.
-
-        Args:
-            width: Pixels.
-            height: Pixels.
-            hz: Pictures per second of the clock, at most; 0 for none.
-            clock: A steady clock, seconds.
-        """
         self.width, self.height = width, height
         self._period = 1.0 / hz if hz else np.inf
         self._clock = clock

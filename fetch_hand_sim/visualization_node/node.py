@@ -44,14 +44,13 @@ _SERVED_FIRST = 200
 
 
 class VisualizationNode(Node):
-    """Publishes the topics of `msgs_spec.view_topics`."""
+    """Publishes the topics of `msgs_spec.view_topics`.
+
+    Raises:
+        UsageError: If a parameter is not allowed.
+    """
 
     def __init__(self) -> None:
-        """Opens its topics and listens for a robot.
-
-        Raises:
-            UsageError: If a parameter is not allowed.
-        """
         super().__init__(NODE_NAME)
         settings = declare_parameters(self, VISUALIZATION_NODE)
         self._scene: Scene | None = None

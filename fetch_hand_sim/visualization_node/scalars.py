@@ -12,15 +12,14 @@ from msgs_spec.view_topics import scalar_topics
 
 
 class Scalars:
-    """Makes the messages of `scalars/*` for one task."""
+    """Makes the messages of `scalars/*` for one task.
+
+    Args:
+        spec: The task.
+        success_rule: `gymnasium` or `paper`.
+    """
 
     def __init__(self, spec: TaskSpec, success_rule: str) -> None:
-        """Takes what tells how far a goal is.
-
-        Args:
-            spec: The task.
-            success_rule: `gymnasium` or `paper`.
-        """
         self._metric = GoalMetric(spec, success_rule=cast('SuccessRule', success_rule))
         self._codecs = {source.name: TopicCodec(source) for source in scalar_topics(spec)}
 

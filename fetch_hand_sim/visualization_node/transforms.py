@@ -28,18 +28,17 @@ class Transform:
 
 
 class Transforms:
-    """The tree of frames of one robot."""
+    """The tree of frames of one robot.
+
+    Args:
+        task: Name of the task.
+        prefix: Before all frames but `world`, such as `left/`.
+
+    Raises:
+        ValueError: If there is no such task.
+    """
 
     def __init__(self, task: str, prefix: str = '') -> None:
-        """Compiles the robot's description.
-
-        Args:
-            task: Name of the task.
-            prefix: Before all frames but `world`, such as `left/`.
-
-        Raises:
-            ValueError: If there is no such task.
-        """
         self.description = RobotDescription(task)
         self._spec = task_spec(task)
         self._prefix = prefix

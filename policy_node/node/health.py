@@ -30,14 +30,13 @@ def read_pause(message: Any, namespace: str) -> bool | None:
 
 
 class Health:
-    """Turns the counters of a responder into reports."""
+    """Turns the counters of a responder into reports.
+
+    Args:
+        name: Fully qualified name of the node.
+    """
 
     def __init__(self, name: str) -> None:
-        """Starts without a robot.
-
-        Args:
-            name: Fully qualified name of the node.
-        """
         self._name = name
         self._commander: Commander | None = None
         self._responder: Responder | None = None

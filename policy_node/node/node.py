@@ -48,14 +48,12 @@ class PolicyNode(Node):
     """Waits for a robot, checks that the policy fits it, then answers every tick with a command.
 
     A robot that comes back with another task or rate is a new robot.
+
+    Raises:
+        UsageError: If a parameter is not allowed or there is no such policy.
     """
 
     def __init__(self) -> None:
-        """Declares parameters, loads the policy if they say which, and listens for a robot.
-
-        Raises:
-            UsageError: If a parameter is not allowed or there is no such policy.
-        """
         super().__init__(NODE_NAME)
         self._settings = declare_parameters(self, POLICY_NODE)
         self._loaded = self._load_ahead()

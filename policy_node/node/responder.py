@@ -21,6 +21,12 @@ from policy_node.node.stamp_join import StampJoin
 class Responder:
     """Answers each complete tick of one robot with one command.
 
+    Args:
+        commander: Who decides.
+        status: What the robot said of itself.
+        send: Takes the CDR bytes of a command; False if nobody listens yet.
+        clock: A steady clock, seconds.
+
     Attributes:
         topics: The topics it needs.
         join: Joins them by stamp.
@@ -37,14 +43,6 @@ class Responder:
         send: Callable[[bytes], bool],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Prepares for a robot.
-
-        Args:
-            commander: Who decides.
-            status: What the robot said of itself.
-            send: Takes the CDR bytes of a command; False if nobody listens yet.
-            clock: A steady clock, seconds.
-        """
         self._commander = commander
         spec = task_spec(status.task, status.joint_prefix)
         self._assembler = ObservationAssembler(spec, status.control_hz)

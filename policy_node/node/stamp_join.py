@@ -16,15 +16,13 @@ class StampJoin:
     Stamps that are incomplete when a later one completes are dropped, and so is everything that
     arrives for a stamp no later than the last complete one: an actor wants the newest state, not
     every state.
+
+    Args:
+        topics: Names of the topics to join.
+        max_pending: Incomplete stamps kept; the oldest goes first.
     """
 
     def __init__(self, topics: Iterable[str], max_pending: int = 8) -> None:
-        """Starts empty.
-
-        Args:
-            topics: Names of the topics to join.
-            max_pending: Incomplete stamps kept; the oldest goes first.
-        """
         self._topics = frozenset(topics)
         self._max_pending = max_pending
         self._pending: dict[int, Vectors] = {}

@@ -19,6 +19,11 @@ class MLP(nn.Module):
 
     The initialisation is that of the paper's code (`baselines/her/util.py`). The output layer stays
     float32 under autocast: values near -50 would otherwise be rounded to steps of 0.25.
+
+    Args:
+        input_size: Of the first layer.
+        output_size: Of the last.
+        shape: Hidden layers, and whether they are normalised.
     """
 
     def __init__(self, input_size: int, output_size: int, shape: NetworkShape) -> None:

@@ -113,6 +113,13 @@ FETCH_CONFIGS = {
 class FetchTask(Task):
     """FetchReach, FetchPush, FetchSlide, FetchPickAndPlace.
 
+    The robot settles once; that state is the start of every episode.
+
+    Args:
+        spec: The task.
+        batch: How many simulations, and how they are stepped.
+        config: In what it differs; None for those of the thirteen.
+
     Attributes:
         config: In what they differ.
         gripper_start: (3,) where the gripper is at a reset, m, world.
@@ -123,13 +130,6 @@ class FetchTask(Task):
     def __init__(
         self, spec: TaskSpec, batch: BatchConfig, config: FetchConfig | None = None
     ) -> None:
-        """Lets the robot settle once and keeps that state as the start of every episode.
-
-        Args:
-            spec: The task.
-            batch: How many simulations, and how they are stepped.
-            config: In what it differs; None for those of the thirteen.
-        """
         self.config = config or FETCH_CONFIGS[spec.name]
         mjcf = load_spec(self.config.asset)
         exclude_body_pairs(mjcf, FETCH_NEVER_TOUCHING)

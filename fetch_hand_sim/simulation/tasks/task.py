@@ -63,6 +63,11 @@ class Task(ABC):
 
     Subclasses fill in the physics of a family. All arrays have the simulation as leading axis.
 
+    Args:
+        spec: The task.
+        model: Its compiled model.
+        batch: How many simulations, and how they are stepped.
+
     Attributes:
         spec: The task as data.
         model: The compiled `mujoco.MjModel`; the batch steps with a copy.
@@ -81,13 +86,6 @@ class Task(ABC):
         model: mujoco.MjModel,
         batch: BatchConfig,
     ) -> None:
-        """Starts the batch.
-
-        Args:
-            spec: The task.
-            model: Its compiled model.
-            batch: How many simulations, and how they are stepped.
-        """
         prepare_engine()
         self.spec = spec
         self.substeps = batch.substeps

@@ -18,6 +18,13 @@ class Collector:
     It owns its generator and touches nothing of the learner, so it may run in another thread and
     still gives the same episodes for the same policy.
 
+    Args:
+        simulation: The simulations.
+        seeds: One seed per simulation for its resets; the first also seeds exploration.
+        noise_std: Standard deviation of the Gaussian noise on actions.
+        random_epsilon: Probability of a uniformly random action instead.
+        noise_spread: The first simulation has 1 - spread times both, the last 1 + spread.
+
     Attributes:
         exploration: Share of `noise_std` and `random_epsilon` that is in force.
     """
@@ -30,15 +37,6 @@ class Collector:
         random_epsilon: float,
         noise_spread: float = 0.0,
     ) -> None:
-        """Prepares collection.
-
-        Args:
-            simulation: The simulations.
-            seeds: One seed per simulation for its resets; the first also seeds exploration.
-            noise_std: Standard deviation of the Gaussian noise on actions.
-            random_epsilon: Probability of a uniformly random action instead.
-            noise_spread: The first simulation has 1 - spread times both, the last 1 + spread.
-        """
         self.simulation = simulation
         self.noise_std = noise_std
         self.random_epsilon = random_epsilon

@@ -43,6 +43,12 @@ class Losses:
 class DDPG:
     """Actor, critic, their targets, and one update.
 
+    Args:
+        shape: Of both networks.
+        config: The configuration.
+        device: Where they live.
+        workers: With whom gradients are averaged.
+
     Attributes:
         updates: Updates so far.
         critic_first: The actor learns after this many of them.

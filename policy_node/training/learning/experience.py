@@ -24,6 +24,13 @@ from policy_node.training.learning.replay import EpisodeReplay, Episodes
 class Experience:
     """Replay and normaliser statistics of one worker; statistics are shared by all workers.
 
+    Args:
+        config: The configuration; `replay_transitions` and `batch_size` are totals.
+        spec: The task.
+        workers: This worker among all.
+        compute_reward: Reward of relabelled goals.
+        generator: Source of all randomness.
+
     Attributes:
         replay: The episodes held.
         statistics: Running statistics of observations and goals, by name.
@@ -39,15 +46,6 @@ class Experience:
         compute_reward: RewardFunction,
         generator: np.random.Generator,
     ) -> None:
-        """Allocates the replay.
-
-        Args:
-            config: The configuration; `replay_transitions` and `batch_size` are totals.
-            spec: The task.
-            workers: This worker among all.
-            compute_reward: Reward of relabelled goals.
-            generator: Source of all randomness.
-        """
         self._config = config
         self._workers = workers
         self._compute_reward = compute_reward

@@ -54,7 +54,20 @@ class Episodes:
 
 
 class EpisodeReplay:
-    """Ring of the latest episodes in arrays allocated once."""
+    """Ring of the latest episodes in arrays allocated once.
+
+    Its memory is touched as episodes arrive.
+
+    Args:
+        capacity: Episodes.
+        ticks: Steps per episode.
+        observation_size: Length of an observation.
+        goal_size: Length of a goal.
+        action_size: Length of an action.
+        weigh: Weights of episodes for `draw`; None is 1 where the achieved goal has moved.
+        count_ticks: How many ticks of an episode, from its first, are worth drawing; None is
+            all of them.
+    """
 
     def __init__(
         self,
@@ -66,18 +79,6 @@ class EpisodeReplay:
         weigh: Callable[[Episodes], NDArray[np.float64]] | None = None,
         count_ticks: Callable[[Episodes], NDArray[np.int64]] | None = None,
     ) -> None:
-        """Allocates room for `capacity` episodes; the memory is touched as episodes arrive.
-
-        Args:
-            capacity: Episodes.
-            ticks: Steps per episode.
-            observation_size: Length of an observation.
-            goal_size: Length of a goal.
-            action_size: Length of an action.
-            weigh: Weights of episodes for `draw`; None is 1 where the achieved goal has moved.
-            count_ticks: How many ticks of an episode, from its first, are worth drawing; None is
-                all of them.
-        """
         if capacity < 1:
             raise ValueError(f'replay capacity {capacity} episodes; allowed: 1 or more')
         self._ring = Episodes(

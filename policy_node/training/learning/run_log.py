@@ -38,20 +38,19 @@ _PLAIN_INTERVAL = 15.0
 
 
 class RunLog:
-    """Writes one row per cycle; a resumed run appends to the same file."""
+    """Writes one row per cycle; a resumed run appends to the same file.
+
+    Args:
+        output: Folder of the run.
+        total_steps: Environment steps of the whole run, for the ETA.
+        time_limit: Its limit, seconds; 0 is none.
+        resumed_steps: Environment steps of the checkpoint the run goes on from. What was logged
+            after it, and is about to be run again, is removed.
+    """
 
     def __init__(
         self, output: Path, total_steps: int, time_limit: float, resumed_steps: int = 0
     ) -> None:
-        """Opens the files.
-
-        Args:
-            output: Folder of the run.
-            total_steps: Environment steps of the whole run, for the ETA.
-            time_limit: Its limit, seconds; 0 is none.
-            resumed_steps: Environment steps of the checkpoint the run goes on from. What was logged
-                after it, and is about to be run again, is removed.
-        """
         self.path = output / 'progress.csv'
         self._total_steps = total_steps
         self._time_limit = time_limit
