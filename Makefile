@@ -38,7 +38,7 @@ help:
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
 	@echo 'make torture    100,000 hostile messages per test, an hour of memory at 20x, 50 killed'
 	@echo '                robots, 10,000 damaged and 2,000 crafted episode files'
-	@echo 'make test-release  build wheel and sdist, install them elsewhere, run the demo from there'
+	@echo 'make test-release  the tests that train or install; wheel and sdist, built, installed elsewhere and used'
 	@echo 'make bench-episodes  what logging costs and how fast logs load'
 	@echo 'make env        only create $(VENV)'
 	@echo 'make clean      remove build products; distclean removes $(VENV) too'
@@ -116,6 +116,7 @@ torture: env
 		test/fetch_hand_sim/episode_log/test_episode_untrusted.py
 
 test-release: env
+	$(BIN)/python -m pytest -m release
 	PYTHON=$(abspath $(BIN)/python) tools/test_release.sh
 
 bench-episodes: env

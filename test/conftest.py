@@ -11,12 +11,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from support.run_guard import start_guard
+from support.run_guard import DOMAIN_LOCK_PORT, start_guard
 
 # Low domains are what people set by hand; above 101 the ports of DDS meet Linux' ephemeral ones.
 DOMAINS = range(40, 102)
-# The ports of `domain_coordinator` (ament_cmake_ros), so its users and this run avoid each other.
-DOMAIN_LOCK_PORT = 32768
 
 
 def reserve_domain() -> tuple[int, socket.socket]:

@@ -127,6 +127,7 @@ def test_gymnasium_the_batch_and_a_controller_of_three_lines(site: Path) -> None
     assert result.stdout.split('\n')[:2] == ['4.0 [0.0, 0.0, 0.0, 0.0]', 'True'], result.stderr
 
 
+@pytest.mark.release
 def test_it_is_trained_run_by_the_nodes_logged_checked_and_replayed(
     site: Path, start_process: Start, tmp_path: Path, ros_environment: dict[str, str]
 ) -> None:

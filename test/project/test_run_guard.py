@@ -11,10 +11,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from conftest import DOMAIN_LOCK_PORT
-
 from support import ROOT, script_environment
-from support.run_guard import processes_of
+from support.run_guard import DOMAIN_LOCK_PORT, processes_of
 
 # What the run starts, and what that starts in a session of its own.
 TEST = """

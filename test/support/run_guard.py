@@ -19,6 +19,9 @@ import sys
 import time
 from pathlib import Path
 
+# Of `domain_coordinator` (ament_cmake_ros), so its users and these runs avoid each other.
+DOMAIN_LOCK_PORT = 32768
+
 
 def start_guard(lock: socket.socket, log_directory: str) -> None:
     """Starts a guard of this process, which hands the lock on.

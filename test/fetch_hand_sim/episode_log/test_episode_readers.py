@@ -84,6 +84,7 @@ def either(request, episode, recovered):
     return episode if request.param == 'whole' else recovered
 
 
+@pytest.mark.release
 def test_foxglove_reads_every_message(either, npm_packages):
     logged = read_episode(either)
     result = subprocess.run(

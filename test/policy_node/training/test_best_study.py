@@ -112,6 +112,7 @@ def test_a_job_that_fails_stops_only_what_starts_from_it(tmp_path: Path) -> None
 
 
 # Nine processes that load torch: on a busy machine that takes its time.
+@pytest.mark.release
 @pytest.mark.timeout(900)
 def test_two_at_once_are_stopped_resumed_and_shipped(tmp_path: Path) -> None:
     arguments = [*TINY, '--tasks', *EGGS, 'FetchReach', '--jobs', '2', '--steps', '2000']

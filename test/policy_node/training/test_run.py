@@ -66,6 +66,7 @@ def train_in_parts(config: TrainConfig, output: Path, cycles: int) -> list[dict]
             return rows
 
 
+@pytest.mark.release
 def test_a_run_interrupted_ten_times_learns_as_much_as_one_that_was_not(tmp_path: Path) -> None:
     config = small(total_steps=4_400, evaluate_every=1_000)
     whole = train_in_parts(config, tmp_path / 'whole', cycles=1000)

@@ -58,6 +58,7 @@ def small_config(**changes: object) -> TrainConfig:
     return recipe_config('FetchReach', 'best', torch_threads=1, **{**options, **changes})
 
 
+@pytest.mark.release
 def test_fetch_reach_is_learnt_from_nothing(tmp_path: Path) -> None:
     arguments = ['--task', 'FetchReach', '--success-target', '1', '--steps', '40000']
     assert main([*arguments, *THREADS, '--output', str(tmp_path / 'run')]) == 0
@@ -342,6 +343,7 @@ def test_the_best_actor_is_kept_and_ties_go_to_the_better_return(tmp_path: Path)
     assert evaluated(6, 3, -20.0) == 6
 
 
+@pytest.mark.release
 def test_two_workers_train_together(tmp_path: Path) -> None:
     run = tmp_path / 'run'
     arguments = ['--task', 'FetchReach', '--success-target', '1', '--steps', '60000', *THREADS]
