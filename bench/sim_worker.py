@@ -83,7 +83,7 @@ def record_episode(task: str, num_envs: int) -> tuple[np.ndarray, Any]:
 
     simulation = Simulation(task, num_envs=num_envs)
     simulation.reset(seed=0)
-    physics, robot = simulation._task, simulation.spec.robot
+    physics, robot = simulation.task, simulation.spec.robot
     generator = np.random.default_rng(0)
     states = []
     for _ in range(simulation.spec.episode_ticks):

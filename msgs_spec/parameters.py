@@ -10,7 +10,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS, substeps_per_tick
+from msgs_spec.tasks import (
+    DEFAULT_CONTROL_HZ,
+    REWARD_TYPES,
+    SUCCESS_RULES,
+    TASKS,
+    substeps_per_tick,
+)
 
 Value = str | int | float | bool
 
@@ -90,14 +96,14 @@ SIM_NODE = (
         'string',
         'sparse',
         'Sparse: 0 at the goal, -1 elsewhere. Dense: minus the distance to the goal.',
-        choices=('sparse', 'dense'),
+        choices=REWARD_TYPES,
     ),
     ParameterSpec(
         'success_rule',
         'string',
         'gymnasium',
         'Success as the released code of the benchmark has it, or as the paper defines it.',
-        choices=('gymnasium', 'paper'),
+        choices=SUCCESS_RULES,
     ),
     ParameterSpec(
         'control_hz',

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,12 @@ Array = NDArray[np.float64]
 # One physics substep, seconds, and the paper's 20 substeps per action (25 Hz).
 PHYSICS_TIMESTEP = 0.002
 DEFAULT_CONTROL_HZ = 25.0
+
+# What `GoalMetric` of the simulation says of them.
+RewardType = Literal['sparse', 'dense']
+SuccessRule = Literal['gymnasium', 'paper']
+REWARD_TYPES: tuple[str, ...] = get_args(RewardType)
+SUCCESS_RULES: tuple[str, ...] = get_args(SuccessRule)
 
 
 class GoalKind(Enum):

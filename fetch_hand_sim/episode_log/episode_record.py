@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from msgs_spec.parameters import LARGEST_PERTURBATION
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
-from msgs_spec.tasks import TaskSpec, substeps_per_tick, task_spec
+from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, TaskSpec, substeps_per_tick, task_spec
 
 Strings = Mapping[str, str]
 Number = TypeVar('Number', int, float)
@@ -59,8 +59,8 @@ class EpisodeRecord:
             task=parse_task(metadata),
             episode=_integer(metadata, 'episode'),
             seed=_integer(metadata, 'seed'),
-            reward_type=_word(metadata, 'reward_type', ('sparse', 'dense')),
-            success_rule=_word(metadata, 'success_rule', ('gymnasium', 'paper')),
+            reward_type=_word(metadata, 'reward_type', REWARD_TYPES),
+            success_rule=_word(metadata, 'success_rule', SUCCESS_RULES),
             control_hz=parse_control_hz(metadata),
             joint_prefix=_joint_prefix(metadata),
             interface_version=_integer(metadata, 'interface_version', default='1'),

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from fetch_hand_sim.episode_log.errors import EpisodeExistsError, EpisodeLogError
-from fetch_hand_sim.episode_log.leftovers import Leftover, find_leftovers
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from fetch_hand_sim.episode_log.writer import EpisodeWriter
 
@@ -74,10 +73,6 @@ class EpisodeDirectory:
             else:
                 self._next[task] = index + 1
                 return writer
-
-    def leftovers(self) -> list[Leftover]:
-        """Returns the episodes that earlier runs did not complete; see `find_leftovers`."""
-        return find_leftovers(self.path)
 
     def _first_index(self, task: str) -> int:
         try:

@@ -23,10 +23,10 @@ from fetch_hand_sim.episodes.perturbations import accept_perturbation
 from fetch_hand_sim.episodes.recorder import episode_result
 from fetch_hand_sim.episodes.runner import Array, EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
 from msgs_spec.codecs import decode
 from msgs_spec.command_line import printable
 from msgs_spec.schemas import deserialize
+from msgs_spec.tasks import RewardType, SuccessRule
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import TopicSpec
 

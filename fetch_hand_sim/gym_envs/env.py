@@ -15,8 +15,7 @@ from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observati
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
 from fetch_hand_sim.simulation import Observation, Simulation
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
-from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,6 @@ from fetch_hand_sim.gym_envs.goal_env import import_goal_env
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES
 from fetch_hand_sim.simulation import Observation
 from fetch_hand_sim.simulation.models import asset_path
-from fetch_hand_sim.simulation.rewards import RewardType
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
 from fetch_hand_sim.simulation.tasks.hand_manipulate import (
     MANIPULATE_CONFIGS,
@@ -27,7 +26,7 @@ from fetch_hand_sim.simulation.tasks.hand_manipulate import (
     HandManipulateTask,
 )
 from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
-from msgs_spec.tasks import GoalKind, task_spec
+from msgs_spec.tasks import GoalKind, RewardType, task_spec
 
 if TYPE_CHECKING:
     GoalEnv = gymnasium.Env[Observation, NDArray[np.float32]]

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fetch_hand_sim.simulation import Simulation
-from fetch_hand_sim.simulation.rewards import RewardType
-from msgs_spec.tasks import TaskSpec
+from msgs_spec.tasks import RewardType, TaskSpec
 
 
 class TaskAttributes:

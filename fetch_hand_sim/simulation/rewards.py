@@ -7,18 +7,13 @@ in a fixed order, so a batch gives the same bits as one call per row.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler, rotation_angle
-from msgs_spec.tasks import GoalKind, TaskSpec
-
-RewardType = Literal['sparse', 'dense']
-SuccessRule = Literal['gymnasium', 'paper']
-REWARD_TYPES: tuple[str, ...] = get_args(RewardType)
-SUCCESS_RULES: tuple[str, ...] = get_args(SuccessRule)
+from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, RewardType, SuccessRule, TaskSpec
 
 Array = NDArray[np.float64]
 

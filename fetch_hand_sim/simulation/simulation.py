@@ -20,11 +20,10 @@ from mujoco.batch import SimulationError
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation.models import asset_path
-from fetch_hand_sim.simulation.rewards import RewardType, SuccessRule
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.actions import command_from_action
 from msgs_spec.observations import Readings
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind, RewardType, SuccessRule
 
 Array = NDArray[np.float64]
 Observation = dict[str, Array]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import cast
 
-from fetch_hand_sim.simulation.rewards import GoalMetric, SuccessRule
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.view.robot_watch import SeenTick
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.tasks import TaskSpec
+from msgs_spec.tasks import SuccessRule, TaskSpec
 from msgs_spec.view_topics import scalar_topics
 
 

@@ -20,6 +20,7 @@ from msgs_spec.command_line import (
     progress,
     run_command,
 )
+from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import (
     FIRST_SEED,
@@ -44,8 +45,8 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--first-seed', type=int, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
     add('--num-envs', type=int, default=100, help='simulations in the batch; default: 100')
     add('--threads', type=int, default=0, help='simulation threads; default: all cores')
-    add('--success-rule', choices=('gymnasium', 'paper'), default='gymnasium', help='of the reward')
-    add('--reward-type', choices=('sparse', 'dense'), default='sparse', help='of the return')
+    add('--success-rule', choices=SUCCESS_RULES, default='gymnasium', help='of the reward')
+    add('--reward-type', choices=REWARD_TYPES, default='sparse', help='of the return')
     add(
         '--json',
         type=Path,

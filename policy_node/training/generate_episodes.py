@@ -26,7 +26,7 @@ from msgs_spec.command_line import (
     progress,
     run_command,
 )
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES
 from policy_node.training.policy_options import add_policy_options, load_chosen_policy
 
 _NAME = 'generate_episodes'
@@ -42,8 +42,8 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--first-seed', type=int, default=0, help='episode i has this seed plus i; default: 0')
     add('--num-envs', type=int, default=64, help='simulations in the batch; default: 64')
     add('--threads', type=int, default=0, help='simulation threads; default: all cores')
-    add('--success-rule', choices=('gymnasium', 'paper'), default='gymnasium')
-    add('--reward-type', choices=('sparse', 'dense'), default='sparse')
+    add('--success-rule', choices=SUCCESS_RULES, default='gymnasium')
+    add('--reward-type', choices=REWARD_TYPES, default='sparse')
     add('--compiled-model', action='store_true', help='store the compiled model in every file')
     options = parser.parse_args(arguments)
     for name in ('episodes', 'num_envs'):

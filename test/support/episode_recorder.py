@@ -20,7 +20,7 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.actions import command_from_action
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.tick import TickEncoder
+from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import TopicSpec, topic
 
 
@@ -36,10 +36,10 @@ class RecordedTick:
 class Recorder:
     """Runs episodes of a task under random commands and writes them."""
 
-    def __init__(self, task: str, control_hz: float = 25.0) -> None:
+    def __init__(self, task: str, control_hz: float = 25.0, first_seed: int = 0) -> None:
         self.simulation = Simulation(task, num_threads=1, control_hz=control_hz)
         self.spec = self.simulation.spec
-        self.runner = EpisodeRunner(self.simulation)
+        self.runner = EpisodeRunner(self.simulation, first_seed=first_seed)
         self.commands = topic(self.spec, 'commands')
         self._encoder = TickEncoder(self.spec)
         self._command_encoder = TopicCodec(self.commands)
@@ -57,6 +57,10 @@ class Recorder:
             started=started,
         )
 
+    def encode(self, tick: Tick) -> list[tuple[TopicSpec, bytes]]:
+        """The messages of a tick, as the robot publishes them."""
+        return self._encoder.encode(tick, latched=tick.status.phase != 'running')
+
     def ticks(self) -> list[RecordedTick]:
         """Runs the next episode to its end."""
         generator = np.random.default_rng(self.runner.seed)
@@ -64,7 +68,7 @@ class Recorder:
         recorded = []
         while not recorded or not self.runner.is_between_episodes:
             tick = self.runner.advance(command)
-            messages = self._encoder.encode(tick, latched=tick.status.phase != 'running')
+            messages = self.encode(tick)
             action = generator.uniform(-1, 1, self.spec.robot.action_size)
             command = command_from_action(self.spec.robot, action)
             is_last = self.runner.is_between_episodes

@@ -20,7 +20,7 @@ from fetch_hand_sim.simulation.model_tuning import (
     skip_unread_stages,
 )
 from fetch_hand_sim.simulation.models import load_spec
-from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.task import (
     Array,
     BatchConfig,
@@ -32,7 +32,7 @@ from fetch_hand_sim.simulation.tasks.task import (
 )
 from msgs_spec.robots import GRIPPER_STEP
 from msgs_spec.rotations import quaternion_multiply
-from msgs_spec.tasks import TaskSpec
+from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec
 
 # The gripper is held in this (unnormalised) orientation: fetch_env.py adds it to the mocap
 # quaternion.

@@ -14,7 +14,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.hand import HandTask, load_hand_model
 from fetch_hand_sim.simulation.tasks.task import (
     Array,
@@ -34,7 +34,7 @@ from msgs_spec.rotations import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
-from msgs_spec.tasks import TaskSpec
+from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec
 
 _OBJECT_JOINT = 'object:joint'
 _OBJECT_SITE = 'object:center'

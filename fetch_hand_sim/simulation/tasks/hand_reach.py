@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.hand import HandTask, fingertip_sites, load_hand_model
 from fetch_hand_sim.simulation.tasks.task import (
     Array,
@@ -15,7 +15,7 @@ from fetch_hand_sim.simulation.tasks.task import (
     integration_state,
 )
 from msgs_spec.robots import FINGERTIPS
-from msgs_spec.tasks import TaskSpec
+from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec
 
 REACH_ASSET = 'hand/reach.xml'
 # Where fingers meet, relative to the palm, and how far that place scatters, metres.

@@ -12,9 +12,9 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.models import prepare_engine
-from fetch_hand_sim.simulation.rewards import GoalMetric, RewardType, SuccessRule
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
-from msgs_spec.tasks import TaskSpec
+from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.intp]

@@ -11,7 +11,6 @@ from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
 from policy_node.training.learning.replay import Episodes, has_moved
 
-EPISODE_WEIGHTS = ('moved', 'energy')
 _GRAVITY = 9.81
 # Most that one tick may add to the energy of an episode (Zhao & Tresp 2018: arm, hand).
 _MOST_ENERGY = {GoalKind.POINT: 0.5, GoalKind.FINGERTIPS: 0.5, GoalKind.POSE: 2.5}

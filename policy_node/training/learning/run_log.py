@@ -81,10 +81,6 @@ class RunLog:
                     self._board.add_scalar(name, value, int(row['env_steps'] or 0))
         self._show(row)
 
-    def say(self, text: str) -> None:
-        """Prints a lasting line."""
-        self._console.print(text, highlight=False, soft_wrap=True)
-
     def close(self) -> None:
         """Ends the live line and closes the files."""
         if self._console.is_terminal:

@@ -106,13 +106,11 @@ def test_generated_bytes_are_those_of_the_node_s_recorder(tmp_path):
     """The same commands through `EpisodeRunner` and the node's encoder give the same messages."""
     (path, *_) = generate(tmp_path, 'FetchPush', episodes=1)
     ticks = split_ticks(read_episode(path))
-    recorder = Recorder('FetchPush')
-    recorder.runner._first_seed = 11
+    recorder = Recorder('FetchPush', first_seed=11)
     command = recorder.runner.resting_command()
     for number, logged in enumerate(ticks):
         tick = recorder.runner.advance(command)
-        messages = recorder._encoder.encode(tick, latched=tick.status.phase != 'running')
-        assert [(m.topic, m.data) for m in logged.published] == messages
+        assert [(m.topic, m.data) for m in logged.published] == recorder.encode(tick)
         times = [m.log_time_ns for m in (*logged.published, *logged.received)]
         assert times == [tick.stamp_ns + rank for rank in range(len(times))]
         assert len(logged.received) == (number < 50)
@@ -209,8 +207,7 @@ def test_check_runs_goals_that_were_set_on_the_way(tmp_path):
     command = recorder.runner.resting_command()
     for number in range(recorder.spec.episode_ticks + 1):
         tick = recorder.runner.advance(command)
-        latched = tick.status.phase != 'running'
-        writer.write_tick(tick.stamp_ns, recorder._encoder.encode(tick, latched=latched))
+        writer.write_tick(tick.stamp_ns, recorder.encode(tick))
         if number == 30:
             # Neither of unit length nor in the hemisphere of the object.
             goal = np.array([1.0, 0.87, 0.2, -0.5, 0.5, 0.5, 0.2])

@@ -152,9 +152,7 @@ def test_the_next_run_starts_after_the_killed_one(killed, recorder, tmp_path):
     shutil.copytree(killed[0], directory)
     writer = EpisodeDirectory(directory).begin('FetchReach', 2, {})
     assert writer.abort('nothing written') is None
-    assert [leftover.name for leftover in EpisodeDirectory(directory).leftovers()] == [
-        'FetchReach_000002_seed2'
-    ]
+    assert [leftover.name for leftover in find_leftovers(directory)] == ['FetchReach_000002_seed2']
     with pytest.raises(EpisodeExistsError, match='was cut off'):
         EpisodeWriter(directory, 'FetchReach_000002_seed2', {})
     with pytest.raises(EpisodeExistsError, match='never overwritten'):
@@ -364,7 +362,9 @@ def test_a_full_disk(small_disk, recorder, ticks):
     writer = directory.begin('FetchReach', 1, {})
     recorder.write(writer, ticks)
     assert read_episode(writer.finish({})).is_complete
-    assert [leftover.name for leftover in directory.leftovers()] == ['FetchReach_000000_seed0']
+    assert [leftover.name for leftover in find_leftovers(directory.path)] == [
+        'FetchReach_000000_seed0'
+    ]
 
 
 def test_too_little_free_space_is_noticed_before(tmp_path):

@@ -27,7 +27,7 @@ def make(task: str, **arguments) -> gymnasium.Env:
 
 def state_of(env: gymnasium.Env) -> bytes:
     generator = env.unwrapped.np_random.bit_generator.state
-    return env.unwrapped.simulation._task.batch.state.tobytes() + repr(generator).encode()
+    return env.unwrapped.simulation.task.batch.state.tobytes() + repr(generator).encode()
 
 
 @pytest.mark.parametrize('task', TASKS)
@@ -124,7 +124,7 @@ def test_actions_out_of_range_are_clipped(dtype):
 def test_a_diverged_episode_is_truncated():
     env = make('FetchPush')
     env.reset(seed=0)
-    env.unwrapped.simulation._task.batch.bind('qvel')[0, 0] = np.nan
+    env.unwrapped.simulation.task.batch.bind('qvel')[0, 0] = np.nan
     observation, _, terminated, truncated, info = env.step(np.zeros(4))
     assert (terminated, truncated, info['diverged']) == (False, True, True)
     assert env.observation_space.contains(observation)

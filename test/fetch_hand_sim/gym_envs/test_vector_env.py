@@ -25,7 +25,7 @@ def make_vec(task: str, num_envs: int, **arguments) -> gymnasium.vector.VectorEn
 
 
 def state_of(env: gymnasium.vector.VectorEnv) -> bytes:
-    return env.unwrapped.simulation._task.batch.state.tobytes()
+    return env.unwrapped.simulation.task.batch.state.tobytes()
 
 
 def assert_same(first, second) -> None:
@@ -152,10 +152,10 @@ def test_a_masked_reset_starts_only_the_masked():
     env = make_vec('FetchPush', 3, max_episode_steps=3)
     env.reset(seed=0)
     env.step(env.action_space.sample())
-    before = env.unwrapped.simulation._task.batch.state.copy()
+    before = env.unwrapped.simulation.task.batch.state.copy()
     mask = np.array([False, True, False])
     observation, _ = env.reset(seed=[0, 50, 0], options={'reset_mask': mask})
-    after = env.unwrapped.simulation._task.batch.state
+    after = env.unwrapped.simulation.task.batch.state
     assert after[~mask].tobytes() == before[~mask].tobytes()
     expected, _ = gymnasium.make(environment_id('FetchPush')).reset(seed=50)
     for name, values in expected.items():
@@ -173,7 +173,7 @@ def test_a_masked_reset_starts_only_the_masked():
 def test_a_diverged_environment_is_truncated_and_starts_again():
     env = make_vec('FetchPush', 3)
     env.reset(seed=0)
-    env.unwrapped.simulation._task.batch.bind('qvel')[1, 0] = np.nan
+    env.unwrapped.simulation.task.batch.bind('qvel')[1, 0] = np.nan
     _, _, terminated, truncated, info = env.step(np.zeros((3, 4)))
     assert truncated.tolist() == info['diverged'].tolist() == [False, True, False]
     assert not terminated.any()

@@ -60,7 +60,7 @@ def contacts(model: mujoco.MjModel, state: np.ndarray) -> list[bytes]:
 def test_contacts_and_trajectories_are_those_of_the_published_model(task):
     simulation = Simulation(task, num_envs=48, num_threads=2)
     simulation.reset(seed=0)
-    batch = simulation._task.batch
+    batch = simulation.task.batch
     published = published_model(task, simulation.model)
     reference = Batch(published, 48, 2)
     generator = np.random.default_rng(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,12 +31,15 @@ def play(simulation: Simulation, played: np.ndarray) -> np.ndarray:
     return np.array(rows)
 
 
+def saved(simulation: Simulation) -> dict[str, Any]:
+    """What `pickle` keeps of a simulation."""
+    return simulation.__getstate__()
+
+
 def state_of(simulation: Simulation) -> bytes:
     """All bits that decide what happens next, generators and goals included."""
-    generators = [
-        generator and generator.bit_generator.state for generator in simulation._generators
-    ]
-    state = simulation._task.batch.state.tobytes() + simulation.goals.tobytes()
+    generators = [each and each.bit_generator.state for each in saved(simulation)['generators']]
+    state = simulation.task.batch.state.tobytes() + simulation.goals.tobytes()
     return state + repr(generators).encode()
 
 
@@ -74,10 +78,10 @@ def test_a_partial_reset_leaves_the_others_alone(task):
     simulation = Simulation(task, num_envs=5)
     simulation.reset(seed=0)
     play(simulation, actions(simulation, 3))
-    before = simulation._task.batch.state.copy()
+    before = simulation.task.batch.state.copy()
     expected = Simulation(task, num_envs=1).reset(seed=[77])
     observation = simulation.reset(seed=[77], ids=[3])
-    after = simulation._task.batch.state
+    after = simulation.task.batch.state
     others = [0, 1, 2, 4]
     assert after[others].tobytes() == before[others].tobytes()
     for name, values in expected.items():
@@ -199,7 +203,7 @@ def test_a_diverged_simulation_starts_again_and_the_others_go_on(
     undisturbed = Simulation(task, num_envs=4, num_threads=2)
     for each in (simulation, undisturbed):
         each.reset(seed=0)
-    simulation._task.batch.bind('qvel')[2, 3] = np.nan
+    simulation.task.batch.bind('qvel')[2, 3] = np.nan
     action = actions(simulation, 1)[0]
     with caplog.at_level(logging.WARNING):
         result = simulation.step(action)
