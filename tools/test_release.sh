@@ -1,5 +1,6 @@
 #!/bin/sh
-# Builds sdist and wheel, checks them, installs the wheel where no source is, and uses it.
+# Builds the documentation; builds sdist and wheel, checks them, installs
+# the wheel where no source is, and uses it, also under the tests of Gymnasium-Robotics.
 # PYTHON=... chooses the interpreter, PIP_OPTIONS=... adds options to `pip install`.
 set -eu
 cd "$(dirname "$0")/.."
@@ -9,7 +10,8 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 unset PYTHONPATH
 
-say() { echo "test-release: $*"; }
+began=$(date +%s)
+say() { echo "test-release: $(($(date +%s) - began)) s: $*"; }
 
 pip_install() {
     environment=$1
@@ -19,9 +21,20 @@ pip_install() {
         ${PIP_OPTIONS:-} --constraint "$root/constraints.txt" "$@"
 }
 
-say 'building what git tracks'
 mkdir "$work/source"
 git ls-files -z | xargs -0 tar -cf - | tar -xf - -C "$work/source"
+
+say 'documentation of what git tracks: no warning, no request, nothing from elsewhere in its pages'
+nowhere=http://127.0.0.1:9
+(cd "$work/source" && http_proxy=$nowhere https_proxy=$nowhere \
+    "$python" -m sphinx -W --keep-going -q -b html docs "$work/pages")
+if grep -rlE '<(script|link|img|iframe)[^>]*(src|href)="(https?:)?//' --include='*.html' "$work/pages"; then
+    say 'these pages load something from another host'
+    exit 1
+fi
+rm -rf "$work/source/docs/generated"
+
+say 'sdist and wheel'
 "$python" -m venv "$work/tools"
 pip_install tools build check-wheel-contents twine
 (cd "$work/source" && "$work/tools/bin/python" -m build --outdir "$work/dist" >"$work/build.log" 2>&1) ||
@@ -52,7 +65,13 @@ pip_install base "$wheel[ros,actors]"
 "$work/base/bin/fetch_hand_sim" demo --episodes 2
 "$work/base/bin/fetch_hand_sim" episodes check episodes
 "$work/base/bin/fetch_hand_sim" evaluate --policy FetchReach --episodes 20
-say "tests and examples of Gymnasium-Robotics, from its repository"
+say "a film by Gymnasium's RecordVideo, in an environment of its own: moviepy wants an older pillow"
+"$python" -m venv "$work/film"
+"$work/film/bin/python" -m pip install --disable-pip-version-check --quiet "$wheel" moviepy pytest pytest-timeout
+(cd "$root" && "$work/film/bin/pytest" -q -p no:cacheprovider -k records_a_film \
+    test/fetch_hand_sim/gym_envs/test_vector_env.py)
+
+say 'tests and examples of Gymnasium-Robotics, from its repository'
 "$work/base/bin/python" -m pip install --quiet pytest
 suite=0
 "$work/base/bin/python" "$root/tools/gymnasium_robotics_suite.py" || suite=$?

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 def python_blocks(page: str) -> list[str]:
     """The Python code of a page, in order."""
-    return re.findall(r'^```python\n(.*?)^```', page, flags=re.DOTALL | re.MULTILINE)
+    return re.findall(r'^```python\b[^\n]*\n(.*?)^```', page, flags=re.DOTALL | re.MULTILINE)
 
 
 def shell_lines(page: str) -> Iterator[str]:
@@ -17,7 +17,7 @@ def shell_lines(page: str) -> Iterator[str]:
     fence = ''
     for line in page.splitlines():
         if line.startswith('```'):
-            fence = '' if fence else line.removeprefix('```') or 'text'
+            fence = '' if fence else line.removeprefix('```').partition(' ')[0] or 'text'
         elif fence in ('sh', 'bash') and line.strip():
             yield line
         elif not fence and re.match(r' {4}\S', line):

@@ -1,0 +1,70 @@
+"""Every tutorial, followed to the letter: real nodes, real training, small budgets.
+
+`make test-release` follows them; `make test` only asks whether their command lines are understood
+(test_documentation.py).
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from support import ROOT
+from support.tutorial import Block, Reader, blocks, missing_line
+
+PAGES = sorted((ROOT / 'docs' / 'tutorials').glob('*.md'))
+
+
+@pytest.mark.release
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
+def test_a_tutorial_can_be_followed(
+    page: Path, tmp_path: Path, ros_environment: dict[str, str]
+) -> None:
+    path = os.pathsep.join([str(Path(sys.executable).parent), ros_environment['PATH']])
+    Reader(tmp_path, ros_environment | {'PATH': path}).follow(page.read_text(encoding='utf-8'))
+
+
+def test_blocks_are_told_apart() -> None:
+    page = (
+        'a\n\n```sh\nx\n```\n```sh second terminal\ny\n```\n```\nout\n```\n```python a.py\nb\n```\n'
+    )
+    assert blocks(page) == [
+        Block('sh', '', 'x\n'),
+        Block('sh', 'second terminal', 'y\n'),
+        Block('', '', 'out\n'),
+        Block('python', 'a.py', 'b\n'),
+    ]
+
+
+@pytest.mark.parametrize(
+    ('expected', 'missing'),
+    [
+        ('one\ntwo', None),
+        ('one\nthree ...', None),
+        ('t... 4', None),
+        ('two\none', 'one'),
+        ('three', 'three'),
+    ],
+)
+def test_what_is_printed_is_compared_with_the_page(expected: str, missing: str | None) -> None:
+    assert missing_line(expected, 'one\ntwo\nthree  3 4\n') == missing
+
+
+@pytest.mark.parametrize(
+    ('page', 'problem'),
+    [
+        ('```sh\nfalse\n```\n', 'false'),
+        ('```sh\necho a\n```\n```\nb\n```\n', "the page shows 'b'"),
+        ("```python\nraise SystemExit('no')\n```\n", 'no'),
+        ('```sh other\ncat nosuchfile\n```\n```sh\nsleep 0.2\n```\n', 'nosuchfile'),
+    ],
+)
+def test_a_page_that_does_not_work_is_noticed(
+    page: str, problem: str, tmp_path: Path, ros_environment: dict[str, str]
+) -> None:
+    with pytest.raises(AssertionError, match=problem):
+        Reader(tmp_path, ros_environment).follow(page)
