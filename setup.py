@@ -47,7 +47,7 @@ TEST = [
 
 setup(
     name=PACKAGE,
-    version='0.1.0',
+    version='1.0.0',
     description='The Fetch and Shadow hand tasks of Plappert et al. 2018 as ROS 2 nodes on MuJoCo',
     long_description=Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
@@ -57,7 +57,7 @@ setup(
     project_urls={'Paper': 'https://arxiv.org/abs/1802.09464'},
     keywords=['robotics', 'reinforcement learning', 'mujoco', 'ros2', 'gymnasium', 'her', 'mcap'],
     classifiers=[
-        'Development Status :: 4 - Beta',
+        'Development Status :: 5 - Production/Stable',
         'Intended Audience :: Science/Research',
         'Operating System :: POSIX :: Linux',
         'Programming Language :: Python :: 3 :: Only',
