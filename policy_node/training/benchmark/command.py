@@ -8,6 +8,10 @@ and prints a table beside the published numbers.
 the networks of another. At the end it also evaluates each best actor on fresh episodes and puts it
 with its critic, evaluation and curve into <output>/actors.
 
+`--study NAME`, any other: one of the paper's requests for research (docs/research). Trains
+task x arm x seed, measures each run on fresh episodes, and renews data, figure and table in
+docs/research/NAME after each.
+
 Finished jobs are skipped and interrupted ones continued, so the same command goes on where it
 stopped; given twice at once, it shares the work.
 """
@@ -33,8 +37,10 @@ from msgs_spec.command_line import (
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.jobs import ARMS, Job
+from policy_node.training.benchmark.research import FINAL_EPISODES, STUDIES, research_jobs
+from policy_node.training.benchmark.research_report import write_study
 from policy_node.training.benchmark.results import write_report
-from policy_node.training.benchmark.studies import STUDIES, best_jobs, paper_jobs, reduced_budget
+from policy_node.training.benchmark.studies import best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
 from policy_node.training.evaluation.shipping import ship
 from policy_node.training.learning.config import RECIPES, parse_assignment
@@ -50,28 +56,29 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         prog=_NAME, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add('--study', choices=STUDIES, default='paper', help='default: paper')
+    names = ('paper', 'best', *STUDIES)
+    add('--study', choices=names, default='paper', help='default: paper')
     add('--tasks', nargs='+', choices=list(TASKS), metavar='TASK', help='default: FetchReach; all')
     add('--seeds', nargs='+', type=int, metavar='SEED', help='default: 0 1 2 3 4; 0')
+    add('--arms', nargs='+', metavar='ARM', help='default: all; not in study best')
     add('--jobs', type=int, help='at once; default: 1; one per core')
     add('--steps', type=int, help='environment steps of each job')
     add('--threads', type=int, help='simulation threads of each job')
     add('--torch-threads', type=int, help='tensor threads of each job')
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='any field of TrainConfig')
-    add('--output', type=Path, help='default: runs/benchmark; runs/best')
-    add('--report', type=Path, help='where figure and tables go; default: the output folder')
+    add('--output', type=Path, help='default: runs/benchmark; runs/best; runs/research/NAME')
+    add('--report', type=Path, help='where figure and tables go')
+    add('--episodes', type=int, help='fresh episodes at the end; default: none; 2000; 500')
     add('--ray', action='store_true', help='independent jobs on Ray (extra: cluster)')
     paper = parser.add_argument_group('study paper').add_argument
-    paper('--arms', nargs='+', choices=list(ARMS), metavar='ARM', help='default: all four')
     paper('--recipe', choices=RECIPES, help='of all jobs; default: paper')
     paper('--full', action='store_true', help="the recipe's own budget, not the reduced one")
     best = parser.add_argument_group('study best').add_argument
     best('--actors', type=Path, help='where actors go; default: <output>/actors')
-    best('--episodes', type=int, help='fresh episodes behind each; default: 2000')
     return parser.parse_args(arguments)
 
 
-_OF_STUDY = {'paper': ('arms', 'recipe', 'full'), 'best': ('actors', 'episodes')}
+_OF_STUDY = {'paper': ('recipe', 'full'), 'best': ('actors',)}
 
 
 def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
@@ -86,8 +93,14 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
                 raise ValueError(f'--{name} belongs to --study {study}')
     if options.jobs is not None and options.jobs < 1:
         raise ValueError(f'--jobs {options.jobs}; allowed: 1 or more')
+    for name, study in (('arms', 'best'), ('episodes', 'paper')):
+        if getattr(options, name) is not None and study == options.study:
+            raise ValueError(f'--{name} does not belong to --study {study}')
+    if options.episodes is not None and options.episodes < 1:
+        raise ValueError(f'--episodes {options.episodes}; allowed: 1 or more')
     overrides = _overrides(options)
-    jobs = _paper(options, overrides) if options.study == 'paper' else _best(options, overrides)
+    list_jobs = {'paper': _paper, 'best': _best}.get(options.study, _research)
+    jobs = list_jobs(options, overrides)
     for job in jobs:
         job.check_configuration()
     return jobs
@@ -101,8 +114,13 @@ def _overrides(options: argparse.Namespace) -> dict[str, Any]:
     }
     overrides = {name: value for name, value in chosen.items() if value is not None}
     overrides.update(parse_assignment(text) for text in options.set)
-    decided = ('task', 'recipe', 'seed', 'init_from')
-    for name in (*decided, 'reward_type') if options.study == 'paper' else decided:
+    decided: tuple[str, ...] = ('task', 'recipe', 'seed', 'init_from')
+    if options.study == 'paper':
+        decided = (*decided, 'reward_type')
+    elif options.study in STUDIES:
+        arms = STUDIES[options.study].arms
+        decided = (*decided, *(name for arm in arms for name in arm.changes))
+    for name in decided:
         if name in overrides:
             raise ValueError(f'--set {name} is not possible: jobs differ in it')
     if overrides.get('strategy') == 'none':
@@ -114,6 +132,9 @@ def _paper(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
     recipe, output = options.recipe or 'paper', _output(options)
     seeds = list(dict.fromkeys(options.seeds or range(5)))
     arms = list(dict.fromkeys(options.arms or ARMS))
+    for name in arms:
+        if name not in ARMS:
+            raise ValueError(f'--arms {name!r}; allowed: {", ".join(ARMS)}')
     jobs = []
     for task in dict.fromkeys(options.tasks or ['FetchReach']):
         reduced = {} if options.full or recipe != 'paper' else reduced_budget(task)
@@ -129,9 +150,25 @@ def _best(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
     return best_jobs(tasks, seeds, {**threads, **overrides}, _output(options))
 
 
+def _research(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
+    study = STUDIES[options.study]
+    seeds = list(dict.fromkeys(options.seeds or range(study.seeds)))
+    tasks = list(dict.fromkeys(options.tasks or study.tasks[:1]))
+    names = dict.fromkeys(options.arms or [arm.name for arm in study.arms])
+    arms = [study.arm(name) for name in names]
+    episodes = options.episodes or FINAL_EPISODES
+    return research_jobs(study, tasks, arms, seeds, overrides, _output(options), episodes)
+
+
 def _output(options: argparse.Namespace) -> Path:
-    default = Path('runs') / ('benchmark' if options.study == 'paper' else 'best')
-    return Path(options.output or default)
+    folders = {'paper': Path('benchmark'), 'best': Path('best')}
+    folder = folders.get(options.study, Path('research') / options.study)
+    return Path(options.output or Path('runs') / folder)
+
+
+def _report_folder(options: argparse.Namespace) -> Path:
+    pages = Path('docs') / 'research' / options.study
+    return Path(options.report or (pages if options.study in STUDIES else _output(options)))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -156,21 +193,36 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 
 def _run_where_asked(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> bool:
+    renew = None
+    if options.study in STUDIES:
+
+        def renew() -> None:
+            _report_study(options, jobs, command)
+
     if options.ray:
-        return run_jobs(jobs, Ray(command))
+        return run_jobs(jobs, Ray(command), renew)
     cores = len(os.sched_getaffinity(0))
-    limit = options.jobs or (1 if options.study == 'paper' else cores)
+    limit = options.jobs or (cores if options.study == 'best' else 1)
     if limit == 1:
-        return run_jobs(jobs, ThisProcess(command))
+        return run_jobs(jobs, ThisProcess(command), renew)
     with Processes(limit, command) as processes:
-        return run_jobs(jobs, processes)
+        return run_jobs(jobs, processes, renew)
+
+
+def _report_study(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> None:
+    """Renews the pages of a study: a machine that is lost after this loses one run at most."""
+    finished = [job for job in jobs if job.is_finished]
+    if finished:
+        write_study(STUDIES[options.study], finished, _report_folder(options), command)
 
 
 def _report(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> None:
     """Draws, prints and ships what is finished, and says what is not."""
     finished = [job for job in jobs if job.is_finished]
-    report = options.report or _output(options)
-    if finished:
+    report = _report_folder(options)
+    if options.study in STUDIES:
+        _report_study(options, jobs, command)
+    elif finished:
         write_report(finished, report, command)
     if options.study == 'best':
         actors = options.actors or _output(options) / 'actors'

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from msgs_spec.command_line import CommandError
+from policy_node.training.benchmark.final import FINAL_FILE, measure_final
 from policy_node.training.learning.config import TrainConfig, config_from_dict
 from policy_node.training.learning.run import RunTakenError, train_run
 from policy_node.training.learning.run_folder import STATE_FILE
@@ -36,33 +39,33 @@ class JobTakenError(RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """One of the four curves in each panel of the paper's figures.
+    """One curve in a figure: what is compared.
 
     Attributes:
         name: Name of the folder and of the command-line option.
         label: Name in figures and tables.
-        reward_type: `sparse` or `dense`.
-        hindsight: Whether goals are relabelled.
+        changes: Fields of `TrainConfig` that are the arm's own.
     """
 
     name: str
     label: str
-    reward_type: str
-    hindsight: bool
+    changes: Mapping[str, Any] = field(default_factory=dict)
 
 
+_NO_HINDSIGHT = {'strategy': 'none', 'goals': ''}
+# The four curves in each panel of the paper's figures.
 ARMS = {
     arm.name: arm
     for arm in (
-        Arm('her_sparse', 'DDPG+HER, sparse', 'sparse', True),
-        Arm('her_dense', 'DDPG+HER, dense', 'dense', True),
-        Arm('ddpg_sparse', 'DDPG, sparse', 'sparse', False),
-        Arm('ddpg_dense', 'DDPG, dense', 'dense', False),
+        Arm('her_sparse', 'DDPG+HER, sparse', {'reward_type': 'sparse'}),
+        Arm('her_dense', 'DDPG+HER, dense', {'reward_type': 'dense'}),
+        Arm('ddpg_sparse', 'DDPG, sparse', {'reward_type': 'sparse', **_NO_HINDSIGHT}),
+        Arm('ddpg_dense', 'DDPG, dense', {'reward_type': 'dense', **_NO_HINDSIGHT}),
     )
 }
 
 
-BEST_ARM = Arm('best', 'DDPG+HER, best recipe', 'sparse', True)
+BEST_ARM = Arm('best', 'DDPG+HER, best recipe')
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +77,14 @@ class Job:
         config: The whole configuration.
         folder: Output of `train_her`.
         after: The job whose networks it starts from; None starts from nothing.
+        final_episodes: Fresh episodes on which the last actor is measured; 0 measures nothing.
     """
 
     arm: Arm
     config: TrainConfig
     folder: Path
     after: Job | None = None
+    final_episodes: int = 0
 
     @property
     def name(self) -> str:
@@ -88,7 +93,13 @@ class Job:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the budget is spent: the curve is whole."""
+        """Whether the budget is spent, so that the curve is whole, and the end measured."""
+        measured = not self.final_episodes or (self.folder / FINAL_FILE).is_file()
+        return self.is_trained and measured
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether the budget is spent."""
         return self.has_checkpoint and self.env_steps >= self.config.total_steps
 
     @property
@@ -154,7 +165,10 @@ def run_job(job: Job, command: str) -> bool:
         JobError: If training failed.
     """
     try:
-        train_run(job.config, job.folder, resume=job.has_checkpoint, command=command)
+        if not job.is_trained:
+            train_run(job.config, job.folder, resume=job.has_checkpoint, command=command)
+        if job.is_trained and job.final_episodes:
+            measure_final(job.config, job.folder, job.final_episodes)
     except RunTakenError:
         raise JobTakenError(f'{job.name} is being run by another process') from None
     except CommandError as error:

@@ -7,7 +7,7 @@ import io
 import json
 import os
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -133,7 +133,7 @@ def write_report(jobs: Iterable[Job], output: Path, command: str) -> None:
         rows.append((task, arm, job.config.seed, curve))
     table = [summarize(t, a, curves) for t, arms in groups.items() for a, curves in arms.items()]
     output.mkdir(parents=True, exist_ok=True)
-    _write_curves(rows, output / 'benchmark_curves.csv')
+    write_curves(rows, output / 'benchmark_curves.csv')
     with (output / 'benchmark.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, list(table[0]))
         writer.writeheader()
@@ -141,7 +141,7 @@ def write_report(jobs: Iterable[Job], output: Path, command: str) -> None:
     about = {'command': command, 'source_revisions': sorted(revisions), 'machine': machine()}
     (output / 'benchmark.json').write_text(json.dumps({**about, 'results': table}, indent=2) + '\n')
     bands = {t: {a: aggregate(curves) for a, curves in arms.items()} for t, arms in groups.items()}
-    draw(bands, output / 'benchmark.png')
+    draw(bands, {arm.name: arm.label for arm in _ARMS.values()}, output / 'benchmark.png')
     text = format_table(table)
     (output / 'benchmark.txt').write_text(text)
     print(text, end='')
@@ -180,8 +180,20 @@ def format_table(table: Sequence[dict[str, Any]]) -> str:
     return str(console.file.getvalue())  # type: ignore[attr-defined]
 
 
-def draw(bands: dict[str, dict[str, Band]], path: Path) -> None:
-    """Draws one panel per task: the median of each arm over its quartiles."""
+def draw(
+    bands: Mapping[str, Mapping[str, Band]],
+    labels: Mapping[str, str],
+    path: Path,
+    paper_epochs: bool = True,
+) -> None:
+    """Draws one panel per task: the median of each arm over its quartiles.
+
+    Args:
+        bands: By task and arm.
+        labels: By arm, in the order of their colours.
+        path: PNG file to write.
+        paper_epochs: Whether the epochs of the paper are marked on a second axis.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -193,26 +205,29 @@ def draw(bands: dict[str, dict[str, Band]], path: Path) -> None:
     for axes in panels[len(bands) :]:
         axes.set_visible(False)
     for axes, (task, arms) in zip(panels, bands.items(), strict=False):
-        for index, arm in enumerate(_ARMS.values()):
-            if arm.name in arms:
-                band, color = arms[arm.name], f'C{index}'
+        for index, (arm, label) in enumerate(labels.items()):
+            if arm in arms:
+                band, color = arms[arm], f'C{index}'
                 axes.fill_between(band.env_steps, band.lower, band.upper, color=color, alpha=0.2)
-                axes.plot(band.env_steps, band.median, color=color, label=arm.label)
-        _label(axes, task)
+                axes.plot(band.env_steps, band.median, color=color, label=label)
+        _label(axes, task, paper_epochs)
     panels[0].legend(loc='best', fontsize='small')
     figure.savefig(path, dpi=130)
 
 
-def _label(axes: Any, task: str) -> None:
+def _label(axes: Any, task: str, paper_epochs: bool) -> None:
     axes.set(xlabel='environment steps', ylabel='success at the last step', ylim=(-0.02, 1.02))
     axes.set_title(task)
     axes.grid(alpha=0.3)
+    if not paper_epochs:
+        return
     steps = EPISODES_PER_EPOCH * task_spec(task).episode_ticks
     epochs = axes.secondary_xaxis('top', functions=(lambda x: x / steps, lambda x: x * steps))
     epochs.set_xlabel("the paper's epochs")
 
 
-def _write_curves(rows: Iterable[tuple[str, str, int, Curve]], path: Path) -> None:
+def write_curves(rows: Iterable[tuple[str, str, int, Curve]], path: Path) -> None:
+    """Writes every evaluation of (task, arm, seed, curve) as CSV."""
     with path.open('w', newline='') as file:
         writer = csv.writer(file)
         writer.writerow(['task', 'arm', 'seed', 'env_steps', 'success'])

@@ -1,8 +1,7 @@
-"""What the studies train: the paper's four arms, or the best recipe of every task."""
+"""What `paper` and `best` train: four arms, or the best recipe of every task."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,6 @@ from typing import Any
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, Job
 from policy_node.training.learning.config import recipe_config
-
-STUDIES = ('paper', 'best')
 
 # The long ones first. What XYZ has learnt of turning a block serves every other task of the block;
 # likewise the egg and the pen.
@@ -86,13 +83,8 @@ def paper_jobs(
     for task in tasks:
         for seed in seeds:
             for arm in (ARMS[name] for name in arms):
-                config = recipe_config(task, recipe, **{**overrides, 'seed': seed})
-                config = dataclasses.replace(
-                    config,
-                    reward_type=arm.reward_type,
-                    strategy=config.strategy if arm.hindsight else 'none',
-                    goals=config.goals if arm.hindsight else '',
-                )
+                values = {**overrides, **arm.changes, 'seed': seed}
+                config = recipe_config(task, recipe, **values)
                 jobs.append(Job(arm, config, output / task / arm.name / f'seed{seed}'))
     return jobs
 

@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
@@ -49,8 +49,15 @@ class Place(Protocol):
         ...
 
 
-def run_jobs(jobs: Sequence[Job], place: Place) -> bool:
+def run_jobs(
+    jobs: Sequence[Job], place: Place, when_finished: Callable[[], None] | None = None
+) -> bool:
     """Runs what is not finished, each job after the one it starts from; whether all is now.
+
+    Args:
+        jobs: All jobs, in the order of their importance.
+        place: Where they run.
+        when_finished: Called after each job that finished.
 
     Raises:
         KeyboardInterrupt: If a signal stopped a job; nothing else is started then.
@@ -74,6 +81,8 @@ def run_jobs(jobs: Sequence[Job], place: Place) -> bool:
         if outcome is Outcome.FINISHED:
             left = sum(not other.is_finished for other in jobs)
             print(f'{job.name} is finished; {left} to go', flush=True)
+            if when_finished is not None:
+                when_finished()
     if stopped:
         raise KeyboardInterrupt
     return whole and not waiting

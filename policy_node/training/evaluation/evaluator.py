@@ -43,9 +43,14 @@ class Evaluator:
 
     def successes(self, outcomes: EpisodeOutcomes) -> NDArray[np.bool_]:
         """Success of each episode at the last step, by the rule of the run."""
-        paper = self._config.success_rule == 'paper'
-        return outcomes.success_paper if paper else outcomes.success_gymnasium
+        return successes(outcomes, self._config.success_rule)
 
     def success_rate(self, outcomes: EpisodeOutcomes) -> float:
         """Share of episodes that succeed."""
         return float(self.successes(outcomes).mean())
+
+
+def successes(outcomes: EpisodeOutcomes, success_rule: str) -> NDArray[np.bool_]:
+    """Success of each episode at the last step, by a rule."""
+    paper = success_rule == 'paper'
+    return outcomes.success_paper if paper else outcomes.success_gymnasium

@@ -12,6 +12,8 @@ from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
 from policy_node.training.learning.hindsight import parse_mixture
 
 RECIPES = ('paper', 'best')
+# Tasks that ignore their gripper action.
+GAMBLE_TASKS = ('FetchReach', 'FetchPush')
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,9 @@ class TrainConfig:
     """`sparse` (-1 until success, then 0) or `dense` (negative distance)."""
     success_rule: str = 'gymnasium'
     """Success rule behind the sparse reward: `gymnasium` or `paper`."""
+    gamble: bool = False
+    """The idle gripper action above .9 teleports the achieved goal at random and freezes the
+    episode (FetchReach, FetchPush): the paper's own case against hindsight."""
     reward_distance: float = 1.0
     """Share of the task's success distance within which the sparse reward of training is 0. Below 1
     the actor learns to come closer than it has to; evaluation keeps the task's distance."""
@@ -46,6 +51,9 @@ class TrainConfig:
     goals: str = ''
     """Goal sources as a mixture instead of `strategy`: `future=.4,actual=.3,near=.1`; what is left
     of 1 keeps the goal. Also `next` (what this step achieved) and `near` (one of the next ten)."""
+    importance: str = 'none'
+    """Weights of transitions in the critic's loss: `none`, or `density`, which takes back that a
+    goal chosen in hindsight depends on where the transition led."""
     moved_share: float = 0.0
     """Share of a batch drawn by `episode_weights`; 0 draws uniformly."""
     episode_weights: str = 'moved'
@@ -155,6 +163,9 @@ class TrainConfig:
             parse_mixture(self.goals)
             if self.strategy == 'none':
                 raise ValueError(f'goals {self.goals!r} excludes strategy none')
+        if self.gamble and self.task not in GAMBLE_TASKS:
+            allowed = ', '.join(GAMBLE_TASKS)
+            raise ValueError(f'gamble: {self.task} uses its gripper; allowed: {allowed}')
         if self.ticks_after_drop >= 0 and spec.goal is not GoalKind.POSE:
             raise ValueError(f'ticks_after_drop: {self.task} has no palm to drop an object from')
         if self.reward_rotation != 1.0 and spec.rotation_threshold is None:
@@ -168,6 +179,7 @@ _CHOICES = {
     'strategy': ('final', 'future', 'episode', 'random', 'futureactual', 'none'),
     'goal_features': GOAL_FEATURES,
     'episode_weights': ('moved', 'energy'),
+    'importance': ('none', 'density'),
     'precision': ('auto', 'float32', 'bfloat16'),
     'device': ('auto', 'cpu', 'cuda'),
 }

@@ -6,16 +6,18 @@ import contextlib
 import copy
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.density_ratio import DensityRatio, GoalView
 from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.hindsight import Transitions
+from policy_node.training.learning.learner import Losses
+from policy_node.training.learning.transitions import Transitions
 
 
 class Critic(nn.Module):
@@ -29,15 +31,6 @@ class Critic(nn.Module):
         """Returns values (batch,), float32."""
         value: Tensor = self.network(torch.cat([features, action], dim=-1))
         return value.squeeze(-1)
-
-
-@dataclass(frozen=True, slots=True)
-class Losses:
-    """Scalars of one update, tensors on the device so that nothing waits for them."""
-
-    critic: Tensor
-    actor: Tensor
-    value: Tensor
 
 
 class DDPG:
@@ -70,6 +63,11 @@ class DDPG:
         self.average_actor = copy.deepcopy(self.actor.network)
         self.actor_optimizer = self._adam(self._actor_parameters)
         self.critic_optimizer = self._adam(self._critic_parameters)
+        self._ratio: DensityRatio | None = None
+        if config.importance == 'density':
+            sizes = shape.feature_size, shape.goal_size, shape.action_size
+            self._ratio = DensityRatio(*sizes).to(device)
+            self._achieved_start = task_spec(config.task).achieved_goal_start
         self._bfloat16 = uses_bfloat16(config.precision, device)
         self.critic_first = config.critic_first
         self.updates = 0
@@ -80,37 +78,64 @@ class DDPG:
     def update(self, batch: Transitions) -> Losses:
         """Improves critic and actor on a batch and, when due, moves the targets."""
         tensors = [self._tensor(getattr(batch, name)) for name in Transitions.__slots__]
-        observation, next_observation, goal, action, reward = tensors
+        observation, next_observation, goal, action, reward, discount = tensors
         features = self.actor.features(observation, goal)
         next_features = self.actor.features(next_observation, goal)
-        critic_loss = self._update_critic(features, action, reward, next_features)
+        targets = self.targets(reward, discount, next_features)
+        weight = None
+        if self._ratio is not None:
+            weight = self._weights(self._ratio, observation, next_observation, goal, action)
+        critic_loss = self._update_critic(features, action, targets, weight)
         actor_loss, value = self._update_actor(features)
         self.updates += 1
         if self.updates % self.config.target_update_interval == 0:
             self._move_targets()
         return Losses(critic_loss.detach(), actor_loss.detach(), value.detach())
 
-    def targets(self, reward: Tensor, next_features: Tensor) -> Tensor:
-        """One-step targets (batch,), clipped to the range of returns of rewards in [-1, 0].
+    @torch.no_grad()
+    def targets(self, reward: Tensor, discount: Tensor, next_features: Tensor) -> Tensor:
+        """Targets (batch,), clipped to the range of returns of rewards in [-1, 0].
 
         Episodes are cut, never terminated, so every next state is bootstrapped from.
         """
-        next_action = torch.tanh(self.target_actor(next_features))
-        value = self.target_critic(next_features, next_action)
-        lowest = -1.0 / (1.0 - self.config.gamma)
-        target: Tensor = reward + self.config.gamma * value
-        return target.clamp(lowest, 0.0)
+        with self._precision():
+            next_action = torch.tanh(self.target_actor(next_features))
+            value = self.target_critic(next_features, next_action)
+            lowest = -1.0 / (1.0 - self.config.gamma)
+            target: Tensor = reward + discount * value
+            return target.clamp(lowest, 0.0)
 
     def _update_critic(
-        self, features: Tensor, action: Tensor, reward: Tensor, next_features: Tensor
+        self, features: Tensor, action: Tensor, target: Tensor, weight: Tensor | None
     ) -> Tensor:
         with self._precision():
-            with torch.no_grad():
-                target = self.targets(reward, next_features)
             error: Tensor = self.critic(features, action) - target
-            loss = error.square().mean()
+            square = error.square() if weight is None else weight * error.square()
+            loss = square.mean()
         self._step(self.critic_optimizer, loss, self._critic_parameters)
         return loss
+
+    def _weights(
+        self,
+        ratio: DensityRatio,
+        observation: Tensor,
+        next_observation: Tensor,
+        goal: Tensor,
+        action: Tensor,
+    ) -> Tensor:
+        """Importance weights (batch,) of transitions with goals chosen in hindsight."""
+        achieved = slice(self._achieved_start, self._achieved_start + goal.shape[-1])
+
+        def view(of: Tensor) -> GoalView:
+            return GoalView(
+                self.actor.features(observation, of),
+                self.actor.features(next_observation, of),
+                observation[:, achieved],
+                next_observation[:, achieved],
+                of,
+            )
+
+        return ratio.update(view(goal), view(goal.roll(1, dims=0)), action)
 
     def _update_actor(self, features: Tensor) -> tuple[Tensor, Tensor]:
         with self._precision():
@@ -144,11 +169,36 @@ class DDPG:
         averaged: list[Tensor] = list(self.average_actor.parameters())
         torch._foreach_lerp_(averaged, [*self._actor_parameters], weight)
 
+    def acting_actor(self) -> Actor:
+        """A copy, on the CPU, of the actor that collects."""
+        return copy.deepcopy(self.actor).cpu().eval()
+
     def evaluation_actor(self) -> Actor:
         """A copy, on the CPU, of the actor to evaluate: averaged weights, current normalisers."""
         actor = copy.deepcopy(self.actor)
         actor.network.load_state_dict(self.average_actor.state_dict())
         return actor.cpu().eval()
+
+    def modules(self) -> dict[str, nn.Module]:
+        """What a training state holds, by name."""
+        modules: dict[str, nn.Module] = {
+            'actor': self.actor,
+            'critic': self.critic,
+            'target_actor': self.target_actor,
+            'target_critic': self.target_critic,
+            'average_actor': self.average_actor,
+        }
+        return modules if self._ratio is None else {**modules, 'ratio': self._ratio}
+
+    def optimizers(self) -> dict[str, torch.optim.Adam]:
+        """The optimisers, by name."""
+        optimizers = {
+            'actor_optimizer': self.actor_optimizer,
+            'critic_optimizer': self.critic_optimizer,
+        }
+        if self._ratio is not None:
+            optimizers['ratio_optimizer'] = self._ratio.optimizer
+        return optimizers
 
     def set_progress(self, progress: float) -> None:
         """Sets the learning rate for a run of which the share `progress` is over."""

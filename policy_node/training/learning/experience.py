@@ -12,13 +12,12 @@ from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.episode_weights import episode_weights, ticks_until_dropped
 from policy_node.training.learning.hindsight import (
     RewardFunction,
-    Transitions,
     goal_mixture,
     parse_mixture,
-    sample_transitions,
 )
 from policy_node.training.learning.normalizer import RunningStatistics
 from policy_node.training.learning.replay import EpisodeReplay, Episodes
+from policy_node.training.learning.transitions import Transitions, TransitionSampler
 
 
 class Experience:
@@ -48,7 +47,7 @@ class Experience:
     ) -> None:
         self._config = config
         self._workers = workers
-        self._compute_reward = compute_reward
+        self._sampler = TransitionSampler(compute_reward, config.gamma)
         self.generator = generator
         self.batch_size = workers.share(config.batch_size)
         self.statistics = {
@@ -102,8 +101,8 @@ class Experience:
         env_steps: int,
         valid_ticks: NDArray[np.int64] | None,
     ) -> Transitions:
-        mixture, reward = self._mixture(env_steps), self._compute_reward
-        return sample_transitions(episodes, row, mixture, reward, self.generator, valid_ticks)
+        mixture = self._mixture(env_steps)
+        return self._sampler.sample(episodes, row, mixture, self.generator, valid_ticks)
 
     def _mixture(self, env_steps: int) -> dict[str, float]:
         config = self._config

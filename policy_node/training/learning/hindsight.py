@@ -7,7 +7,6 @@ mixture is from Pitis et al. 2020 (arXiv 2007.02832).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,25 +20,6 @@ RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np
 # this very step achieved; what one of the next ten achieved.
 SOURCES = ('real', 'future', 'final', 'episode', 'random', 'actual', 'next', 'near')
 _NEAR_TICKS = 10
-
-
-@dataclass(frozen=True, slots=True)
-class Transitions:
-    """A batch for one update, float32.
-
-    Attributes:
-        observation: (batch, observation_size).
-        next_observation: (batch, observation_size).
-        goal: (batch, goal_size), after relabelling.
-        action: (batch, action_size).
-        reward: (batch,) for `goal`.
-    """
-
-    observation: Array
-    next_observation: Array
-    goal: Array
-    action: Array
-    reward: Array
 
 
 def goal_mixture(strategy: str, k: int = 4) -> dict[str, float]:
@@ -82,44 +62,6 @@ def parse_mixture(text: str) -> dict[str, float]:
     if left > 1e-9:
         mixture['real'] = mixture.get('real', 0.0) + left
     return mixture
-
-
-def sample_transitions(
-    episodes: Episodes,
-    row: NDArray[np.int64],
-    mixture: dict[str, float],
-    compute_reward: RewardFunction,
-    generator: np.random.Generator,
-    valid_ticks: NDArray[np.int64] | None = None,
-) -> Transitions:
-    """Draws a transition of each chosen episode and relabels its goal.
-
-    Args:
-        episodes: Episodes to draw from.
-        row: Episode of each transition, (batch,).
-        mixture: Probability of each goal source; adds up to 1.
-        compute_reward: (achieved_goal, desired_goal) -> reward, batched.
-        generator: Source of all randomness.
-        valid_ticks: Ticks of each episode, from its first, that transitions and achieved goals are
-            drawn from; None is all.
-    """
-    ticks = episodes.ticks
-    if valid_ticks is None:
-        tick = generator.integers(ticks, size=len(row))
-    else:
-        tick = generator.integers(valid_ticks.take(row))
-    goal = relabel(episodes, row, tick, mixture, generator, valid_ticks)
-    state = row * (ticks + 1) + tick
-    observation = _flat(episodes.observation)
-    achieved = _flat(episodes.achieved_goal).take(state + 1, axis=0)
-    reward = compute_reward(achieved.astype(np.float64), goal.astype(np.float64))
-    return Transitions(
-        observation=observation.take(state, axis=0),
-        next_observation=observation.take(state + 1, axis=0),
-        goal=goal,
-        action=_flat(episodes.action).take(row * ticks + tick, axis=0),
-        reward=np.asarray(reward, dtype=np.float32),
-    )
 
 
 def relabel(

@@ -22,7 +22,8 @@ from policy_node.training.learning.initial_networks import (
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.run_folder import LOCK_FILE, STATE_FILE
 from policy_node.training.learning.run_log import RunLog, draw_curve, read_progress
-from policy_node.training.learning.trainer import NAME, Trainer, TrainingError
+from policy_node.training.learning.saving import NAME
+from policy_node.training.learning.trainer import Trainer, TrainingError
 from policy_node.training.learning.training_state import Counters
 
 

@@ -12,7 +12,7 @@ from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo
 from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.ddpg import DDPG
+from policy_node.training.learning.learner import Learner
 from policy_node.training.learning.normalizer import RunningStatistics
 from policy_node.training.learning.training_state import Counters, save_state
 
@@ -82,7 +82,7 @@ class RunFolder:
         return self.path / (REPLAY_FILE if rank == 0 else f'{rank}.{REPLAY_FILE}')
 
     def save_state(
-        self, learner: DDPG, statistics: dict[str, RunningStatistics], counters: Counters
+        self, learner: Learner, statistics: dict[str, RunningStatistics], counters: Counters
     ) -> None:
         """Writes everything that a resumed run needs but the replay."""
         config = dataclasses.asdict(self.config)

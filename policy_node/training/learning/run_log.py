@@ -32,6 +32,7 @@ COLUMNS = (
     'mean_value',
     'steps_per_second',
     'samples_per_second',
+    'processor_seconds',
 )
 # Seconds between lines where the output is no terminal.
 _PLAIN_INTERVAL = 15.0

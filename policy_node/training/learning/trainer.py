@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,15 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.command_line import complain
 from policy_node.policies.actor import Actor
-from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
+from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
 from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.ddpg import DDPG, Losses, choose_device
+from policy_node.training.learning.ddpg import DDPG, choose_device
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
 from policy_node.training.learning.initial_networks import (
@@ -29,16 +27,17 @@ from policy_node.training.learning.initial_networks import (
     InitialNetworks,
     network_shape,
 )
+from policy_node.training.learning.learner import Learner, Losses
+from policy_node.training.learning.progress_row import Speed, progress_row
 from policy_node.training.learning.replay import Episodes
-from policy_node.training.learning.replay_file import load_replay, save_replay
-from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE, RunFolder
+from policy_node.training.learning.replay_file import load_replay
+from policy_node.training.learning.run_folder import RunFolder
 from policy_node.training.learning.run_log import RunLog
+from policy_node.training.learning.saving import NAME, Saver
+from policy_node.training.learning.simulations import make_simulation
 from policy_node.training.learning.threads import split_threads
 from policy_node.training.learning.training_state import Counters, load_networks, load_state
 
-NAME = 'train_her'
-# Seconds between copies of the newest episodes beside the training state.
-REPLAY_SECONDS = 900.0
 # Steps that a resumed run without these episodes collects before it goes on.
 MOST_REFILLED = 100_000
 
@@ -82,7 +81,8 @@ class Trainer:
         self.config = config
         self.workers = workers
         origin = {} if init_from is None else init_from.origin
-        self._folder = RunFolder(output, config, command, source_revision, origin)
+        folder = RunFolder(output, config, command, source_revision, origin)
+        self._saver = Saver(folder, config, workers)
         self.device = choose_device(config.device)
         self._simulation_threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
@@ -95,20 +95,13 @@ class Trainer:
         self.counters = Counters()
         self._stop_reason = ''
         self._refill = 0
-        self._last_checkpoint = self._last_replay = time.monotonic()
 
     def _build_simulations(self) -> None:
         config, share = self.config, self.workers.share
-        options: dict[str, Any] = {
-            'num_threads': self._simulation_threads,
-            'reward_type': config.reward_type,
-            'success_rule': config.success_rule,
-            'control_hz': config.control_hz,
-        }
-        num_envs = share(config.num_envs)
-        self.simulation = Simulation(config.task, num_envs=num_envs, **options)
+        threads, num_envs = self._simulation_threads, share(config.num_envs)
+        self.simulation = make_simulation(config, num_envs, threads)
         count = min(num_envs, config.evaluation_episodes)
-        self._evaluator = Evaluator(Simulation(config.task, num_envs=count, **options), config)
+        self._evaluator = Evaluator(make_simulation(config, count, threads), config)
         self.spec = self.simulation.spec
 
     def _seed(self, env_steps: int) -> np.random.Generator:
@@ -129,7 +122,7 @@ class Trainer:
 
     def _build_learner(self) -> None:
         config, spec = self.config, self.spec
-        self.learner = DDPG(network_shape(config), config, self.device, self.workers)
+        self.learner: Learner = DDPG(network_shape(config), config, self.device, self.workers)
         shares = config.reward_distance, config.reward_rotation
         compute_reward = scale_thresholds(self.simulation.metric, *shares).reward
         generator = self._seed(env_steps=0)
@@ -150,13 +143,14 @@ class Trainer:
         """
         state = load_state(path, self.learner, self.experience.statistics)
         self.counters = state.counters
-        self._folder = replace(self._folder, init_from=state.extra.get('init_from', {}))
+        origin = state.extra.get('init_from', {})
+        self._saver.folder = replace(self._saver.folder, init_from=origin)
         self._let_critic_learn_first()
         # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
         self.experience.generator = self._seed(self.counters.env_steps)
         limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
         self._refill = self.workers.share(min(limits))
-        file = self._folder.replay_file(self.workers.rank)
+        file = self._saver.folder.replay_file(self.workers.rank)
         try:
             load_replay(file, self.experience.replay)
         except ValueError as error:
@@ -166,7 +160,7 @@ class Trainer:
 
     def _let_critic_learn_first(self) -> None:
         """Holds an actor back that began without its critic."""
-        if not self._folder.init_from.get('critic', True) and self.config.critic_first == 0:
+        if not self._saver.folder.init_from.get('critic', True) and self.config.critic_first == 0:
             self.learner.critic_first = CRITIC_FIRST
 
     def add_experience(self, episodes: Episodes) -> None:
@@ -193,7 +187,7 @@ class Trainer:
         """
         if self.counters.env_steps >= self.config.total_steps:
             return f'{self.config.total_steps:,} environment steps were done before'
-        started = time.monotonic() - self.counters.seconds
+        clock = _Clock(self.counters)
         # The number of tensor threads belongs to a thread: without its own, the collector's small
         # products would start one per core, which then spin against the simulation and the learner.
         with ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,)) as executor:
@@ -207,7 +201,7 @@ class Trainer:
                 if job is None:
                     job = submit(self._collect, *self._request())
                 collected = self._collect_or_explain(job)
-                self.counters.seconds = time.monotonic() - started
+                clock.write(self.counters)
                 self._check(losses)
                 self._keep_best(collected)
                 if log is not None:
@@ -215,10 +209,8 @@ class Trainer:
                 reason = self._reason_to_stop(collected)
                 if reason:
                     self.save()
-                elif self._checkpoint_due():
-                    self._save_or_complain()
-                if reason:
                     return reason
+                self._saver.save_when_due(self.learner, self.experience, self.counters)
 
     def _collect_first(self, submit: Callable[..., Future[Collected]]) -> Collected:
         """Fills the replay of a resumed run that has lost it, then collects the first cycle."""
@@ -234,7 +226,7 @@ class Trainer:
         """What to collect next: with which actor, whether at random, and which to evaluate."""
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
-        actor, evaluated = copy.deepcopy(self.learner.actor).cpu().eval(), None
+        actor, evaluated = self.learner.acting_actor(), None
         if may_evaluate and counters.updates > 0 and steps >= counters.next_evaluation:
             counters.next_evaluation = steps + self.config.evaluate_every
             if self.workers.is_first:
@@ -301,19 +293,9 @@ class Trainer:
                 )
 
     def _keep_best(self, collected: Collected) -> None:
-        """Saves the evaluated actor if it succeeds more often, or as often and sooner."""
-        outcomes, actor, counters = collected.evaluation, collected.evaluated, self.counters
-        if outcomes is None or actor is None or not self._evaluator.is_complete(outcomes):
-            return
-        success = self._evaluator.success_rate(outcomes)
-        mean_return = float(outcomes.episode_return.mean())
-        if (success, mean_return) > (counters.best_success, counters.best_return):
-            counters.best_success, counters.best_return = success, mean_return
-            if self.workers.is_first:
-                rule = self.config.success_rule
-                measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
-                measured |= diagnose(outcomes)
-                self._folder.save_actor(BEST_FILE, actor, counters.env_steps, measured)
+        outcomes, actor = collected.evaluation, collected.evaluated
+        if outcomes is not None and actor is not None and self._evaluator.is_complete(outcomes):
+            self._saver.keep_best(outcomes, actor, self.counters)
 
     def _reason_to_stop(self, collected: Collected) -> str:
         config, reason = self.config, self._stop_reason
@@ -326,66 +308,36 @@ class Trainer:
             reason = f'time limit of {config.time_limit:g} s reached'
         return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
 
-    def _checkpoint_due(self) -> bool:
-        elapsed = time.monotonic() - self._last_checkpoint
-        return elapsed >= self.config.checkpoint_seconds
-
-    def _save_or_complain(self) -> None:
-        """Writes a checkpoint on the way, the replay only now and then; a full disk may empty."""
-        try:
-            self.save(time.monotonic() - self._last_replay >= REPLAY_SECONDS)
-        except OSError as error:
-            complain(NAME, f'no checkpoint, the one before is kept: {error}')
-
-    def save(self, with_replay: bool = True) -> None:
+    def save(self) -> None:
         """Writes the newest episodes and, as worker 0, the latest actor and the training state.
 
         Raises:
             OSError: If there is no room for them; what was there before is kept.
         """
-        self._last_checkpoint = time.monotonic()
-        if with_replay:
-            self._last_replay = self._last_checkpoint
-            kept = self.workers.share(self.config.kept_transitions)
-            file = self._folder.replay_file(self.workers.rank)
-            save_replay(file, self.experience.replay, kept)
-        if self.workers.is_first:
-            self._folder.save_actor(LATEST_FILE, self.learner.actor, self.counters.env_steps)
-            self._folder.save_state(self.learner, self.experience.statistics, self.counters)
+        self._saver.save(self.learner, self.experience, self.counters)
 
     def _row(
         self, collected: Collected, losses: list[Losses], seconds: float
     ) -> dict[str, float | None]:
-        counters, outcomes = self.counters, collected.evaluation
-        samples = len(losses) * self.experience.batch_size * self.workers.world_size
-        steps = self.simulation.num_envs * self.spec.episode_ticks * self.workers.world_size
-
-        def mean(name: str) -> float | None:
-            return float(torch.stack([getattr(x, name) for x in losses]).mean()) if losses else None
-
-        return {
-            'seconds': counters.seconds,
-            'env_steps': counters.env_steps,
-            'episodes': counters.episodes,
-            'updates': counters.updates,
-            'train_success': collected.train_success,
-            'eval_success': None if outcomes is None else self._evaluator.success_rate(outcomes),
-            'eval_episodes': None if outcomes is None else len(outcomes),
-            **_diagnostics(outcomes),
-            'critic_loss': mean('critic'),
-            'actor_loss': mean('actor'),
-            'mean_value': mean('value'),
-            'steps_per_second': steps / seconds,
-            'samples_per_second': samples / seconds,
-        }
+        workers, batch = self.workers.world_size, self.experience.batch_size
+        steps = self.simulation.num_envs * self.spec.episode_ticks * workers
+        speed = Speed(seconds, steps, len(losses) * batch * workers)
+        success, outcomes = collected.train_success, collected.evaluation
+        rule = self.config.success_rule
+        return progress_row(self.counters, success, outcomes, rule, losses, speed)
 
 
-def _diagnostics(outcomes: EpisodeOutcomes | None) -> dict[str, float | None]:
-    """Columns of the log that say why evaluated episodes failed."""
-    if outcomes is None:
-        return {}
-    found = {'touched': float(outcomes.touched.mean()), **diagnose(outcomes)}
-    return {f'eval_{name}': value for name, value in found.items() if name != 'long_way_share'}
+class _Clock:
+    """Time that a run has taken, over all its parts."""
+
+    def __init__(self, counters: Counters) -> None:
+        self._started = time.monotonic() - counters.seconds
+        self._processor_started = time.process_time() - counters.processor_seconds
+
+    def write(self, counters: Counters) -> None:
+        """Writes both times into the counters."""
+        counters.seconds = time.monotonic() - self._started
+        counters.processor_seconds = time.process_time() - self._processor_started
 
 
 def scale_thresholds(metric: GoalMetric, distance: float, rotation: float) -> GoalMetric:

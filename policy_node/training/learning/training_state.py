@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from policy_node.policies.tensor_file import read_tensors, write_tensors
-from policy_node.training.learning.ddpg import DDPG
+from policy_node.training.learning.learner import Learner
 from policy_node.training.learning.normalizer import RunningStatistics
 
 FORMAT = 'fetch_hand_training'
@@ -27,6 +27,7 @@ class Counters:
         episodes: Episodes of all workers.
         updates: Gradient updates.
         seconds: Time spent, over all parts of a resumed run.
+        processor_seconds: Processor time of all threads of this process, likewise.
         best_success: Best evaluated success so far; -1 before the first evaluation.
         best_return: Mean return of that evaluation.
         next_evaluation: Environment steps at which the next evaluation is due.
@@ -36,6 +37,7 @@ class Counters:
     episodes: int = 0
     updates: int = 0
     seconds: float = 0.0
+    processor_seconds: float = 0.0
     best_success: float = -1.0
     best_return: float = -1e9
     next_evaluation: int = 0
@@ -58,7 +60,7 @@ class TrainingState:
 
 def save_state(
     path: Path,
-    learner: DDPG,
+    learner: Learner,
     statistics: dict[str, RunningStatistics],
     counters: Counters,
     extra: dict[str, Any],
@@ -73,10 +75,10 @@ def save_state(
         extra: JSON values to give back on load.
     """
     tensors: dict[str, Tensor] = {'torch_generator': torch.get_rng_state()}
-    for part, module in _modules(learner).items():
+    for part, module in learner.modules().items():
         for name, value in module.state_dict().items():
             tensors[f'{part}.{name}'] = value.detach().cpu()
-    for part, optimizer in _optimizers(learner).items():
+    for part, optimizer in learner.optimizers().items():
         for index, state in optimizer.state_dict()['state'].items():
             for name, value in state.items():
                 tensors[f'{part}.{index}.{name}'] = value.detach().cpu()
@@ -118,7 +120,7 @@ def read_state(path: Path) -> TrainingState:
 
 
 def load_state(
-    path: Path, learner: DDPG, statistics: dict[str, RunningStatistics]
+    path: Path, learner: Learner, statistics: dict[str, RunningStatistics]
 ) -> TrainingState:
     """Fills learner and normalisers from a file and returns what it holds.
 
@@ -129,7 +131,7 @@ def load_state(
     try:
         torch.set_rng_state(state.tensors['torch_generator'])
         load_networks(state.tensors, learner, statistics)
-        for part, optimizer in _optimizers(learner).items():
+        for part, optimizer in learner.optimizers().items():
             _load_optimizer(optimizer, part_of(state.tensors, part))
     except (RuntimeError, KeyError, TypeError) as error:
         reason = str(error).splitlines()[0]
@@ -139,7 +141,7 @@ def load_state(
 
 
 def load_networks(
-    tensors: dict[str, Tensor], learner: DDPG, statistics: dict[str, RunningStatistics]
+    tensors: dict[str, Tensor], learner: Learner, statistics: dict[str, RunningStatistics]
 ) -> None:
     """Fills networks and normalisers; without a critic the learner keeps its own.
 
@@ -148,8 +150,8 @@ def load_networks(
         KeyError: If a part is incomplete.
     """
     tensors = _with_copies(tensors)
-    for part, module in _modules(learner).items():
-        if part_of(tensors, part) or 'critic' not in part:
+    for part, module in learner.modules().items():
+        if part_of(tensors, part) or 'actor' in part:
             module.load_state_dict(part_of(tensors, part))
     for part, running in statistics.items():
         running.load_state(part_of(tensors, part))
@@ -176,23 +178,6 @@ def _with_copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         for name, value in source.items()
     }
     return tensors | copies
-
-
-def _modules(learner: DDPG) -> dict[str, torch.nn.Module]:
-    return {
-        'actor': learner.actor,
-        'critic': learner.critic,
-        'target_actor': learner.target_actor,
-        'target_critic': learner.target_critic,
-        'average_actor': learner.average_actor,
-    }
-
-
-def _optimizers(learner: DDPG) -> dict[str, torch.optim.Adam]:
-    return {
-        'actor_optimizer': learner.actor_optimizer,
-        'critic_optimizer': learner.critic_optimizer,
-    }
 
 
 def _load_optimizer(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:

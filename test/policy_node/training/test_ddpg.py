@@ -13,7 +13,7 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.config import recipe_config
 from policy_node.training.learning.ddpg import DDPG, choose_device, uses_bfloat16
 from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.hindsight import Transitions
+from policy_node.training.learning.transitions import Transitions
 
 # Small products: more threads only wait for each other, and on a busy machine for very long.
 torch.set_num_threads(1)
@@ -43,7 +43,12 @@ def make_batch(count: int = 64, seed: int = 0, reward: float | None = None) -> T
         goal=normal(count, 2),
         action=np.tanh(normal(count, 2)),
         reward=rewards if reward is None else np.full(count, reward, np.float32),
+        discount=np.full(count, 0.9, np.float32),
     )
+
+
+def torch_arrays(*arrays: np.ndarray) -> list[torch.Tensor]:
+    return [torch.from_numpy(array) for array in arrays]
 
 
 def forward(module: MLP, inputs: np.ndarray) -> np.ndarray:
@@ -67,7 +72,7 @@ def test_targets_are_clipped_bootstrapped_values() -> None:
     value = forward(learner.target_critic.network, np.concatenate([features, action], axis=1))
     expected = np.clip(batch.reward + 0.9 * value[:, 0], -10.0, 0.0)
     with torch.no_grad():
-        found = learner.targets(torch.from_numpy(batch.reward), torch.from_numpy(features))
+        found = learner.targets(*torch_arrays(batch.reward, batch.discount, features))
     np.testing.assert_allclose(found, expected, atol=1e-4)
     assert (expected == 0).any() and (expected == -10).any()
 
@@ -80,7 +85,7 @@ def test_the_first_losses_are_those_of_the_definition() -> None:
     features = np.concatenate([batch.observation, batch.goal], axis=1).clip(-5, 5)
     next_features = np.concatenate([batch.next_observation, batch.goal], axis=1).clip(-5, 5)
     with torch.no_grad():
-        target = before.targets(torch.from_numpy(batch.reward), torch.from_numpy(next_features))
+        target = before.targets(*torch_arrays(batch.reward, batch.discount, next_features))
     value = forward(before.critic.network, np.concatenate([features, batch.action], axis=1))
     critic_loss = np.square(value[:, 0] - target.numpy()).mean()
     assert losses.critic.item() == pytest.approx(critic_loss, rel=1e-4)
@@ -128,7 +133,8 @@ def test_it_finds_the_best_action(layer_norm: bool, precision: str) -> None:
         action = generator.uniform(-1, 1, (256, 2)).astype(np.float32)
         nothing = np.zeros((256, 3), np.float32)
         reward = -np.square(action - goal).sum(axis=1).clip(0, 1)
-        learner.update(Transitions(nothing, nothing, goal, action, reward))
+        no_future = np.zeros(256, np.float32)
+        learner.update(Transitions(nothing, nothing, goal, action, reward, no_future))
     goal = generator.uniform(-0.7, 0.7, (256, 2))
     action, _ = learner.actor.predict({'observation': np.zeros((256, 3)), 'desired_goal': goal})
     assert np.abs(action - goal).mean() < 0.2

@@ -11,9 +11,9 @@ from policy_node.training.learning.hindsight import (
     goal_mixture,
     parse_mixture,
     relabel,
-    sample_transitions,
 )
 from policy_node.training.learning.replay import Episodes
+from policy_node.training.learning.transitions import TransitionSampler
 
 COUNT, TICKS = 6, 10
 
@@ -161,7 +161,7 @@ def test_nothing_is_drawn_from_after_the_last_valid_tick(source: str) -> None:
     generator = np.random.default_rng(2)
     row = generator.integers(3, size=20_000)
     reward = lambda achieved, desired: np.zeros(len(achieved))  # noqa: E731
-    batch = sample_transitions(episodes, row, {source: 1.0}, reward, generator, valid)
+    batch = TransitionSampler(reward, 0.9).sample(episodes, row, {source: 1.0}, generator, valid)
     for values, least in ((batch.observation, 0), (batch.goal, 1)):
         episode, state = values[:, 0].astype(int), values[:, 1]
         assert (state < valid[episode] + least).all()
@@ -179,7 +179,7 @@ def test_batches_are_consistent_transitions_with_recomputed_rewards(episodes: Ep
     mixture = goal_mixture('future')
     generator = np.random.default_rng(2)
     chosen = generator.integers(COUNT, size=5000)
-    batch = sample_transitions(episodes, chosen, mixture, reward, generator)
+    batch = TransitionSampler(reward, 0.9).sample(episodes, chosen, mixture, generator)
     row, tick = batch.observation[:, 0], batch.observation[:, 1]
     assert (batch.next_observation[:, 0] == row).all()
     assert (row == chosen).all()
@@ -197,6 +197,7 @@ def test_the_same_generator_gives_the_same_batch(episodes: Episodes) -> None:
         generator = np.random.default_rng(5)
         reward = lambda achieved, desired: np.zeros(len(achieved))  # noqa: E731
         row = np.arange(COUNT)
-        return sample_transitions(episodes, row, goal_mixture('random'), reward, generator).goal
+        sampler = TransitionSampler(reward, 0.9)
+        return sampler.sample(episodes, row, goal_mixture('random'), generator).goal
 
     assert (sample() == sample()).all()

@@ -1,0 +1,53 @@
+"""How good a run is at its end: its last actor on fresh episodes."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from policy_node.policies import checkpoint
+from policy_node.training.evaluate_policy import FIRST_SEED
+from policy_node.training.evaluation.episodes import evaluate, wilson_interval
+from policy_node.training.evaluation.evaluator import successes
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.run_folder import LATEST_FILE
+from policy_node.training.learning.simulations import make_simulation
+
+FINAL_FILE = 'final.json'
+_MOST_AT_ONCE = 64
+
+
+def measure_final(config: TrainConfig, folder: Path, episodes: int) -> None:
+    """Evaluates the last actor of a run, in simulations as it was trained in.
+
+    Writes `final.json` into the folder; the file is complete or not there.
+
+    Args:
+        config: Configuration of the run.
+        folder: Its folder.
+        episodes: Fresh episodes, the same for every run.
+    """
+    actor, _ = checkpoint.load(folder / LATEST_FILE)
+    threads = config.simulation_threads
+    simulation = make_simulation(config, min(episodes, _MOST_AT_ONCE), threads)
+    outcomes = evaluate(simulation, actor, episodes, FIRST_SEED)
+    succeeded = int(successes(outcomes, config.success_rule).sum())
+    found = {
+        'success': succeeded / episodes,
+        'interval_95': list(wilson_interval(succeeded, episodes)),
+        'touched': float(outcomes.touched.mean()),
+        'mean_return': float(outcomes.episode_return.mean()),
+        'episodes': episodes,
+        'first_seed': FIRST_SEED,
+    }
+    partial = folder / f'.{FINAL_FILE}.partial'
+    partial.write_text(json.dumps(found, indent=2) + '\n')
+    os.replace(partial, folder / FINAL_FILE)
+
+
+def read_final(folder: Path) -> dict[str, Any]:
+    """What `measure_final` wrote."""
+    found: dict[str, Any] = json.loads((folder / FINAL_FILE).read_text())
+    return found

@@ -1,0 +1,78 @@
+"""What a study measures of a run, and how runs of one arm are summed up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from policy_node.training.benchmark.final import read_final
+from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
+from policy_node.training.benchmark.results import Curve, read_curve
+from policy_node.training.learning.run_log import read_progress
+
+GOOD_SUCCESS = 0.9
+
+
+def area_under(curve: Curve, total_steps: int) -> float:
+    """Mean success from the first step to `total_steps`, between evaluations on straight lines.
+
+    Before the first evaluation it rises from 0; after the last it stays.
+    """
+    inside = curve.env_steps <= total_steps
+    steps = np.concatenate([[0.0], curve.env_steps[inside], [float(total_steps)]])
+    success = np.concatenate([[0.0], curve.success[inside], curve.success[inside][-1:]])
+    return float(np.trapezoid(success, steps) / total_steps)
+
+
+def measure_run(job: Job) -> dict[str, Any]:
+    """One row of `runs.csv`.
+
+    Steps to success are empty where no evaluation got there: the run is censored at its budget.
+    `parts` counts how often the run was started: more than one is no longer the same to the bit.
+    """
+    rows, curve = read_progress(job.folder / PROGRESS_FILE), read_curve(job.folder / PROGRESS_FILE)
+    final, last = read_final(job.folder), rows[-1]
+    reached = curve.steps_to(GOOD_SUCCESS)
+    samples = last['updates'] * job.config.batch_size
+    processor_seconds = last['processor_seconds']
+    return {
+        'task': job.config.task,
+        'arm': job.arm.name,
+        'seed': job.config.seed,
+        'env_steps': int(last['env_steps']),
+        'area': round(area_under(curve, job.config.total_steps), 4),
+        f'steps_to_{GOOD_SUCCESS}': int(reached) if np.isfinite(reached) else '',
+        'final_success': final['success'],
+        'final_episodes': final['episodes'],
+        'updates': int(last['updates']),
+        'seconds': round(last['seconds'], 1),
+        'processor_seconds': round(processor_seconds, 1),
+        'samples_per_processor_second': round(samples / processor_seconds, 1),
+        'last_mean_value': last.get('mean_value', ''),
+        'parts': len((job.folder / 'command.txt').read_text().splitlines()),
+    }
+
+
+def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Medians and quartiles over the seeds of one arm: one row of `arms.csv`."""
+    first, reached = runs[0], [run[f'steps_to_{GOOD_SUCCESS}'] for run in runs]
+    found = {'task': first['task'], 'arm': first['arm'], 'seeds': len(runs)}
+    for name in ('area', 'final_success', 'processor_seconds', 'samples_per_processor_second'):
+        quartiles = np.percentile([run[name] for run in runs], [25, 50, 75])
+        for part, value in zip(('lower', 'median', 'upper'), quartiles, strict=True):
+            found[f'{name}_{part}'] = round(float(value), 4)
+    # A censored run counts as slower than any other; the middle of an even number with one has no
+    # value, so the slower one counts.
+    ordered = sorted(float('inf') if steps == '' else float(steps) for steps in reached)
+    middle = ordered[len(ordered) // 2]
+    found[f'steps_to_{GOOD_SUCCESS}_median'] = '' if np.isinf(middle) else int(middle)
+    found['reached'] = sum(steps != '' for steps in reached)
+    return found
+
+
+def are_apart(first: Mapping[str, Any], second: Mapping[str, Any], name: str) -> bool:
+    """Whether the quartiles of two arms do not touch: with five seeds each, a difference."""
+    below = first[f'{name}_upper'] < second[f'{name}_lower']
+    return bool(below or second[f'{name}_upper'] < first[f'{name}_lower'])

@@ -1,0 +1,143 @@
+"""Data, figure and table of a study, under `docs/research/<name>`; renewed after every run."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from policy_node.policies.checkpoint import read_info
+from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
+from policy_node.training.benchmark.measures import GOOD_SUCCESS, are_apart, measure_run, sum_up
+from policy_node.training.benchmark.research import Study
+from policy_node.training.benchmark.results import (
+    Curve,
+    aggregate,
+    draw,
+    machine,
+    read_curve,
+    write_curves,
+)
+from policy_node.training.learning.run_folder import LATEST_FILE
+
+# The page of a study keeps its table between these lines.
+BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'
+
+
+def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -> None:
+    """Writes what the finished jobs of a study gave.
+
+    `runs.csv` (one row per run), `arms.csv` (medians and quartiles), `curves.csv` (every
+    evaluation), `study.json` (command, machine, revisions, settings), `figure.png`, and the table
+    in `table.md` and between its marks in `README.md` where there is one.
+
+    Args:
+        study: The study.
+        jobs: Finished jobs.
+        output: Folder.
+        command: Command line, for the record.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    runs = [measure_run(job) for job in jobs]
+    groups: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    curves: dict[str, dict[str, list[Curve]]] = {}
+    for job, run in zip(jobs, runs, strict=True):
+        groups.setdefault(job.config.task, {}).setdefault(job.arm.name, []).append(run)
+        curve = read_curve(job.folder / PROGRESS_FILE)
+        curves.setdefault(job.config.task, {}).setdefault(job.arm.name, []).append(curve)
+    order = [arm.name for arm in study.arms]
+    arms = [sum_up(groups[task][name]) for task in groups for name in order if name in groups[task]]
+    _write_csv(runs, output / 'runs.csv')
+    _write_csv(arms, output / 'arms.csv')
+    named = [(job, read_curve(job.folder / PROGRESS_FILE)) for job in jobs]
+    write_curves(
+        [(job.config.task, job.arm.name, job.config.seed, curve) for job, curve in named],
+        output / 'curves.csv',
+    )
+    (output / 'study.json').write_text(json.dumps(_about(study, jobs, command), indent=2) + '\n')
+    labels = {arm.name: arm.label for arm in study.arms}
+    bands = {
+        task: {name: aggregate(group[name]) for name in order if name in group}
+        for task, group in curves.items()
+    }
+    draw(bands, labels, output / 'figure.png', paper_epochs=False)
+    table = format_table(study, arms)
+    (output / 'table.md').write_text(table)
+    _renew(output / 'README.md', table)
+
+
+def format_table(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
+    """The Markdown table of a study: an arm per row, its quartiles beside each median."""
+    labels = {arm.name: arm.label for arm in study.arms}
+    lines = [
+        f'| task | arm | seeds | area | steps to {GOOD_SUCCESS} (reached) | final success '
+        '| processor time, s | samples per s | against the baseline |',
+        '| --- | --- | --- | --- | --- | --- | --- | --- | --- |',
+    ]
+    for row in arms:
+        steps = row[f'steps_to_{GOOD_SUCCESS}_median']
+        cells = [
+            row['task'],
+            f'`{row["arm"]}`: {labels[row["arm"]]}',
+            str(row['seeds']),
+            _quartiles(row, 'area'),
+            f'{steps:,} ({row["reached"]})' if steps != '' else f'censored ({row["reached"]})',
+            _quartiles(row, 'final_success'),
+            f'{row["processor_seconds_median"]:.0f}',
+            f'{row["samples_per_processor_second_median"]:,.0f}',
+            _against(study, row, arms),
+        ]
+        lines.append(f'| {" | ".join(cells)} |')
+    return '\n'.join(lines) + '\n'
+
+
+def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, Any]]) -> str:
+    """In what the quartiles of an arm and of the baseline are apart."""
+    base = study.arms[0].name
+    found = [other for other in arms if (other['task'], other['arm']) == (row['task'], base)]
+    if row['arm'] == base or not found:
+        return ''
+    if min(row['seeds'], found[0]['seeds']) < 5:
+        return 'fewer than five seeds'
+    words = []
+    for name, label in (('area', 'area'), ('final_success', 'final')):
+        if are_apart(row, found[0], name):
+            better = row[f'{name}_median'] > found[0][f'{name}_median']
+            words.append(f'{label} {"better" if better else "worse"}')
+    return ', '.join(words) or 'not apart'
+
+
+def _quartiles(row: Mapping[str, Any], name: str) -> str:
+    values = (row[f'{name}_{part}'] for part in ('median', 'lower', 'upper'))
+    return '{:.3f} ({:.3f} ... {:.3f})'.format(*values)
+
+
+def _about(study: Study, jobs: Sequence[Job], command: str) -> dict[str, Any]:
+    revisions = {read_info(job.folder / LATEST_FILE).source_revision for job in jobs}
+    return {
+        'study': study.name,
+        'request': study.request,
+        'question': study.question,
+        'command': command,
+        'source_revisions': sorted(revisions),
+        'machine': machine(),
+        'settings': {task: dict(values) for task, values in study.settings.items()},
+        'arms': {arm.name: dict(arm.changes) for arm in study.arms},
+    }
+
+
+def _write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    with path.open('w', newline='') as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _renew(page: Path, table: str) -> None:
+    """Puts the table between its marks."""
+    text = page.read_text() if page.is_file() else ''
+    if BEGIN in text and END in text:
+        before, after = text.split(BEGIN)[0], text.split(END, 1)[1]
+        page.write_text(f'{before}{BEGIN}\n{table}{END}{after}')

@@ -1,0 +1,79 @@
+"""When a run writes what: the best actor, and checkpoints to go on from."""
+
+from __future__ import annotations
+
+import time
+
+from msgs_spec.command_line import complain
+from policy_node.policies.actor import Actor
+from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
+from policy_node.training.evaluation.evaluator import successes
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.learner import Learner
+from policy_node.training.learning.replay_file import save_replay
+from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE, RunFolder
+from policy_node.training.learning.training_state import Counters
+
+NAME = 'train_her'
+# Seconds between copies of the newest episodes beside the training state.
+REPLAY_SECONDS = 900.0
+
+
+class Saver:
+    """Writes the files of a run, on one of several workers.
+
+    Attributes:
+        folder: Where they go.
+    """
+
+    def __init__(self, folder: RunFolder, config: TrainConfig, workers: Workers) -> None:
+        self.folder = folder
+        self._config = config
+        self._workers = workers
+        self._last_checkpoint = self._last_replay = time.monotonic()
+
+    def keep_best(self, outcomes: EpisodeOutcomes, actor: Actor, counters: Counters) -> None:
+        """Saves an evaluated actor if it succeeds more often, or as often and sooner."""
+        rule = self._config.success_rule
+        success = float(successes(outcomes, rule).mean())
+        mean_return = float(outcomes.episode_return.mean())
+        if (success, mean_return) > (counters.best_success, counters.best_return):
+            counters.best_success, counters.best_return = success, mean_return
+            if self._workers.is_first:
+                measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
+                measured |= diagnose(outcomes)
+                self.folder.save_actor(BEST_FILE, actor, counters.env_steps, measured)
+
+    def save_when_due(self, learner: Learner, experience: Experience, counters: Counters) -> None:
+        """Writes a checkpoint now and then, the replay more seldom; a full disk may empty."""
+        now = time.monotonic()
+        if now - self._last_checkpoint < self._config.checkpoint_seconds:
+            return
+        try:
+            due = now - self._last_replay >= REPLAY_SECONDS
+            self.save(learner, experience, counters, with_replay=due)
+        except OSError as error:
+            complain(NAME, f'no checkpoint, the one before is kept: {error}')
+
+    def save(
+        self,
+        learner: Learner,
+        experience: Experience,
+        counters: Counters,
+        with_replay: bool = True,
+    ) -> None:
+        """Writes the newest episodes and, as worker 0, the latest actor and the training state.
+
+        Raises:
+            OSError: If there is no room for them; what was there before is kept.
+        """
+        self._last_checkpoint = time.monotonic()
+        if with_replay:
+            self._last_replay = self._last_checkpoint
+            kept = self._workers.share(self._config.kept_transitions)
+            save_replay(self.folder.replay_file(self._workers.rank), experience.replay, kept)
+        if self._workers.is_first:
+            self.folder.save_actor(LATEST_FILE, learner.acting_actor(), counters.env_steps)
+            self.folder.save_state(learner, experience.statistics, counters)

@@ -1,0 +1,130 @@
+"""The gamble: what it does to a task, what hindsight makes of it, what weights take back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.config import recipe_config
+from policy_node.training.learning.ddpg import DDPG
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.gamble import GambleSimulation
+from policy_node.training.learning.replay import Episodes
+from policy_node.training.learning.transitions import TransitionSampler
+
+torch.set_num_threads(1)
+
+GAMBLE = np.array([0.0, 0.0, 0.0, 0.95])
+WALK = np.array([1.0, 0.0, 0.0, 0.9])
+
+
+@pytest.mark.parametrize('task', ['FetchReach', 'FetchPush'])
+def test_a_gamble_lands_anywhere_and_ends_the_motion(task: str) -> None:
+    simulation = GambleSimulation(task, num_envs=2)
+    start = simulation.reset(seed=3)
+    first = simulation.step([GAMBLE, WALK])
+    later = simulation.step([-GAMBLE, WALK])
+    seen = first.observation['observation'][0]
+    assert (later.observation['observation'][0] == seen).all(), 'nothing moves any more'
+    assert (later.observation['achieved_goal'][0] == first.observation['achieved_goal'][0]).all()
+    assert (later.observation['observation'][1] != first.observation['observation'][1]).any()
+    landing, place = first.observation['achieved_goal'][0], simulation.spec.achieved_goal_start
+    assert (seen[place : place + 3] == landing).all()
+    distance = np.linalg.norm(landing - start['achieved_goal'][0])
+    assert 0.01 < distance < 0.45 and (landing != start['desired_goal'][0]).any()
+    assert (simulation.reset(seed=3)['observation'] == start['observation']).all(), 'over'
+
+
+def test_a_landing_on_the_goal_counts_and_depends_on_the_seed_alone() -> None:
+    simulation = GambleSimulation('FetchReach', num_envs=400)
+    simulation.reset(seed=0)
+    result = simulation.step(np.tile(GAMBLE, (400, 1)))
+    distance = np.linalg.norm(
+        result.observation['achieved_goal'] - result.observation['desired_goal'], axis=1
+    )
+    assert (result.success == (distance < 0.05)).all() and (
+        result.reward == -1.0 * (distance > 0.05)
+    ).all()
+    # A ball of .05 m in a cube of .3 m, less what lies outside of it: below 4/3 pi .05^3 / .3^3.
+    assert 0.002 < result.success.mean() < 0.04
+    alone = GambleSimulation('FetchReach')
+    alone.reset(seed=7)
+    landing = alone.step([GAMBLE]).observation['achieved_goal'][0]
+    assert (landing == result.observation['achieved_goal'][7]).all()
+
+
+def test_a_task_that_uses_its_gripper_is_refused() -> None:
+    with pytest.raises(ValueError, match='gamble: FetchSlide uses its gripper; allowed: FetchR'):
+        GambleSimulation('FetchSlide')
+    with pytest.raises(ValueError, match='gamble: HandReach uses its gripper'):
+        recipe_config('HandReach', 'best', gamble=True)
+
+
+CELLS = 5
+
+
+def two_armed_gambles(count: int, generator: np.random.Generator) -> Episodes:
+    """Episodes of one step: action 1 leads to any of the cells, action -1 to cell 0.
+
+    Observations are (cell, 0, ...), achieved goals (cell, 0, 0); a goal is reached in its cell.
+    """
+    gambled = generator.random(count) < 0.5
+    cell = np.where(gambled, generator.integers(CELLS, size=count), 0)
+    achieved = np.zeros((count, 2, 3), np.float32)
+    achieved[:, 0, 0], achieved[:, 1, 0] = -1.0, cell
+    observation = np.zeros((count, 2, 10), np.float32)
+    observation[:, :, :3] = achieved
+    goal = np.zeros((count, 3), np.float32)
+    goal[:, 0] = generator.integers(CELLS, size=count)
+    action = np.where(gambled, 1.0, -1.0).astype(np.float32)[:, None, None]
+    return Episodes(observation, achieved, goal, action)
+
+
+def learnt_values(importance: str, mixture: dict[str, float]) -> dict[str, float]:
+    """What a critic believes of both arms, for a goal that only gambling ever reaches."""
+    torch.manual_seed(0)
+    generator = np.random.default_rng(0)
+    config = recipe_config(
+        'FetchReach',
+        'paper',
+        precision='float32',
+        gamma=0.0,
+        importance=importance,
+        learning_rate=3e-3,
+    )
+    shape = NetworkShape(10, 3, 1, (64, 64))
+    learner = DDPG(shape, config, torch.device('cpu'), Workers())
+    episodes = two_armed_gambles(2_000, generator)
+    sampler = TransitionSampler(
+        lambda achieved, goal: -1.0 * (np.abs(achieved - goal).max(axis=-1) > 0.5), gamma=0.0
+    )
+    for _ in range(500):
+        row = generator.integers(len(episodes), size=256)
+        learner.update(sampler.sample(episodes, row, mixture, generator))
+    goal = torch.tensor([[3.0, 0.0, 0.0]])
+    features = learner.actor.features(torch.tensor(episodes.observation[:1, 0]), goal)
+    with torch.no_grad():
+        return {
+            name: float(learner.critic(features, torch.tensor([[action]])))
+            for name, action in (('gamble', 1.0), ('walk', -1.0))
+        }
+
+
+def test_future_goals_make_a_gamble_a_sure_thing() -> None:
+    """In truth it reaches a goal once in five times: its value is -0.8."""
+    assert learnt_values('none', {'future': 1.0})['gamble'] == pytest.approx(0.0, abs=0.1)
+
+
+def test_goals_that_do_not_depend_on_the_landing_do_not() -> None:
+    assert learnt_values('none', {'real': 1.0})['gamble'] == pytest.approx(-0.8, abs=0.1)
+
+
+def test_weights_take_back_what_hindsight_does() -> None:
+    mixture = {'future': 0.5, 'real': 0.5}
+    biased, weighted = (learnt_values(kind, mixture) for kind in ('none', 'density'))
+    # Half of the gambles that go with this goal were chosen in hindsight: (0 - 0.8) / 2.
+    assert biased['gamble'] == pytest.approx(-0.4, abs=0.15)
+    assert weighted['gamble'] == pytest.approx(-0.8, abs=0.15)
+    assert weighted['walk'] == pytest.approx(-1.0, abs=0.1)
