@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from policy_node.policies import checkpoint
-from policy_node.training.evaluate_policy import FIRST_SEED
-from policy_node.training.evaluation.episodes import evaluate, wilson_interval
+from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, wilson_interval
 from policy_node.training.evaluation.evaluator import successes
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.run_folder import LATEST_FILE

@@ -31,7 +31,7 @@ def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -
 
     `runs.csv` (one row per run), `arms.csv` (medians and quartiles), `curves.csv` (every
     evaluation), `study.json` (command, machine, revisions, settings), `figure.png`, and the table
-    in `table.md` and between its marks in `README.md` where there is one.
+    between its marks in `README.md`, which is made where there is none.
 
     Args:
         study: The study.
@@ -63,9 +63,7 @@ def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -
         for task, group in curves.items()
     }
     draw(bands, labels, output / 'figure.png', paper_epochs=False)
-    table = format_table(study, arms)
-    (output / 'table.md').write_text(table)
-    _renew(output / 'README.md', table)
+    _renew(output / 'README.md', format_table(study, arms))
 
 
 def format_table(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
@@ -137,7 +135,7 @@ def _write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def _renew(page: Path, table: str) -> None:
     """Puts the table between its marks."""
-    text = page.read_text() if page.is_file() else ''
+    text = page.read_text() if page.is_file() else f'{BEGIN}\n{END}\n'
     if BEGIN in text and END in text:
         before, after = text.split(BEGIN)[0], text.split(END, 1)[1]
         page.write_text(f'{before}{BEGIN}\n{table}{END}{after}')

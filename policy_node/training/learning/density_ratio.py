@@ -54,16 +54,15 @@ class GoalView:
 
 
 class DensityRatio(nn.Module):
-    """The two classifiers and their optimiser."""
+    """The two classifiers and their optimiser.
+
+    Args:
+        feature_size: Length of the features of a state and a goal.
+        goal_size: Length of a goal.
+        action_size: Length of an action.
+    """
 
     def __init__(self, feature_size: int, goal_size: int, action_size: int) -> None:
-        """Builds them.
-
-        Args:
-            feature_size: Length of the features of a state and a goal.
-            goal_size: Length of a goal.
-            action_size: Length of an action.
-        """
         super().__init__()
         before = feature_size + action_size + goal_size + 1
         self.before = _classifier(before)

@@ -31,18 +31,16 @@ class GambleSimulation(Simulation):
     The landing is drawn as goals are, by the generator of the episode, whatever the goal of the
     episode is. From the gamble to the end of the episode the observation stays as it is then: the
     achieved goal at the landing, no velocities, fingers at 1 m. Physics go on beneath, unseen.
+
+    Args:
+        task: One of `GAMBLE_TASKS`.
+        **options: Those of `Simulation`.
+
+    Raises:
+        ValueError: If the task uses its gripper, or an option is not allowed.
     """
 
     def __init__(self, task: str, **options: Any) -> None:
-        """Prepares the copies.
-
-        Args:
-            task: One of `GAMBLE_TASKS`.
-            **options: Those of `Simulation`.
-
-        Raises:
-            ValueError: If the task uses its gripper, or an option is not allowed.
-        """
         if task not in GAMBLE_TASKS:
             allowed = ', '.join(GAMBLE_TASKS)
             raise ValueError(f'gamble: {task} uses its gripper; allowed: {allowed}')

@@ -24,6 +24,11 @@ REPLAY_SECONDS = 900.0
 class Saver:
     """Writes the files of a run, on one of several workers.
 
+    Args:
+        folder: Where they go.
+        config: Configuration of the run.
+        workers: This worker among all.
+
     Attributes:
         folder: Where they go.
     """
