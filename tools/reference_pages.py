@@ -19,7 +19,7 @@ from msgs_spec.tasks import TASKS
 from policy_node.training.learning import config
 from policy_node.training.learning.config import TrainConfig, recipe_config
 
-_COLUMNS = '100'
+_COLUMNS = '88'
 # One task for each group of equal values in the recipe `best`.
 _EXAMPLES = ('FetchPush', 'FetchSlide', 'HandReach', 'HandManipulateBlockRotateZ')
 
