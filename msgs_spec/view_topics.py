@@ -28,6 +28,11 @@ SHOWN = (
         frame=WORLD,
     ),
     TopicSpec('camera/image_raw', f'{_IMAGES}Image', 'A picture; while somebody subscribes.'),
+    TopicSpec(
+        'camera/image_raw/compressed',
+        f'{_IMAGES}CompressedImage',
+        'The same as JPEG, where `image_transport` looks for it; while somebody subscribes.',
+    ),
     TopicSpec('camera/camera_info', f'{_IMAGES}CameraInfo', 'Its calibration, of the same stamp.'),
 )
 

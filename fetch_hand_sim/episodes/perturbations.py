@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from msgs_spec.codecs import decode
@@ -12,6 +13,21 @@ from msgs_spec.topics import TopicSpec
 
 # Newton metres of torque for each newton of force: fingers are about as long, in metres.
 _LEVER = 0.1
+_WITHIN = 1.0 - 1e-9
+Array = NDArray[np.float64]
+
+
+def bounded_wrench(wrench: Array, limit: float) -> Array:
+    """Returns a wrench (6,) that is accepted: the same, or weaker along the same line.
+
+    Args:
+        wrench: N and N m.
+        limit: Largest force, N.
+    """
+    force, torque = np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])
+    share = max(float(force) / limit, float(torque) / (_LEVER * limit))
+    # A hair within the limit, whatever rounding does.
+    return wrench if share <= _WITHIN else wrench * (_WITHIN / share)
 
 
 def accept_perturbation(

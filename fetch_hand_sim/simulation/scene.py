@@ -34,7 +34,8 @@ _POINTER = np.array([0.1, 0.0, 0.0])
 # Where the position of a pose does not count, its ghost stands beside the hand, metres
 # (Gymnasium-Robotics draws it there too).
 GHOST_OFFSET = np.array([0.15, 0.0, 0.0])
-_GHOST = 'target'
+# Name of the body that shows a goal.
+GHOST = 'target'
 SHOWN_SITES = 0
 
 
@@ -139,7 +140,7 @@ class Scene:
         joints = [self.model.joint(name) for name in self.spec.robot.joints]
         self._joints = np.array([int(joint.qposadr[0]) for joint in joints])
         self._object = self._free_joint(self.spec.object_name)
-        self._ghost = self._free_joint(_GHOST if self.has_ghost else None)
+        self._ghost = self._free_joint(GHOST if self.has_ghost else None)
 
     @property
     def has_ghost(self) -> bool:
@@ -173,7 +174,7 @@ class Scene:
 
     def _shell(self, frame: Frame, color: Color) -> list[Marker]:
         """A tinted skin around the ghost."""
-        geom = self.model.geom(_GHOST)
+        geom = self.model.geom(GHOST)
         pose = ghost_pose(self.spec, frame.desired_goal)
         tint = (*color[:3], 2.0 * _HALO_OPACITY)
         size = _SHELL_SCALE * np.asarray(geom.size)

@@ -9,7 +9,7 @@ from pathlib import Path
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.summary import expand_episodes
 from fetch_hand_sim.view.announce import announce
-from fetch_hand_sim.view.page import Page
+from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.player import Player
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import open_page
@@ -28,10 +28,13 @@ def run_files(options: argparse.Namespace) -> int:
     """
     stop = StopSignals()
     try:
-        player = Player(find_playable(options.path))
+        paths = find_playable(options.path)
+        player = Player(paths)
     except EpisodeReadError as error:
         raise UsageError(str(error)) from None
-    handle, address = open_page(options.host, options.port, [Page(), Requests(player.perform)])
+    handle, address = open_page(
+        options.host, options.port, [Page(tuple(paths)), Requests(player.perform)]
+    )
     try:
         announce(address, options.browser)
         session = Session(handle, player)

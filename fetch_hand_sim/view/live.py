@@ -128,12 +128,13 @@ class LiveRobot:
         for status in message.status:
             if status.name == self._sim_name:
                 values = {pair.key: pair.value for pair in status.values}
+                self._requests.push_limit = _number(values.get('perturb limit (N)'))
                 self._update_facts(
                     is_paused=values.get('paused') == 'True',
                     rate=_number(values.get('rate (Hz)')),
                     missed_ticks=int(_number(values.get('missed ticks'))),
                     commander=values.get('commanders', '-'),
-                    push_limit=_number(values.get('perturb limit (N)')),
+                    push_limit=self._requests.push_limit,
                 )
 
     def _update_facts(self, **changes: Any) -> None:

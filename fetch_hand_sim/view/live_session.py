@@ -19,7 +19,7 @@ from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.view.announce import announce
 from fetch_hand_sim.view.live import LiveRobot
-from fetch_hand_sim.view.page import Page
+from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import open_page
 from msgs_spec.ros import EventLoop, NodeFailure, StopSignals, run_node

@@ -222,7 +222,7 @@ class ReleaseGoal(Request):
 
 @dataclass(frozen=True, eq=False)
 class Push(LatestRequest):
-    """A pull at a body, as long as it is sent.
+    """A pull at a body, as long as it is sent; what is beyond the robot's limit is made less.
 
     Attributes:
         body: Name of the body.
@@ -245,6 +245,13 @@ class ChangeEpisode(Request):
     """Opens another episode of the list, relative to this one."""
 
     by: int
+
+
+@dataclass(frozen=True)
+class OpenEpisode(Request):
+    """Opens an episode of the list by its number, from 0."""
+
+    number: int
 
 
 @dataclass(frozen=True, eq=False)

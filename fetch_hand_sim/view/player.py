@@ -18,6 +18,7 @@ from fetch_hand_sim.view.messages import (
     ChangeEpisode,
     Facts,
     LatestRequest,
+    OpenEpisode,
     Picture,
     Request,
     Seek,
@@ -93,6 +94,8 @@ class Player:
                 self._show(request.index)
             case ChangeEpisode():
                 self._change(request.by)
+            case OpenEpisode():
+                self._choose(request.number)
 
     def _set_paused(self, is_paused: bool) -> None:
         self._is_paused = is_paused
@@ -105,20 +108,29 @@ class Player:
 
     def _change(self, by: int) -> None:
         """Opens the next episode that can be read."""
-        number = self._number
+        number, skipped = self._number, ''
         for _ in self._paths:
             number = (number + by) % len(self._paths)
             try:
                 self._open(number)
             except EpisodeReadError as error:
-                self._notice = f'skipped {error}'
+                skipped = f'skipped {error}'
                 continue
+            self._notice = skipped
             return
+
+    def _choose(self, number: int) -> None:
+        """Opens an episode, or says why not and stays."""
+        if not 0 <= number < len(self._paths):
+            return
+        try:
+            self._open(number)
+        except EpisodeReadError as error:
+            self._notice = str(error)
 
     def _open(self, number: int) -> None:
         self._recording = recording = load_recording(self._paths[number])
-        self._number = number
-        self._position = 0.0
+        self._number, self._position, self._notice = number, 0.0, ''
         arrays = recording.arrays
         curves = Curves(recording.spec, recording.metric, length=len(recording.frames))
         for tick, frame in enumerate(recording.frames):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from fetch_hand_sim.episodes.perturbations import bounded_wrench
 from fetch_hand_sim.view.messages import (
     ChooseActor,
     LatestRequest,
@@ -39,7 +40,11 @@ _GOAL_PATIENCE = 0.5
 
 
 class RobotRequests:
-    """Passes on what the page asks for."""
+    """Passes on what the page asks for.
+
+    Attributes:
+        push_limit: Largest force that the robot takes, N; 0 for none.
+    """
 
     def __init__(self, node: Node, tell: Callable[..., None]) -> None:
         """Connects to the nodes in the namespace of ours.
@@ -53,6 +58,7 @@ class RobotRequests:
         self._sim = RemoteNode(node, 'sim_node', self._notice)
         self._policy = RemoteNode(node, 'policy_node', self._notice)
         self._spec: TaskSpec | None = None
+        self.push_limit = 0.0
         self._is_commanding = False
         self._kept_goal: Array | None = None
         self._asked_goal: tuple[float, Array] | None = None
@@ -147,8 +153,12 @@ class RobotRequests:
 
     def _push(self, request: Push) -> None:
         assert self._spec is not None
+        if not self.push_limit:
+            self._notice('pushes are off; start the robot with perturb_limit:=10.0 (N)')
+            return
         target = topic(self._spec, 'perturb')
-        message = build_message(target, 0, request.wrench)
+        wrench = bounded_wrench(request.wrench, self.push_limit)
+        message = build_message(target, 0, wrench)
         message.header.frame_id = request.body
         self._send('perturb', serialize(target.type_name, message))
 

@@ -8,7 +8,8 @@ from typing import Protocol
 from mujoco.studio import messages, plugin, viewer_handle
 
 from fetch_hand_sim.simulation.scene import Scene
-from fetch_hand_sim.view.messages import LatestRequest, Picture, Request, ShowScene
+from fetch_hand_sim.view.messages import LatestRequest, Picture, Push, Request, ShowScene
+from fetch_hand_sim.view.page.body_drag import pulls
 
 
 class Source(Protocol):
@@ -22,9 +23,10 @@ class Source(Protocol):
 
 
 class Requests(plugin.SimPlugin):
-    """Hands what the page asks for to a source, and drops what the viewer's own tools send.
+    """Hands what the page asks for to a source.
 
-    They would change a model that is only looked at.
+    What the viewer's own tools send would change a model that is only looked at: pulls at bodies
+    are passed on, all else is dropped.
     """
 
     def __init__(self, perform: Callable[[Request | LatestRequest], None]) -> None:
@@ -50,7 +52,9 @@ class Requests(plugin.SimPlugin):
 
     @messages.handler
     def on_perturb(self, event: messages.PerturbSnapshot) -> bool:
-        """Drops."""
+        """Passes on who is pulled at, and how hard."""
+        for body, wrench in pulls(self.handle.model, event):
+            self._perform(Push(body, wrench))
         return True
 
     @messages.handler

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from io import BytesIO
 
 import mujoco
 import numpy as np
+import PIL.Image
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Quaternion, TransformStamped, Vector3
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -27,6 +29,10 @@ _SHAPES = {
     # There is no capsule.
     _GEOM.mjGEOM_CAPSULE.value: Marker.CYLINDER,
 }
+
+_JPEG_QUALITY = 85
+# As `compressed_image_transport` has it: encoding of the raw picture; that of the decoded one.
+_JPEG_FORMAT = 'rgb8; jpeg compressed bgr8'
 
 
 def stamp(nanoseconds: int) -> Time:
@@ -78,6 +84,17 @@ def image_message(picture: NDArray[np.uint8], frame_id: str, stamp_ns: int) -> I
         step=3 * width,
     )
     message.data.frombytes(np.ascontiguousarray(picture).tobytes())
+    return message
+
+
+def compressed_message(picture: NDArray[np.uint8], frame_id: str, stamp_ns: int) -> CompressedImage:
+    """Returns a picture (height, width, 3), red first, as JPEG."""
+    file = BytesIO()
+    PIL.Image.fromarray(picture).save(file, 'JPEG', quality=_JPEG_QUALITY)
+    message = CompressedImage(
+        header=Header(stamp=stamp(stamp_ns), frame_id=frame_id), format=_JPEG_FORMAT
+    )
+    message.data.frombytes(file.getvalue())
     return message
 
 

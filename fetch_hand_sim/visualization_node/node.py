@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.node import Node
 
 from fetch_hand_sim.simulation.scene import Scene
@@ -13,6 +16,7 @@ from fetch_hand_sim.visualization_node import NODE_NAME
 from fetch_hand_sim.visualization_node.camera import Camera
 from fetch_hand_sim.visualization_node.messages import (
     camera_info,
+    compressed_message,
     image_message,
     marker_array,
     transform_messages,
@@ -39,6 +43,10 @@ from msgs_spec.topics import TopicSpec
 from msgs_spec.view_topics import SHOWN, scalar_topics
 
 _CAMERA_FRAME = 'camera'
+_PICTURES: dict[str, Callable[[NDArray[np.uint8], str, int], Any]] = {
+    'camera/image_raw': image_message,
+    'camera/image_raw/compressed': compressed_message,
+}
 # Callbacks served before a picture is drawn, which takes as long as some ticks do.
 _SERVED_FIRST = 200
 
@@ -146,17 +154,20 @@ class VisualizationNode(Node):
         if self._has_listener('goal_markers'):
             markers = marker_array(scene.markers(tick.frame), tick.stamp_ns)
             self._outputs['goal_markers'].publish(markers)
-        if self._has_listener('camera/image_raw') and self._camera.is_due:
-            self._take_photo(scene, tick)
+        wanted = [name for name in _PICTURES if self._has_listener(name)]
+        if wanted and self._camera.is_due:
+            self._take_photo(scene, tick, wanted)
 
-    def _take_photo(self, scene: Scene, tick: SeenTick) -> None:
+    def _take_photo(self, scene: Scene, tick: SeenTick, wanted: list[str]) -> None:
         try:
             picture = self._camera.render(scene, tick.frame)
         except RuntimeError as error:
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
-        name = self._prefix + _CAMERA_FRAME
+        frame_id = self._prefix + _CAMERA_FRAME
         camera, fovy = self._camera, float(scene.model.vis.global_.fovy)
-        info = camera_info(camera.width, camera.height, fovy, name, tick.stamp_ns)
-        self._outputs['camera/image_raw'].publish(image_message(picture, name, tick.stamp_ns))
+        info = camera_info(camera.width, camera.height, fovy, frame_id, tick.stamp_ns)
+        for name in wanted:
+            message = _PICTURES[name](picture, frame_id, tick.stamp_ns)
+            self._outputs[name].publish(message)
         self._outputs['camera/camera_info'].publish(info)

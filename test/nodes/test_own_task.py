@@ -73,7 +73,7 @@ VIEW = """
 import os
 os.environ['MUJOCO_GL'] = 'egl'
 import gymnasium
-from fetch_hand_sim.view.panels import introduction
+from fetch_hand_sim.view.page.introduction import introduction
 from msgs_spec.tasks import task_spec
 
 print(introduction(task_spec('FetchReachOriented')))

@@ -9,8 +9,10 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from io import BytesIO
 
 import numpy as np
+import PIL.Image
 import pytest
 import rclpy
 
@@ -139,7 +141,7 @@ def test_a_viewer_that_dies_or_hangs_is_not_noticed(start_process: Start, number
 
 
 def test_standard_tools_get_what_they_need(start_process: Start) -> None:
-    from sensor_msgs.msg import CameraInfo, Image
+    from sensor_msgs.msg import CameraInfo, CompressedImage, Image
     from std_msgs.msg import String
     from visualization_msgs.msg import MarkerArray
 
@@ -174,6 +176,14 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
         connection.spin_until(lambda: 'camera/image_raw' in received, 'picture')
         picture = np.array(received['camera/image_raw'].data).reshape(48, 64, 3)
         assert picture.std() > 10.0
+        info = received['camera/camera_info']
+        assert (info.width, info.height) == (64, 48)
+        assert connection.node.count_subscribers('camera/image_raw/compressed') == 0
+        subscribe(CompressedImage, 'camera/image_raw/compressed', STATE)
+        connection.spin_until(lambda: 'camera/image_raw/compressed' in received, 'JPEG')
+        data = bytes(received['camera/image_raw/compressed'].data)
+        small = np.asarray(PIL.Image.open(BytesIO(data)))
+        assert small.shape == picture.shape and small.std() > 10.0
     node.send_signal(signal.SIGINT)
     assert node.wait(10) == 0
 

@@ -34,6 +34,10 @@ def find_browser() -> str | None:
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
+_CONTROL = 2
+_KEY_CODES = {'Control': 17, 'ArrowLeft': 37, 'ArrowUp': 38, 'ArrowRight': 39, 'ArrowDown': 40}
+
+
 class Browser:
     """One window with one page."""
 
@@ -59,6 +63,7 @@ class Browser:
         # Drawing without a GPU keeps the page from answering for a while.
         self._socket = connect(pages[0]['webSocketDebuggerUrl'], max_size=None, ping_interval=None)
         self._number = 0
+        self._modifiers = 0
         self.events: list[dict[str, Any]] = []
         for domain in ('Page', 'Network', 'Runtime'):
             self.call(f'{domain}.enable')
@@ -113,7 +118,14 @@ class Browser:
 
     def move(self, x: float, y: float, pressed: bool = False) -> None:
         button = {'button': 'left', 'buttons': 1} if pressed else {'button': 'none', 'buttons': 0}
-        self.call('Input.dispatchMouseEvent', type='mouseMoved', x=x, y=y, **button)
+        self.call(
+            'Input.dispatchMouseEvent',
+            type='mouseMoved',
+            x=x,
+            y=y,
+            modifiers=self._modifiers,
+            **button,
+        )
         self.wait(0.1)
 
     def press(self, x: float, y: float) -> None:
@@ -121,6 +133,26 @@ class Browser:
 
     def release(self, x: float, y: float) -> None:
         self._button('mouseReleased', x, y, 0)
+
+    def press_key(self, key: str) -> None:
+        """Presses a key and holds it: `Control` or one of the arrows."""
+        self._key('rawKeyDown', key)
+
+    def release_key(self, key: str) -> None:
+        self._key('keyUp', key)
+
+    def _key(self, kind: str, key: str) -> None:
+        if key == 'Control':
+            self._modifiers = 0 if kind == 'keyUp' else _CONTROL
+        self.call(
+            'Input.dispatchKeyEvent',
+            type=kind,
+            key=key,
+            code='ControlLeft' if key == 'Control' else key,
+            windowsVirtualKeyCode=_KEY_CODES[key],
+            modifiers=self._modifiers,
+        )
+        self.wait(0.25)
 
     def click(self, x: float, y: float) -> None:
         self.move(x, y)
@@ -137,6 +169,7 @@ class Browser:
             button='left',
             buttons=buttons,
             clickCount=1,
+            modifiers=self._modifiers,
         )
         self.wait(0.25)
 

@@ -8,7 +8,7 @@ import pytest
 from fetch_hand_sim.commands.check_episode import main as check_episode
 from fetch_hand_sim.episode_log import read_episode
 from fetch_hand_sim.episodes.context import RecordingContext
-from fetch_hand_sim.episodes.perturbations import accept_perturbation
+from fetch_hand_sim.episodes.perturbations import accept_perturbation, bounded_wrench
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
@@ -130,3 +130,22 @@ def test_a_logged_episode_says_so_and_the_check_pushes_as_well(simulation, tmp_p
     assert episode.metadata['perturb_limit'] == '10.0'
     assert len(episode.topics['/perturb'].messages) == 3
     assert check_episode([str(path)]) == 0, capsys.readouterr()
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_a_wrench_that_was_bounded_is_taken_and_keeps_its_line(simulation, seed):
+    wrench = np.random.default_rng(seed).normal(scale=10.0 ** (seed % 5 - 1), size=6)
+    bounded = bounded_wrench(wrench, LIMIT)
+    accept_perturbation(
+        started(simulation),
+        topic(simulation.spec, 'perturb'),
+        push('FetchPush', 'object0', *bounded),
+        LIMIT,
+    )
+    share = bounded @ wrench / (wrench @ wrench)
+    assert 0.0 < share <= 1.0
+    np.testing.assert_allclose(bounded, share * wrench, rtol=1e-12)
+    # No weaker than it has to be.
+    if share < 1.0:
+        force, torque = np.linalg.norm(bounded[:3]), np.linalg.norm(bounded[3:])
+        assert max(force / LIMIT, torque / (0.1 * LIMIT)) == pytest.approx(1.0)

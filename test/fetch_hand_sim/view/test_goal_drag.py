@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation.scene import Scene, ghost_pose
-from fetch_hand_sim.view.goal_drag import find_handle, handles, moved_goal
-from fetch_hand_sim.view.ray import mouse_ray
+from fetch_hand_sim.view.page.goal_drag import find_handle, handles, moved_goal
+from fetch_hand_sim.view.page.ray import mouse_ray
 from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TASKS
 

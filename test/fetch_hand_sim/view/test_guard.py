@@ -10,7 +10,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from fetch_hand_sim.view.guard import Guard, is_loopback
-from fetch_hand_sim.view.page import Page
+from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests
 from fetch_hand_sim.view.web import CannotServe, open_page
 

@@ -20,7 +20,7 @@ from PIL import Image
 
 from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.simulation.scene import Scene
-from fetch_hand_sim.view.ray import mouse_ray
+from fetch_hand_sim.view.page.ray import mouse_ray
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode
 from msgs_spec.tasks import TASKS

@@ -11,7 +11,14 @@ from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.films.recording import load_recording
 from fetch_hand_sim.view.file_session import find_playable
-from fetch_hand_sim.view.messages import ChangeEpisode, Seek, SetPaused, SetSpeed, StepOnce
+from fetch_hand_sim.view.messages import (
+    ChangeEpisode,
+    OpenEpisode,
+    Seek,
+    SetPaused,
+    SetSpeed,
+    StepOnce,
+)
 from fetch_hand_sim.view.player import Player
 from msgs_spec.tasks import TASKS
 from support.episode_recorder import Recorder
@@ -116,6 +123,25 @@ def test_what_cannot_be_read_is_skipped_and_said(folder, tmp_path, clock):
     picture = player.picture()
     assert picture.timeline.number == 2
     assert 'damaged.mcap' in picture.facts.notice
+
+
+def test_an_episode_is_chosen_by_its_number(player):
+    player.perform(OpenEpisode(2))
+    assert player.picture().timeline.number == 2
+    player.perform(OpenEpisode(7))
+    assert player.picture() is None
+
+
+def test_choosing_what_cannot_be_read_stays_and_says_why(folder, tmp_path, clock):
+    damaged = tmp_path / 'damaged.mcap'
+    damaged.write_bytes(b'nothing')
+    player = Player([*find_playable(folder), damaged], clock)
+    player.perform(OpenEpisode(3))
+    picture = player.picture()
+    assert picture.timeline.number == 0
+    assert 'damaged.mcap' in picture.facts.notice
+    player.perform(OpenEpisode(1))
+    assert player.picture().facts.notice == ''
 
 
 def test_curves_end_at_the_playhead(player):

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from io import BytesIO
+
 import mujoco
 import numpy as np
+import PIL.Image
 import pytest
 from builtin_interfaces.msg import Time
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from visualization_msgs.msg import Marker, MarkerArray
 
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rendering import simulation_frame
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.simulation.urdf import ROOT, Pose
-from fetch_hand_sim.view.ray import mouse_ray
+from fetch_hand_sim.view.page.ray import mouse_ray
 from fetch_hand_sim.visualization_node.camera import Camera
 from fetch_hand_sim.visualization_node.messages import (
     camera_info,
+    compressed_message,
     image_message,
     marker_array,
     transform_messages,
@@ -101,6 +105,19 @@ def test_an_image_keeps_its_pixels():
     message = deserialize_message(serialize_message(image_message(picture, 'camera', STAMP)), Image)
     assert (message.height, message.width, message.step) == (6, 8, 24)
     np.testing.assert_array_equal(np.array(message.data).reshape(6, 8, 3), picture)
+
+
+def test_a_compressed_image_is_the_same_picture():
+    shades = np.linspace(0.0, 255.0, 64)
+    colors = np.stack([shades, shades[::-1], np.full(64, 90.0)], axis=1)
+    picture = np.tile(colors.astype(np.uint8), (48, 1, 1))
+    data = serialize_message(compressed_message(picture, 'camera', STAMP))
+    message = deserialize_message(data, CompressedImage)
+    assert message.format == 'rgb8; jpeg compressed bgr8'
+    assert message.header.stamp == Time(sec=3, nanosec=7)
+    found = np.asarray(PIL.Image.open(BytesIO(bytes(message.data))))
+    assert len(message.data) < picture.nbytes / 4
+    np.testing.assert_allclose(found.astype(int), picture, atol=16)
 
 
 def test_the_camera_says_where_a_point_is_seen():

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.messages import LatestRequest, Push, Request
+from fetch_hand_sim.view.messages import Push
+from fetch_hand_sim.view.page.windows import ITEM_WIDTH, Send
 from msgs_spec.tasks import TaskSpec
-
-Send = Callable[[Request | LatestRequest], None]
 
 
 def pushable_bodies(spec: TaskSpec) -> list[str]:
@@ -36,16 +33,14 @@ class PushPanel:
             limit: Largest force, N.
         """
         bodies = pushable_bodies(spec)
-        imgui.SetNextItemWidth(210.0)
+        imgui.SetNextItemWidth(ITEM_WIDTH)
         self._body = imgui.Combo('body', min(self._body, len(bodies) - 1), bodies)[1]
         for axis, name in enumerate('xyz'):
-            imgui.SetNextItemWidth(210.0)
+            imgui.SetNextItemWidth(ITEM_WIDTH)
             value = float(self._force[axis])
             self._force[axis] = imgui.SliderFloat(f'{name} (N)', value, -limit, limit)[1]
         length = float(np.linalg.norm(self._force))
         imgui.Button(f'Push with {min(length, limit):.1f} N while held')
         if imgui.IsItemActive() and length > 0.0:
-            # A hair within the limit, whatever rounding does.
-            force = self._force * min(1.0, 0.999 * limit / length)
-            wrench = np.concatenate([force, np.zeros(3)])
+            wrench = np.concatenate([self._force, np.zeros(3)])
             self._send(Push(bodies[self._body], wrench))

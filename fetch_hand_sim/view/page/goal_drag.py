@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.scene import ghost_pose
-from fetch_hand_sim.view.ray import Ray
+from fetch_hand_sim.view.page.ray import Ray
 from msgs_spec.rotations import quaternion_from_axis_angle, quaternion_multiply
 from msgs_spec.tasks import GoalKind, TaskSpec
 

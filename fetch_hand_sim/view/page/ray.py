@@ -11,6 +11,21 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
+class MousePlace:
+    """Where the mouse is.
+
+    Attributes:
+        x: 0 ... 1 from the left.
+        y: 0 ... 1 from the top.
+        aspect: Width of the picture divided by its height.
+    """
+
+    x: float
+    y: float
+    aspect: float
+
+
+@dataclass(frozen=True, slots=True)
 class Ray:
     """A half line, and the axes of the camera it comes from.
 

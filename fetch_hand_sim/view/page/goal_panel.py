@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from numpy.typing import NDArray
 
-from fetch_hand_sim.view.messages import LatestRequest, ReleaseGoal, Request, SetGoal
+from fetch_hand_sim.view.messages import ReleaseGoal, SetGoal
+from fetch_hand_sim.view.page.windows import ITEM_WIDTH, Send
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler
 from msgs_spec.tasks import GoalKind, TaskSpec
 
 Array = NDArray[np.float64]
-Send = Callable[[Request | LatestRequest], None]
 
 # Where goals make sense, metres: about where the tasks draw theirs.
 _FETCH_RANGES = ((1.05, 1.6), (0.4, 1.1), (0.42, 0.9))
@@ -37,7 +35,7 @@ def draw_goal_sliders(spec: TaskSpec, goal: Array, is_kept: bool, send: Send) ->
         for axis, (name, (lower, upper)) in enumerate(
             zip('xyz', position_ranges(spec), strict=True)
         ):
-            imgui.SetNextItemWidth(210.0)
+            imgui.SetNextItemWidth(ITEM_WIDTH)
             changed[axis] = imgui.SliderFloat(f'{name} (m)', float(goal[axis]), lower, upper)[1]
     if spec.goal is GoalKind.POSE:
         changed[3:] = _draw_angles(spec, goal[3:])
@@ -53,7 +51,7 @@ def _draw_angles(spec: TaskSpec, quaternion: Array) -> Array:
     axes = (2,) if spec.name == 'HandManipulateBlockRotateZ' else (0, 1, 2)
     has_changed = False
     for axis in axes:
-        imgui.SetNextItemWidth(210.0)
+        imgui.SetNextItemWidth(ITEM_WIDTH)
         degrees = float(np.degrees(angles[axis]))
         moved, degrees = imgui.SliderFloat(f'about {"xyz"[axis]} (deg)', degrees, -180.0, 180.0)
         if moved:

@@ -1,0 +1,173 @@
+"""The page: scene, panels and mouse, as a plugin of MuJoCo's viewer."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from mujoco.studio import messages, plugin, ux
+from mujoco.studio.dear_imgui import dear_imgui as imgui
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.rendering import make_options
+from fetch_hand_sim.simulation.scene import Frame, Scene
+from fetch_hand_sim.view.messages import LatestRequest, Picture, Request, SetGoal, ShowScene
+from fetch_hand_sim.view.page.body_drag import BodyDrag
+from fetch_hand_sim.view.page.goal_drag import Handle, find_handle, moved_goal
+from fetch_hand_sim.view.page.introduction import drag_hint
+from fetch_hand_sim.view.page.panels import Panels
+from fetch_hand_sim.view.page.ray import MousePlace, Ray, mouse_ray
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(slots=True)
+class _GoalDrag:
+    """A goal that the mouse holds."""
+
+    handle: Handle
+    goal: Array
+    started: MousePlace
+
+
+class Page(plugin.ViewerPlugin):
+    """Draws what pictures say and sends what people do."""
+
+    def __init__(self, episodes: tuple[Path, ...] = ()) -> None:
+        """Shows nothing yet.
+
+        Args:
+            episodes: Files to choose from, where files are played.
+        """
+        self._scene: Scene | None = None
+        self._picture: Picture | None = None
+        self._panels = Panels(self._send, episodes)
+        self._goal_drag: _GoalDrag | None = None
+        self._body_drag: BodyDrag | None = None
+
+    def _send(self, request: Request | LatestRequest) -> None:
+        self.viewer.send_to_sim(request)
+
+    # What arrives
+
+    @messages.handler
+    def on_viewer_init(self, event: plugin.ViewerInitEvent) -> None:
+        """Sets the looks of the page."""
+        ux.setup_theme(ux.GuiTheme.LIGHT)
+        event.viewer.vis_options = make_options()
+        self._body_drag = BodyDrag(event.viewer.perturb)
+
+    @messages.handler
+    def on_scene(self, event: ShowScene) -> None:
+        """Takes another robot; its model follows."""
+        self._scene, self._picture, self._goal_drag = event.scene, None, None
+
+    @messages.handler
+    def on_post_model(self, event: messages.PostModelEvent) -> None:
+        """Looks at the robot from where it is seen best."""
+        del event
+        if self._body_drag is not None:
+            self._body_drag.end(self.viewer.data)
+        if self._scene is not None:
+            self._scene.view.apply(self.viewer.camera)
+
+    @messages.handler
+    def on_picture(self, picture: Picture) -> None:
+        """Takes what is to be shown."""
+        self._picture = picture
+
+    @messages.handler
+    def on_theme(self, event: plugin.ThemeEvent) -> None:
+        """Follows the visitor's choice of colours."""
+        ux.setup_theme(event.theme)
+
+    # What is drawn
+
+    @messages.handler
+    def on_update(self, event: messages.UpdateEvent) -> None:
+        """Follows the mouse and draws the markers."""
+        del event
+        self._follow_mouse()
+        picture = self._picture
+        markers = []
+        if self._scene is not None and picture is not None and picture.frame is not None:
+            markers = self._scene.markers(picture.frame, picture.trail)
+        geoms = self.viewer.extra_geoms
+        while len(geoms) < len(markers):
+            geoms.append(mujoco.MjvGeom())
+        del geoms[len(markers) :]
+        for geom, marker in zip(geoms, markers, strict=True):
+            marker.draw(geom)
+
+    @messages.handler
+    def on_build_gui(self, event: messages.BuildGuiEvent) -> None:
+        """Draws the panels."""
+        del event
+        self._panels.draw(self._picture)
+
+    # The mouse
+
+    def _follow_mouse(self) -> None:
+        picture, scene, body_drag = self._picture, self._scene, self._body_drag
+        size = imgui.GetIO().DisplaySize
+        if scene is None or picture is None or picture.frame is None or size.y <= 0:
+            return
+        if body_drag is None or not picture.facts.may_command or picture.facts.source != 'live':
+            return
+        mouse = imgui.GetIO().MousePos
+        place = MousePlace(mouse.x / size.x, mouse.y / size.y, size.x / size.y)
+        if body_drag.is_pulling:
+            self._pull(body_drag)
+        elif self._goal_drag is not None:
+            self._move_goal(scene, self._goal_drag, place)
+        elif not (
+            imgui.IsAnyItemHovered() or imgui.IsWindowHovered(int(imgui.HoveredFlags.AnyWindow))
+        ):
+            if not imgui.GetIO().KeyCtrl:
+                self._offer_goal(scene, picture.frame, place)
+            elif picture.facts.push_limit and imgui.IsMouseClicked(imgui.MouseButton.Left):
+                self._take_body(body_drag, place, picture.facts.push_limit)
+
+    def _take_body(self, drag: BodyDrag, place: MousePlace, limit: float) -> None:
+        viewer, ray = self.viewer, self._ray(place)
+        if drag.begin(viewer.model, viewer.data, viewer.camera, viewer.vis_options, ray, limit):
+            imgui.SetNextFrameWantCaptureMouse(True)
+
+    def _pull(self, drag: BodyDrag) -> None:
+        viewer, io = self.viewer, imgui.GetIO()
+        if not imgui.IsMouseDown(imgui.MouseButton.Left):
+            drag.end(viewer.data)
+            return
+        # Else the browser would turn the camera.
+        imgui.SetNextFrameWantCaptureMouse(True)
+        delta = (io.MouseDelta.x / io.DisplaySize.x, io.MouseDelta.y / io.DisplaySize.y)
+        viewer.send_to_sim(drag.move(viewer.model, viewer.data, viewer.camera, delta))
+
+    def _offer_goal(self, scene: Scene, frame: Frame, place: MousePlace) -> None:
+        handle = find_handle(scene.spec, frame.desired_goal, self._ray(place))
+        if handle is None:
+            return
+        imgui.SetNextFrameWantCaptureMouse(True)
+        imgui.SetMouseCursor(imgui.MouseCursor.Hand)
+        imgui.SetTooltip(drag_hint(scene.spec))
+        if imgui.IsMouseClicked(imgui.MouseButton.Left):
+            self._goal_drag = _GoalDrag(handle, frame.desired_goal.copy(), place)
+
+    def _move_goal(self, scene: Scene, drag: _GoalDrag, place: MousePlace) -> None:
+        imgui.SetNextFrameWantCaptureMouse(True)
+        if not imgui.IsMouseDown(imgui.MouseButton.Left):
+            self._goal_drag = None
+            return
+        delta = np.array([place.x - drag.started.x, place.y - drag.started.y])
+        if delta.any():
+            is_turning, ray = not imgui.GetIO().KeyShift, self._ray(place)
+            goal = moved_goal(scene.spec, drag.goal, drag.handle, ray, is_turning, delta)
+            self._send(SetGoal(goal, is_kept=self._panels.keeps_goal))
+
+    def _ray(self, place: MousePlace) -> Ray:
+        camera = self.viewer.camera
+        view = (np.array(camera.lookat), camera.distance, camera.azimuth, camera.elevation)
+        fovy = float(self.viewer.model.vis.global_.fovy)
+        return mouse_ray(view, fovy, (place.x, place.y), place.aspect)
