@@ -109,6 +109,26 @@ def test_launch_file_starts_what_setup_py_installs():
     assert all(arg.get('description') for arg in LAUNCH.findall('arg'))
 
 
+def test_what_is_only_looked_at_runs_on_and_is_not_logged():
+    """The arguments that view.launch.xml gives to demo.launch.xml, by its defaults."""
+    root = ElementTree.parse(ROOT / 'launch' / 'view.launch.xml').getroot()
+    defaults = {arg.get('name'): arg.get('default') for arg in root.findall('arg')}
+    given = {
+        arg.get('name'): re.sub(r'\$\(var (\w+)\)', lambda m: defaults[m[1]], arg.get('value'))
+        for arg in root.find('include').findall('arg')
+    }
+    values = parameters_of('sim_node', **given)
+    assert (values['task'], values['episodes'], values['episode_dir']) == (
+        'HandManipulateBlockRotateZ',
+        0,
+        '',
+    )
+    assert values['wait_for_commands'] is True
+    assert parameters_of('policy_node', **given)['task'] == 'HandManipulateBlockRotateZ'
+    logged = parameters_of('sim_node', **given | {'episode_dir': 'there'})
+    assert logged['episode_dir'] == 'there'
+
+
 @pytest.mark.parametrize('node', SPECS)
 def test_parameter_file_holds_the_defaults(node):
     nodes = yaml.safe_load((ROOT / 'config' / 'sim_node.yaml').read_text())

@@ -47,3 +47,35 @@ def test_foxglove_shows_topics_that_there_are():
     assert shown <= ROBOT | PUBLISHED
     placed = set(re.findall(r'"(\w+!\w+)"', json.dumps(layout['layout'])))
     assert placed == set(panels)
+
+
+def test_foxglove_gets_what_its_panels_read():
+    """The keys that its 3D and Plot panels keep in layouts, by its last open source and exports."""
+    layout = json.loads((ROOT / 'config/foxglove_layout.json').read_text())
+    assert set(layout) == {
+        'configById',
+        'globalVariables',
+        'userNodes',
+        'playbackConfig',
+        'layout',
+    }
+    panels = layout['configById']
+    assert {name.partition('!')[0] for name in panels} == {'3D', 'Plot', 'DiagnosticSummary'}
+    for identity, layer in panels['3D!robot']['layers'].items():
+        assert layer['instanceId'] == identity
+        assert layer['sourceType'] == 'topic' and layer['displayMode'] == 'visual'
+        assert layer['framePrefix'] == '' and layer['frameLocked'] and layer['visible']
+    sizes = {'target': 3, 'targetOffset': 3, 'targetOrientation': 4}
+    camera = panels['3D!robot']['cameraState']
+    assert {name: len(camera[name]) for name in sizes} == sizes
+    for plot in (config for name, config in panels.items() if name.startswith('Plot')):
+        for path in plot['paths']:
+            has_stamp = path['value'].startswith('/scalars/')
+            assert path['timestampMethod'] == ('headerStamp' if has_stamp else 'receiveTime')
+            assert path['enabled'] is True
+    children = [layout['layout']]
+    while children:
+        child = children.pop()
+        if isinstance(child, dict):
+            assert child['direction'] in ('row', 'column')
+            children += [child['first'], child['second']]
