@@ -12,7 +12,6 @@ import time
 import webbrowser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from mujoco.studio import (
     endpoints,
@@ -168,6 +167,13 @@ def has_display() -> bool:
     return bool(os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
 
 
-def open_browser(url: str, browser: Callable[[str], Any] = webbrowser.open) -> None:
-    """Opens a page without waiting for the browser."""
-    threading.Thread(target=browser, args=(url,), daemon=True).start()
+def open_browser(url: str, browser: Callable[[str], bool] = webbrowser.open) -> threading.Thread:
+    """Opens a page without waiting for the browser; says so where there is none."""
+
+    def open_it() -> None:
+        if not browser(url):
+            print('No browser was found: open the address in one', flush=True)
+
+    thread = threading.Thread(target=open_it, daemon=True)
+    thread.start()
+    return thread

@@ -10,6 +10,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import PIL.Image
@@ -173,7 +174,8 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
             pytest.skip(str(error))
         subscribe(Image, 'camera/image_raw', STATE)
         subscribe(CameraInfo, 'camera/camera_info', STATE)
-        connection.spin_until(lambda: 'camera/image_raw' in received, 'picture')
+        wanted = {'camera/image_raw', 'camera/camera_info'}
+        connection.spin_until(lambda: wanted <= received.keys(), 'picture')
         picture = np.array(received['camera/image_raw'].data).reshape(48, 64, 3)
         assert picture.std() > 10.0
         info = received['camera/camera_info']
@@ -218,9 +220,10 @@ def test_scalars_are_those_of_the_tick_with_their_stamp(start_process: Start) ->
             for name in ('achieved_goal', 'desired_goal')
         }
     end(node)
-    stamps = sorted(set(seen['scalars/distance']) & set(goals['achieved_goal']))
-    # A tick is 40 ms, and all come; a machine that is busy may lose one of them.
-    assert len(stamps) > 0.95 * (stamps[-1] - stamps[0]) / 40e6 > 95.0
+    # Of a desired_goal only the last is kept for a client that is late.
+    stamps = sorted(set.intersection(*map(set, [seen['scalars/distance'], *goals.values()])))
+    # A tick is 40 ms, and all come; a machine that is busy may lose some of them.
+    assert len(stamps) > 0.8 * (stamps[-1] - stamps[0]) / 40e6 > 80.0
     for stamp in stamps[:-1]:
         achieved, desired = goals['achieved_goal'][stamp], goals['desired_goal'][stamp]
         distance, rotation = metric.distances(achieved, desired)
@@ -229,8 +232,20 @@ def test_scalars_are_those_of_the_tick_with_their_stamp(start_process: Start) ->
         assert seen['scalars/is_success'][stamp] == metric.success(achieved, desired)
         if stamp in seen['scalars/reward']:
             assert seen['scalars/reward'][stamp] == metric.reward(achieved, desired)
-    resets = len(stamps) - len(set(stamps) & set(seen['scalars/reward']))
-    assert 1 <= resets <= 3
+    assert set(seen['scalars/distance']) - set(seen['scalars/reward']), 'a reset has a reward'
+
+
+def processes_of_session(session: int) -> list[str]:
+    """Command lines of what runs in a session."""
+    found = []
+    for path in Path('/proc').glob('[0-9]*/stat'):
+        try:
+            fields = path.read_text().rpartition(')')[2].split()
+            if int(fields[3]) == session and fields[0] != 'Z':
+                found.append(path.with_name('cmdline').read_text())
+        except OSError:
+            continue
+    return found
 
 
 @pytest.mark.parametrize(
@@ -252,6 +267,7 @@ def test_what_cannot_be_shown_is_one_line(
     _, error = process.communicate(timeout=60)
     assert process.returncode == code, error
     assert line in error and 'Traceback' not in error
+    assert not processes_of_session(process.pid)
 
 
 def test_rclpy_is_left_as_it_was() -> None:

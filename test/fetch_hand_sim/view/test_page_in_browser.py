@@ -19,6 +19,7 @@ import pytest
 from PIL import Image
 
 from fetch_hand_sim.episode_log import EpisodeDirectory
+from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.view.page.ray import mouse_ray
 from msgs_spec.cdr import TopicCodec
@@ -40,7 +41,9 @@ pytestmark = [
 VIEW = (sys.executable, '-m', 'fetch_hand_sim.view')
 # What the browser draws below the scene.
 BAR = 32
-RED = (150, 90)
+# Of a list; and the colour of headers.
+ROW = 18.0
+HEADER = (230, 232, 235)
 
 
 @pytest.fixture
@@ -110,18 +113,37 @@ def is_green(pixel: np.ndarray) -> bool:
     return pixel[1] > 70 and pixel[1] > 1.3 * max(pixel[0], pixel[2])
 
 
+def is_goal(pixel: np.ndarray) -> bool:
+    return is_red(pixel) or is_green(pixel)
+
+
+def headers(picture: np.ndarray) -> list[float]:
+    """Where headers and chosen rows of the panels on the left are, from above."""
+    is_header = (np.abs(picture[40:500, 325].astype(int) - HEADER) < 3).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], is_header, [0]])))
+    return [40.0 + (a + b) / 2.0 for a, b in edges.reshape(-1, 2) if b - a > 12]
+
+
 @pytest.fixture
 def robot(start_process):
-    """A robot that nobody commands, and a client that hears it."""
-    start_process(sys.executable, '-m', 'fetch_hand_sim.sim_node', *ros_args(task='FetchReach'))
+    """A robot that nobody commands and everybody may push, and a client that hears it."""
+    parameters = ros_args(task='FetchReach', perturb_limit=50.0)
+    start_process(sys.executable, '-m', 'fetch_hand_sim.sim_node', *parameters)
     with client(TASKS['FetchReach']) as connection:
-        connection.subscribe('desired_goal', 'episode_status', 'achieved_goal')
+        connection.subscribe('desired_goal', 'episode_status', 'achieved_goal', 'applied_command')
         connection.spin_until(lambda: connection.received['desired_goal'], 'a goal')
         yield connection
 
 
 def latest(connection: Client, name: str) -> np.ndarray:
     return decode(topic(connection.spec, name), connection.received[name][-1])
+
+
+def wait_for_moves(connection: Client, moves: list[float]) -> None:
+    """Waits until the robot is told to move by that along its axes."""
+    connection.spin_until(
+        lambda: np.allclose(latest(connection, 'applied_command')[:3], moves), f'moves {moves}'
+    )
 
 
 def test_a_file_is_played_and_the_timeline_moves_it(browser, start_process, tmp_path):
@@ -144,6 +166,78 @@ def test_a_file_is_played_and_the_timeline_moves_it(browser, start_process, tmp_
     browser.click(880.0, y)
     browser.wait(2.0)
     assert difference(browser.screenshot()[scene], early[scene]) > 0.005
+
+
+def test_the_list_opens_the_episode_that_is_clicked(browser, start_process, tmp_path):
+    recorder = Recorder('FetchPush')
+    paths = [recorder.record(EpisodeDirectory(tmp_path)) for _ in range(8)]
+    goals = [load_episode(path).goals[0] for path in paths]
+    places = [place_of('FetchPush', goal) for goal in goals]
+    # One that is not where a panel is, nor where the first one has its goal.
+    number = next(
+        number
+        for number, (x, y) in enumerate(places)
+        if 370.0 < x < 590.0 and np.hypot(x - places[0][0], y - places[0][1]) > 40.0
+    )
+    browser.open(address_of(start_process(*VIEW, tmp_path)))
+    picture = wait_for_scene(browser)
+    _title, first = headers(picture)
+    x, y = (round(value) for value in places[number])
+    assert not is_goal(picture[y, x])
+    browser.click(100.0, first + ROW * number)
+    wait_for(browser, lambda picture: is_goal(picture[y, x]), 'goal of that episode')
+    keep('list', browser.screenshot())
+
+
+def test_a_robot_is_pulled_with_control_and_the_mouse(browser, start_process, robot):
+    browser.open(address_of(start_process(*VIEW)))
+    wait_for_scene(browser)
+    # Nobody commands, so it stays where it is.
+    rest = latest(robot, 'achieved_goal')
+    x, y = place_of('FetchReach', rest)
+    browser.move(x, y)
+    browser.press_key('Control')
+    browser.press(x, y)
+    for step in range(1, 9):
+        browser.move(x + 8.0 * step, y - 8.0 * step, pressed=True)
+
+    def is_pulled():
+        return np.linalg.norm(latest(robot, 'achieved_goal') - rest) > 2e-3
+
+    robot.spin_until(is_pulled, 'gripper that gives way')
+    keep('pulled', browser.screenshot())
+    browser.release(x + 64.0, y - 64.0)
+    browser.release_key('Control')
+    # The next episode, if not this one, is one that nobody pushes.
+    robot.spin_until(
+        lambda: np.linalg.norm(latest(robot, 'achieved_goal') - rest) < 1e-4, 'gripper at rest'
+    )
+
+
+def test_arrow_keys_command_where_nobody_else_does(browser, start_process, robot):
+    browser.open(address_of(start_process(*VIEW)))
+    picture = wait_for_scene(browser)
+    _, commands, *_ = headers(picture)
+    browser.click(120.0, commands)
+    browser.wait(1.0)
+    browser.click(25.0, commands + 22.0)
+    robot.spin_until(lambda: robot.node.count_publishers('/commands') == 1, 'page that commands')
+    wait_for_moves(robot, [0.0, 0.0, 0.0])
+    for key, wanted in (('ArrowRight', 1.0), ('ArrowLeft', -1.0)):
+        browser.press_key(key)
+        wait_for_moves(robot, [wanted, 0.0, 0.0])
+        browser.release_key(key)
+        wait_for_moves(robot, [0.0, 0.0, 0.0])
+    browser.press_key('ArrowDown')
+    browser.release_key('ArrowDown')
+    browser.press_key('ArrowRight')
+    wait_for_moves(robot, [0.0, 1.0, 0.0])
+    keep('keys', browser.screenshot())
+    browser.release_key('ArrowRight')
+    browser.click(25.0, commands + 22.0)
+    robot.spin_until(
+        lambda: robot.node.count_publishers('/commands') == 0, 'page that commands no more'
+    )
 
 
 def test_dragging_the_goal_moves_it_and_the_actor_gets_there(browser, start_process, robot):
