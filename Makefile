@@ -17,7 +17,7 @@ STAMP := $(VENV)/.complete
 # not leak in.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo docs tables pictures test test-browser lint format twin bench-sim bench-view bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
+.PHONY: help env demo docs tables pictures test test-browser lint format twin bench-sim bench-view bench-camera bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -32,6 +32,7 @@ help:
 	@echo 'make twin       the long comparison with Gymnasium-Robotics, 20 seeds per task'
 	@echo 'make bench-sim  simulation speed against its peers'
 	@echo 'make bench-view [SECONDS=$(SECONDS)]  what viewers cost a robot'
+	@echo 'make bench-camera  what pictures cost, with and without somebody who looks'
 	@echo 'make bench-her  training speed against Stable-Baselines3'
 	@echo 'make bench-paper [TASK=$(TASK)]  four arms x five seeds, as in the figures of the paper'
 	@echo 'make bench-lockstep  ticks per second of two nodes against the limit of the middleware'
@@ -90,6 +91,9 @@ pictures: env
 
 bench-view: env
 	$(BIN)/python bench/bench_view.py --seconds $(SECONDS)
+
+bench-camera: env
+	$(BIN)/python bench/bench_camera.py
 
 bench-sim: env
 	$(BIN)/python bench/bench_sim.py

@@ -30,6 +30,8 @@ from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
 
 VISITORS = 3
+# Seconds after which a process that was told to end is killed.
+_END_TIMEOUT = 20.0
 
 
 def start(stack: ExitStack, *words: str, stdout: int | None = None) -> subprocess.Popen[str]:
@@ -38,7 +40,11 @@ def start(stack: ExitStack, *words: str, stdout: int | None = None) -> subproces
 
     def end() -> None:
         process.send_signal(signal.SIGINT)
-        process.wait()
+        try:
+            process.wait(_END_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
     stack.callback(end)
     return process
@@ -72,35 +78,50 @@ def visit(stack: ExitStack, address: str, number: int) -> None:
     stack.callback(socket.close)
 
 
-def measure(watcher: Watcher, label: str, seconds: float, factor: float) -> None:
-    """Watches for a while and prints what was seen."""
+def measure(
+    watcher: Watcher, label: str, seconds: float, factor: float, without: float = 0.0
+) -> float:
+    """Watches for a while and prints what was seen; returns ticks per second.
+
+    Args:
+        watcher: Hears the robot.
+        label: What is measured.
+        seconds: How long.
+        factor: Real-time factor; 0 in lockstep.
+        without: Ticks per second without viewers; 0 if this is that.
+    """
     watcher.watch(2.0)
     watcher.times.clear()
     before = watcher.missed
     watcher.watch(seconds)
+    rate = len(watcher.times) / seconds
     if factor:
         report(label, watcher.times, watcher.missed - before, factor)
-        return
-    rate = len(watcher.times) / seconds
-    print(f'{label}: {rate:.0f} ticks/s; load average {os.getloadavg()[0]:.1f}', flush=True)
+        return rate
+    share = f', {100.0 * rate / without:.1f} % of without' if without else ''
+    print(f'{label}: {rate:.0f} ticks/s{share}; load average {os.getloadavg()[0]:.1f}', flush=True)
+    return rate
 
 
 def compare(watcher: Watcher, options: argparse.Namespace, factor: float) -> None:
-    """Measures without viewers, with one, and with its visitors."""
-    measure(watcher, 'no viewer', options.seconds, factor)
+    """Measures without viewers, with one, with its visitors, and without again."""
+    seconds = options.seconds
+    without = measure(watcher, 'no viewer', seconds, factor)
     with ExitStack() as stack:
         address = open_view(stack)
-        measure(watcher, 'a viewer that nobody visits', options.seconds, factor)
+        measure(watcher, 'a viewer that nobody visits', seconds, factor, without)
         for number in range(VISITORS):
             visit(stack, address, number)
-        measure(watcher, f'{VISITORS} visitors that do not draw', options.seconds, factor)
+        measure(watcher, f'{VISITORS} visitors that do not draw', seconds, factor, without)
         if options.browser and factor:
             from support.browser import Browser
 
             browser = Browser()
             stack.callback(browser.close)
             browser.open(f'http://{address}/')
-            measure(watcher, 'and a Chromium that draws', options.seconds, factor)
+            measure(watcher, 'and a Chromium that draws', seconds, factor, without)
+    # How much the machine itself has changed meanwhile.
+    measure(watcher, 'no viewer any more', seconds, factor, without)
 
 
 def main() -> None:
