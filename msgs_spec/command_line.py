@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 # Done; done, and something is wrong; not begun, because of what was given.
 EXIT_SUCCESS, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
@@ -45,6 +45,31 @@ class UsageError(CommandError):
     """The user asked for what is not possible; the message is one line that says what is."""
 
     exit_code = EXIT_USAGE
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose errors are one line, as those of `run_command` are."""
+
+    def error(self, message: str) -> NoReturn:
+        """Says what is wrong and exits."""
+        complain(self.prog, message)
+        sys.exit(EXIT_USAGE)
+
+
+def whole_number(lower: int, upper: int | None = None) -> Callable[[str], int]:
+    """Returns what reads a number from `lower` to `upper`, for `add_argument(type=...)`."""
+    allowed = f'{lower} or more' if upper is None else f'{lower} ... {upper}'
+
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = lower - 1
+        if value < lower or (upper is not None and value > upper):
+            raise argparse.ArgumentTypeError(f'{text[:80]!r} given; allowed: {allowed}')
+        return value
+
+    return read
 
 
 class FormerOption(argparse.Action):

@@ -66,7 +66,7 @@ class ParameterSpec:
         return f'0 or {limits}' if self.or_zero else limits
 
 
-_LARGEST_SEED = 2**32 - 1
+LARGEST_SEED = 2**32 - 1
 
 # More than that throws the robots apart, N.
 LARGEST_PERTURBATION = 100.0
@@ -80,7 +80,7 @@ SIM_NODE = (
         'Seed of the first episode, and when set later of the next one; each further episode takes '
         'the next seed.',
         lower=0,
-        upper=_LARGEST_SEED,
+        upper=LARGEST_SEED,
         read_only=False,
     ),
     ParameterSpec(

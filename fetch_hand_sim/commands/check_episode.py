@@ -19,6 +19,7 @@ from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     EXIT_USAGE,
+    CommandParser,
     complain,
     printable,
     progress,
@@ -30,7 +31,7 @@ _NAME = 'check_episode'
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument(
         'paths', type=Path, nargs='+', metavar='PATH', help='episode, or directory of episodes'
     )

@@ -28,11 +28,14 @@ from fetch_hand_sim.episode_log import EpisodeReadError, EpisodeRecord, read_epi
 from msgs_spec.codecs import decode_status
 from msgs_spec.command_line import (
     EXIT_SUCCESS,
+    CommandParser,
     FormerOption,
     complain,
     require_extra,
     run_command,
+    whole_number,
 )
+from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.ros import StopSignals, keep_discovery_local, rclpy_profile, ros_message_class
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
@@ -238,10 +241,11 @@ def _logs() -> Iterator[IO[str]]:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog='fetch_hand_sim demo', description=__doc__)
+    parser = CommandParser(prog='fetch_hand_sim demo', description=__doc__)
     parser.add_argument('--task', default='FetchReach', help='one of the thirteen tasks')
-    parser.add_argument('--episodes', type=int, default=5, help='how many episodes')
-    parser.add_argument('--seed', type=int, default=0, help='seed of the first episode')
+    count, seed = whole_number(1), whole_number(0, LARGEST_SEED)
+    parser.add_argument('--episodes', type=count, default=5, help='how many episodes')
+    parser.add_argument('--seed', type=seed, default=0, help='seed of the first episode')
     parser.add_argument('--episode-dir', default='episodes', help='where episodes are logged')
     parser.add_argument('--policy', default='', help="actor file, 'random' or 'resting'")
     parser.add_argument('--checkpoint', dest='policy', action=FormerOption, help=argparse.SUPPRESS)
@@ -250,10 +254,6 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         task_spec(options.task)
     except ValueError as error:
         parser.error(str(error))
-    if options.episodes < 1:
-        parser.error(f'--episodes {options.episodes}; allowed: 1 or more')
-    if options.seed < 0:
-        parser.error(f'--seed {options.seed}; allowed: 0 or more')
     return options
 
 

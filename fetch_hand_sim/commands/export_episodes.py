@@ -17,12 +17,12 @@ from fetch_hand_sim.episode_log import (
     expand_episodes,
     load_episodes,
 )
-from fetch_hand_sim.episodes.export import ExportError, export_minari, export_parquet
+from fetch_hand_sim.episodes.export import export_minari, export_parquet
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     EXIT_USAGE,
-    CommandError,
+    CommandParser,
     UsageError,
     complain,
     printable,
@@ -35,7 +35,7 @@ _NAME = 'export_episodes'
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('path', type=Path, help='an episode, or a directory of episodes')
     parser.add_argument('--to', choices=('parquet', 'minari'), required=True)
     parser.add_argument('--output', type=Path, required=True, help='directory to write to')
@@ -73,10 +73,7 @@ def _run(options: argparse.Namespace) -> int:
     for episode in episodes:
         by_task.setdefault(episode.spec.name, []).append(episode)
     for task, group in by_task.items():
-        try:
-            done = f'{len(group)} episodes of {task}: {_export(options, group)}'
-        except ExportError as error:
-            raise CommandError(str(error)) from None
+        done = f'{len(group)} episodes of {task}: {_export(options, group)}'
         print(printable(done), flush=True)
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
 

@@ -29,6 +29,7 @@ from fetch_hand_sim.episode_log.summary import EpisodeSummary
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
+    CommandParser,
     UsageError,
     complain,
     printable,
@@ -113,7 +114,7 @@ def _known(number: float | None) -> str:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('directory', type=Path, help='where episodes are collected')
     parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='only this task')
     success = parser.add_mutually_exclusive_group()

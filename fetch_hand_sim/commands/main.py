@@ -11,11 +11,12 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from typing import NoReturn
 
 import shtab
 
 from fetch_hand_sim.commands.executables import UnknownExecutableError, find_executable
-from msgs_spec.command_line import EXIT_USAGE, UsageError, run_command, start_command
+from msgs_spec.command_line import EXIT_USAGE, CommandParser, UsageError, run_command, start_command
 
 _NAME = 'fetch_hand_sim'
 
@@ -118,17 +119,18 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-class _Parser(argparse.ArgumentParser):
+class _Parser(CommandParser):
     """Says what was probably meant instead of an unknown command."""
 
-    def error(self, message: str) -> None:  # type: ignore[override]
+    def error(self, message: str) -> NoReturn:
+        """Says what is wrong and exits."""
         if "invalid choice: '" in message:
             given = message.split("invalid choice: '")[1].split("'")[0]
             near = difflib.get_close_matches(given, list(self._names()), 1)
             message = f'no command {given!r}; ' + (
                 f'did you mean {near[0]!r}?' if near else f'allowed: {", ".join(self._names())}'
             )
-        self.exit(2, f'{self.prog}: {message}\n')
+        super().error(message)
 
     def _names(self) -> list[str]:
         words = self.prog.split()[1:]

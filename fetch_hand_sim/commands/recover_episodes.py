@@ -22,6 +22,7 @@ from fetch_hand_sim.episode_log import (
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
+    CommandParser,
     UsageError,
     complain,
     printable,
@@ -34,7 +35,7 @@ _NAME = 'recover_episodes'
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('directory', type=Path, help='where episodes are collected')
     parser.add_argument('--dry-run', action='store_true', help='only name what is unfinished')
     options = parser.parse_args(arguments)

@@ -14,7 +14,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.command_line import EXIT_SUCCESS, CommandError, UsageError, progress, run_command
+from msgs_spec.command_line import (
+    EXIT_SUCCESS,
+    CommandError,
+    CommandParser,
+    UsageError,
+    progress,
+    run_command,
+)
 
 _NAME = 'render_episode'
 _SPEEDS = (0.01, 100.0)
@@ -26,7 +33,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('path', type=Path, help='an episode; with --grid a folder of episodes')
     parser.add_argument(
         '--out', type=Path, required=True, help='film.mp4, .gif or .webp; picture.png or .jpg'

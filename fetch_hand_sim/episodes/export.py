@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
 from fetch_hand_sim.gym_envs.spaces import observation_space
-from msgs_spec.command_line import printable
+from msgs_spec.command_line import CommandError, UsageError, printable
 
 # Parts of a dataset's id become directories.
 _DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
@@ -31,7 +31,7 @@ _VERSION = re.compile(r'-v\d+$')
 _OBSERVATIONS = ('observation', 'achieved_goal', 'desired_goal')
 
 
-class ExportError(RuntimeError):
+class ExportError(CommandError):
     """A dataset cannot be written; the message is one line."""
 
 
@@ -147,11 +147,12 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
         The id of the dataset, `<task>/<name>`.
 
     Raises:
-        ExportError: If the name is not allowed, minari is missing, the dataset exists or cannot be
-            written; nothing is created then.
+        UsageError: If the name is not allowed.
+        ExportError: If minari is missing, the dataset exists or cannot be written. Nothing is
+            created in either case.
     """
     if not _DATASET_NAME.fullmatch(name):
-        raise ExportError(
+        raise UsageError(
             f'dataset name {name!r}; allowed: letters, digits, _ and -, parts separated by /, such '
             'as logged-v0'
         )

@@ -10,6 +10,7 @@ from pathlib import Path
 from msgs_spec.command_line import (
     EXIT_SUCCESS,
     CommandError,
+    CommandParser,
     UsageError,
     require_extra,
     run_command,
@@ -21,7 +22,7 @@ _NAME = 'export_actor'
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Writes the file; returns the exit code."""
-    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('actor', help='name of a shipped actor, or its .safetensors file')
     parser.add_argument('target', type=Path, help='file to write, <name>.onnx')
     options = parser.parse_args(arguments)

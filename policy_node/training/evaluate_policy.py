@@ -16,10 +16,13 @@ from msgs_spec.command_line import (
     EXIT_INTERRUPTED,
     EXIT_SUCCESS,
     CommandError,
+    CommandParser,
     UsageError,
     progress,
     run_command,
+    whole_number,
 )
+from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import (
@@ -38,12 +41,18 @@ _STDOUT = Path('-')
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser, former='--actor')
     add = parser.add_argument
-    add('--episodes', type=int, default=1000, help='default: 1000')
-    add('--first-seed', type=int, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
-    add('--num-envs', type=int, default=100, help='simulations in the batch; default: 100')
+    count, seed = whole_number(1), whole_number(0, LARGEST_SEED)
+    add('--episodes', type=count, default=1000, help='default: 1000')
+    add('--first-seed', type=seed, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
+    add(
+        '--num-envs',
+        type=count,
+        default=100,
+        help='simulations in the batch; default: 100',
+    )
     add('--threads', type=int, default=0, help='simulation threads; default: all cores')
     add('--success-rule', choices=SUCCESS_RULES, default='gymnasium', help='of the reward')
     add('--reward-type', choices=REWARD_TYPES, default='sparse', help='of the return')
@@ -66,9 +75,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    for name in ('episodes', 'num_envs'):
-        if getattr(options, name) < 1:
-            raise UsageError(f'--{name.replace("_", "-")} {getattr(options, name)}; allowed: >= 1')
     loaded = load_chosen_policy(options)
     try:
         simulation = _simulation(options, loaded.task)

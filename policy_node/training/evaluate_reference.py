@@ -14,7 +14,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from msgs_spec.command_line import EXIT_SUCCESS, UsageError, run_command
+from msgs_spec.command_line import (
+    EXIT_SUCCESS,
+    CommandParser,
+    UsageError,
+    run_command,
+    whole_number,
+)
+from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import task_spec
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
@@ -23,11 +30,12 @@ from policy_node.training.policy_options import add_policy_options, load_chosen_
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(prog='evaluate_reference', description=__doc__)
+    parser = CommandParser(prog='evaluate_reference', description=__doc__)
     add_policy_options(parser, former='--actor')
     add = parser.add_argument
-    add('--episodes', type=int, default=1000, help='default: 1000')
-    add('--first-seed', type=int, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
+    add('--episodes', type=whole_number(1), default=1000, help='default: 1000')
+    seed = whole_number(0, LARGEST_SEED)
+    add('--first-seed', type=seed, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
     add('--json', type=Path, help='add the result to this JSON file')
     return parser.parse_args(arguments)
 

@@ -22,10 +22,13 @@ from fetch_hand_sim.simulation import Observation, Simulation
 from msgs_spec.command_line import (
     EXIT_SUCCESS,
     CommandError,
+    CommandParser,
     UsageError,
     progress,
     run_command,
+    whole_number,
 )
+from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES
 from policy_node.training.policy_options import add_policy_options, load_chosen_policy
 
@@ -34,24 +37,19 @@ _NAME = 'generate_episodes'
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
+    parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser)
     add = parser.add_argument
-    add('--episodes', type=int, default=1000, help='default: 1000')
+    count, seed = whole_number(1), whole_number(0, LARGEST_SEED)
+    add('--episodes', type=count, default=1000, help='default: 1000')
     add('--output', type=Path, required=True, help='directory in which episodes are collected')
-    add('--first-seed', type=int, default=0, help='episode i has this seed plus i; default: 0')
-    add('--num-envs', type=int, default=64, help='simulations in the batch; default: 64')
+    add('--first-seed', type=seed, default=0, help='episode i has this seed plus i; default: 0')
+    add('--num-envs', type=count, default=64, help='simulations in the batch; default: 64')
     add('--threads', type=int, default=0, help='simulation threads; default: all cores')
     add('--success-rule', choices=SUCCESS_RULES, default='gymnasium')
     add('--reward-type', choices=REWARD_TYPES, default='sparse')
     add('--compiled-model', action='store_true', help='store the compiled model in every file')
-    options = parser.parse_args(arguments)
-    for name in ('episodes', 'num_envs'):
-        if getattr(options, name) < 1:
-            parser.error(f'--{name.replace("_", "-")} {getattr(options, name)}; allowed: >= 1')
-    if options.first_seed < 0:
-        parser.error(f'--first-seed {options.first_seed}; allowed: >= 0')
-    return options
+    return parser.parse_args(arguments)
 
 
 def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simulation]:

@@ -10,9 +10,11 @@ from pathlib import Path
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
+    CommandParser,
     UsageError,
     require_extra,
     run_command,
+    whole_number,
 )
 
 _NAME = 'ship_actor'
@@ -21,11 +23,16 @@ ACTORS = Path(__file__).parents[1] / 'actors'
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(prog=_NAME, description=__doc__)
-    add = parser.add_argument
+    parser = CommandParser(prog=_NAME, description=__doc__)
+    add, count = parser.add_argument, whole_number(1)
     add('run', type=Path, help='output folder of train_her')
-    add('--episodes', type=int, default=1000, help='default: 1000')
-    add('--num-envs', type=int, default=100, help='simulations in the batch; default: 100')
+    add('--episodes', type=count, default=1000, help='default: 1000')
+    add(
+        '--num-envs',
+        type=count,
+        default=100,
+        help='simulations in the batch; default: 100',
+    )
     add('--threads', type=int, default=0, help='simulation threads; default: all cores')
     add('--checkpoint', default='best.safetensors', help='file in the run; default: %(default)s')
     add('--actors', type=Path, default=ACTORS, help='where to; default: the package')
@@ -39,8 +46,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    if options.episodes < 1 or options.num_envs < 1:
-        raise UsageError(f'--episodes {options.episodes}, --num-envs {options.num_envs}: >= 1')
     require_extra('train')
     from policy_node.training.evaluation.shipping import ship
 

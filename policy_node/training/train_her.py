@@ -9,7 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msgs_spec.command_line import EXIT_SUCCESS, UsageError, require_extra, run_command
+from msgs_spec.command_line import (
+    EXIT_SUCCESS,
+    CommandParser,
+    UsageError,
+    require_extra,
+    run_command,
+)
 from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.learning.config import (
     RECIPES,
@@ -30,7 +36,7 @@ EXIT_SIGNAL = 128
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog=_NAME,
         description=__doc__,
         epilog='Several workers: torchrun --nproc-per-node N -m policy_node.training.train_her ...',

@@ -12,11 +12,13 @@ import pytest
 
 from msgs_spec.command_line import (
     CommandError,
+    CommandParser,
     UsageError,
     progress,
     require_extra,
     run_command,
     start_command,
+    whole_number,
 )
 from support import script_environment
 
@@ -146,3 +148,15 @@ def test_progress_is_shown_to_a_person_only(is_watched):
 def test_progress_passes_what_is_inside_on():
     with pytest.raises(ValueError, match='inside'), progress('episodes', 1):
         raise ValueError('inside')
+
+
+@pytest.mark.parametrize('text', ['0', '7', '', 'inf', '1.5', '-1', str(2**63), '\x1b[31m'])
+def test_numbers_out_of_range_are_one_line(text, capsys):
+    parser = CommandParser(prog='tool')
+    parser.add_argument('--count', type=whole_number(1, 6))
+    with pytest.raises(SystemExit) as caught:
+        parser.parse_args([f'--count={text}'])
+    assert caught.value.code == 2
+    error = capsys.readouterr().err
+    assert error == f'tool: argument --count: {text!r} given; allowed: 1 ... 6\n'
+    assert parser.parse_args(['--count', '6']).count == 6

@@ -29,10 +29,12 @@ from typing import Any
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
+    CommandParser,
     UsageError,
     complain,
     require_extra,
     run_command,
+    whole_number,
 )
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.actors_table import actors_table
@@ -52,7 +54,7 @@ ACTORS_TABLE = 'actors.md'
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog=_NAME, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
@@ -61,14 +63,14 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--tasks', nargs='+', choices=list(TASKS), metavar='TASK', help='default: FetchReach; all')
     add('--seeds', nargs='+', type=int, metavar='SEED', help='default: 0 1 2 3 4; 0')
     add('--arms', nargs='+', metavar='ARM', help='default: all; not in study best')
-    add('--jobs', type=int, help='at once; default: 1; one per core')
+    add('--jobs', type=whole_number(1), help='at once; default: 1; one per core')
     add('--steps', type=int, help='environment steps of each job')
     add('--threads', type=int, help='simulation threads of each job')
     add('--torch-threads', type=int, help='tensor threads of each job')
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='any field of TrainConfig')
     add('--output', type=Path, help='default: runs/benchmark; runs/best; runs/research/NAME')
     add('--report', type=Path, help='where figure and tables go')
-    add('--episodes', type=int, help='fresh episodes at the end; default: none; 2000; 500')
+    add('--episodes', type=whole_number(1), help='fresh episodes at the end; default: none; 2000; 500')
     add('--ray', action='store_true', help='independent jobs on Ray (extra: cluster)')
     paper = parser.add_argument_group('study paper').add_argument
     paper('--recipe', choices=RECIPES, help='of all jobs; default: paper')
@@ -91,13 +93,9 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
         for name in names:
             if study != options.study and getattr(options, name) not in (None, False):
                 raise ValueError(f'--{name} belongs to --study {study}')
-    if options.jobs is not None and options.jobs < 1:
-        raise ValueError(f'--jobs {options.jobs}; allowed: 1 or more')
     for name, study in (('arms', 'best'), ('episodes', 'paper')):
         if getattr(options, name) is not None and study == options.study:
             raise ValueError(f'--{name} does not belong to --study {study}')
-    if options.episodes is not None and options.episodes < 1:
-        raise ValueError(f'--episodes {options.episodes}; allowed: 1 or more')
     overrides = _overrides(options)
     list_jobs = {'paper': _paper, 'best': _best}.get(options.study, _research)
     jobs = list_jobs(options, overrides)

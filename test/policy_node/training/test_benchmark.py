@@ -235,7 +235,6 @@ def test_another_budget_in_the_same_folder_is_refused(
         (['--study', 'best', '--arms', 'her_sparse'], '--arms belongs to --study paper'),
         (['--study', 'best', '--full'], '--full belongs to --study paper'),
         (['--episodes', '10'], '--episodes belongs to --study best'),
-        (['--jobs', '0'], '--jobs 0; allowed: 1 or more'),
         (['--set', 'init_from=FetchReach'], '--set init_from is not possible'),
     ],
 )

@@ -200,7 +200,6 @@ def test_former_names_work_and_say_what_they_are_called_now(
         (['--policy', 'random'], 'random needs a task; allowed: FetchReach, '),
         ([], '--policy is missing; allowed: a shipped actor'),
         (['--policy', 'FetchReach', '--task', 'FetchPush'], 'trained on FetchReach, not on Fetch'),
-        (['--policy', 'FetchReach', '--episodes', '0'], '--episodes 0'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(
