@@ -112,7 +112,6 @@ def test_a_study_runs_measures_and_gives_the_same_bits_again(
         ),
         (['--set', 'goals=near=1'], '--set goals is not possible: jobs differ in it'),
         (['--recipe', 'best'], '--recipe belongs to --study paper'),
-        (['--episodes', '0'], '--episodes 0; allowed: 1 or more'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(
