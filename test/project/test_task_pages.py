@@ -20,7 +20,7 @@ END, START = TOOL['END'], TOOL['START']
 def test_a_page_is_up_to_date(path: Path) -> None:
     page = path.read_text(encoding='utf-8')
     renewed = TOOL['with_section'](page, TOOL['sections']()[path])
-    assert renewed == page, 'run: make tables'
+    assert renewed == page, 'run: make tables, or python tools/task_pages.py --write'
     assert (path.parent / f'../images/tasks/{path.stem}.jpg').is_file() or path.stem == 'index'
 
 
