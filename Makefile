@@ -121,7 +121,7 @@ torture: env
 		test/fetch_hand_sim/episode_log/test_episode_untrusted.py
 
 test-release: env
-	$(BIN)/python -m pytest -m release
+	$(BIN)/python -m pytest -m release --timeout 1800 --durations 0
 	PYTHON=$(abspath $(BIN)/python) tools/test_release.sh
 
 bench-episodes: env

@@ -19,7 +19,6 @@ PAGES = sorted((ROOT / 'docs' / 'tutorials').glob('*.md'))
 
 
 @pytest.mark.release
-@pytest.mark.timeout(1800)
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
 def test_a_tutorial_can_be_followed(
     page: Path, tmp_path: Path, ros_environment: dict[str, str]

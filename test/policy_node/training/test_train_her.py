@@ -351,7 +351,7 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
     command += ['--master-port', '0', '--rdzv-backend', 'c10d', '--rdzv-endpoint', 'localhost:0']
     command += ['-m', 'policy_node.training.train_her', *arguments, '--output', str(run)]
     environment = {**os.environ, 'OMP_NUM_THREADS': '1'}
-    result = subprocess.run(command, capture_output=True, text=True, timeout=150, env=environment)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=1200, env=environment)
     assert result.returncode == 0, result.stderr
     assert result.stdout.count('success target 1 reached') == 1
     info = checkpoint.read_info(run / 'best.safetensors')
