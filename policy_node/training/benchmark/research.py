@@ -72,11 +72,96 @@ _REACH = {
     'evaluate_every': 1_600,
     'evaluation_episodes': 32,
 }
-_PUSH = {'total_steps': 600_000, 'evaluate_every': 19_200, 'evaluation_episodes': 64}
+_EVALUATED = {'evaluate_every': 19_200, 'evaluation_episodes': 64}
+_PUSH = {'total_steps': 600_000, **_EVALUATED}
+_PICK = {'total_steps': 800_000, **_EVALUATED}
+_SLIDE = {'total_steps': 2_000_000, **_EVALUATED, 'evaluate_every': 64_000}
+_ROTATE = {'total_steps': 1_000_000, **_EVALUATED, 'evaluate_every': 64_000}
+# Sparse, with settings that the dense recipe of the task does not have.
+_SPARSE_HAND_REACH = {
+    'total_steps': 2_000_000,
+    **_EVALUATED,
+    'evaluate_every': 64_000,
+    'reward_type': 'sparse',
+    'action_l2': 0.1,
+    'gamma': 0.95,
+}
+
+
+def _arms(field: str, **labels: str) -> tuple[Arm, ...]:
+    """Arms named like the values of one field."""
+    return tuple(Arm(name, label, {field: name}) for name, label in labels.items())
+
+
+def _targets() -> tuple[Arm, ...]:
+    """Slow copies at four intervals, and none with three normalisations."""
+    slow = [
+        Arm(
+            f'polyak{interval}',
+            f'target moves every {interval} updates',
+            {'target': 'polyak', 'target_update_interval': interval},
+        )
+        for interval in (10, 1, 4, 40)
+    ]
+    none = [
+        Arm(f'none_{norm}', f'no target network, norm {norm}', {'target': 'none', 'norm': norm})
+        for norm in ('none', 'layer', 'batch')
+    ]
+    layer = Arm(
+        'polyak10_layer',
+        'target moves every 10 updates, norm layer',
+        {'target': 'polyak', 'target_update_interval': 10, 'norm': 'layer'},
+    )
+    return (*slow, layer, *none)
+
+
+def _returns() -> tuple[Arm, ...]:
+    """One step, and longer returns with each correction."""
+    longer = [
+        Arm(
+            f'{correction}{steps}',
+            f'{steps} steps, correction {correction}',
+            {'n_step': steps, 'correction': correction},
+        )
+        for steps in (3, 5, 10)
+        for correction in ('none', 'lambda', 'cut')
+    ]
+    return (Arm('one', 'one step', {'n_step': 1}), *longer)
+
+
+def _ensembles() -> tuple[Arm, ...]:
+    """One critic, and two or five with each way to be one."""
+    several = [
+        Arm(
+            f'{aggregate}{critics}',
+            f'{critics} critics, {aggregate}',
+            {'critics': critics, 'aggregate': aggregate},
+        )
+        for critics, aggregate in (
+            (2, 'mean'),
+            (2, 'min'),
+            (5, 'mean'),
+            (5, 'min'),
+            (5, 'truncated'),
+        )
+    ]
+    return (Arm('one', 'one critic', {'critics': 1}), *several)
+
 
 STUDIES: dict[str, Study] = {
     study.name: study
     for study in (
+        Study(
+            'goals',
+            1,
+            'Are goals worth more that the critic errs on, or that critics differ in?',
+            {'FetchReach': _REACH, 'FetchPush': _PUSH, 'FetchPickAndPlace': _PICK},
+            (
+                Arm('uniform', 'any future goal', {'goal_choice': 'uniform', 'critics': 2}),
+                Arm('bellman', 'greatest error of 8', {'goal_choice': 'bellman', 'critics': 2}),
+                Arm('uncertain', 'widest gap of 8', {'goal_choice': 'uncertain', 'critics': 2}),
+            ),
+        ),
         Study(
             'unbiased',
             2,
@@ -87,16 +172,53 @@ STUDIES: dict[str, Study] = {
             },
             (
                 Arm('future', 'future goals', {'strategy': 'future'}),
-                Arm('none', 'no hindsight', {'strategy': 'none'}),
+                Arm(
+                    'weighted',
+                    'half future, half actual, importance weights',
+                    {'goals': 'future=.4,actual=.4', 'importance': 'density'},
+                ),
                 Arm('actual', 'desired goals of any episode', {'goals': 'actual=.8'}),
                 Arm('random', 'achieved goals of any episode', {'goals': 'random=.8'}),
                 Arm('mixed', 'half future, half actual', {'goals': 'future=.4,actual=.4'}),
-                Arm(
-                    'weighted',
-                    'the same with importance weights',
-                    {'goals': 'future=.4,actual=.4', 'importance': 'density'},
-                ),
+                Arm('none', 'no hindsight', {'strategy': 'none'}),
             ),
+        ),
+        Study(
+            'values',
+            4,
+            'Do values of more than a goal help: of how close, or of how soon?',
+            {'HandReach': _SPARSE_HAND_REACH, 'FetchReach': _REACH},
+            _arms(
+                'condition',
+                none='the goal alone',
+                threshold='and the success threshold',
+                horizon='and the steps left',
+            ),
+        ),
+        Study(
+            'targets',
+            5,
+            'Can targets move faster, or be left out?',
+            {'FetchReach': _REACH, 'FetchPush': _PUSH, 'FetchPickAndPlace': _PICK},
+            _targets(),
+        ),
+        Study(
+            'returns',
+            6,
+            'Do returns of several steps help data that is far from the policy?',
+            {'FetchReach': _REACH, 'FetchPush': _PUSH, 'FetchSlide': _SLIDE},
+            _returns(),
+        ),
+        Study(
+            'ensembles',
+            8,
+            'Do several critics help, for the time that they cost?',
+            {
+                'FetchReach': _REACH,
+                'FetchPickAndPlace': _PICK,
+                'HandManipulateBlockRotateZ': _ROTATE,
+            },
+            _ensembles(),
         ),
     )
 }

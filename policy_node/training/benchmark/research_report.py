@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -121,8 +122,18 @@ def _about(study: Study, jobs: Sequence[Job], command: str) -> dict[str, Any]:
         'command': command,
         'source_revisions': sorted(revisions),
         'machine': machine(),
-        'settings': {task: dict(values) for task, values in study.settings.items()},
+        'settings': _shared_settings(study, jobs),
         'arms': {arm.name: dict(arm.changes) for arm in study.arms},
+    }
+
+
+def _shared_settings(study: Study, jobs: Sequence[Job]) -> dict[str, dict[str, Any]]:
+    """By task, the fields of `TrainConfig` that all arms share."""
+    own = {'seed', *(name for arm in study.arms for name in arm.changes)}
+    configs = {job.config.task: dataclasses.asdict(job.config) for job in jobs}
+    return {
+        task: {name: value for name, value in config.items() if name not in own}
+        for task, config in configs.items()
     }
 
 

@@ -51,6 +51,9 @@ class TrainConfig:
     goals: str = ''
     """Goal sources as a mixture instead of `strategy`: `future=.4,actual=.3,near=.1`; what is left
     of 1 keeps the goal. Also `next` (what this step achieved) and `near` (one of the next ten)."""
+    goal_choice: str = 'uniform'
+    """Which of 8 future goals is taken: `uniform` (any), `bellman` (the value that errs most) or
+    `uncertain` (that critics differ in most)."""
     importance: str = 'none'
     """Weights of transitions in the critic's loss: `none`, or `density`, which takes back that a
     goal chosen in hindsight depends on where the transition led."""
@@ -61,6 +64,20 @@ class TrainConfig:
     the object)."""
     ticks_after_drop: int = -1
     """Ticks after an object fell off the palm that are still learnt from; -1 is all."""
+
+    condition: str = 'none'
+    """One input more of actor and critic: `none`, `threshold` (log-uniform, .5 ... 8 times that of
+    success, also in the reward) or `horizon` (steps left, of which values count the rewards). The
+    actor acts at the threshold of the task and with a whole episode left."""
+    n_step: int = 1
+    """Most steps of a return before it bootstraps."""
+    correction: str = 'none'
+    """Of longer returns, whose actions are not the actor's: `none`, `lambda` (their mean is the
+    lambda-return) or `cut` (they end before an action far from the actor's)."""
+    trace: float = 0.7
+    """With `lambda`, the probability of going on after each step."""
+    cut_distance: float = 0.3
+    """With `cut`, the farthest action from the actor's, root mean square."""
 
     init_from: str = ''
     """Networks and normalisers to start from: a run folder, a shipped actor or the file of one;
@@ -114,6 +131,17 @@ class TrainConfig:
     """Share of the old target network kept by a target update."""
     target_update_interval: int = 40
     """Updates between target updates."""
+    target: str = 'polyak'
+    """Networks that targets are computed with: `polyak` (slow copies) or `none` (those that
+    learn)."""
+    norm: str = 'none'
+    """What normalises hidden layers of the critic alone: `none`, `layer` or `batch` (as CrossQ,
+    without target networks); `layer_norm` is for both networks."""
+    critics: int = 1
+    """Critics that start differently; the actor follows their mean."""
+    aggregate: str = 'mean'
+    """What targets take of several critics: `mean`, `min` or `truncated` (the mean without the
+    highest)."""
 
     random_epsilon: float = 0.3
     """Probability of a uniformly random action."""
@@ -163,6 +191,9 @@ class TrainConfig:
             parse_mixture(self.goals)
             if self.strategy == 'none':
                 raise ValueError(f'goals {self.goals!r} excludes strategy none')
+        for wrong, reason in self._contradictions():
+            if wrong:
+                raise ValueError(reason)
         if self.gamble and self.task not in GAMBLE_TASKS:
             allowed = ', '.join(GAMBLE_TASKS)
             raise ValueError(f'gamble: {self.task} uses its gripper; allowed: {allowed}')
@@ -170,6 +201,61 @@ class TrainConfig:
             raise ValueError(f'ticks_after_drop: {self.task} has no palm to drop an object from')
         if self.reward_rotation != 1.0 and spec.rotation_threshold is None:
             raise ValueError(f'reward_rotation: goals of {self.task} have no rotation')
+
+    def _contradictions(self) -> list[tuple[bool, str]]:
+        """Fields that exclude each other, or that nothing would look at, and why."""
+        sources = self.goals or self.strategy
+        replays_later = 'future' in sources or 'near' in sources
+        conditioned, chosen = self.condition != 'none', self.goal_choice != 'uniform'
+        weighted = self.importance != 'none'
+        plain = (self.critics, self.norm, self.condition) == (1, 'none', 'none')
+        return [
+            (
+                self.correction != 'none' and self.n_step == 1,
+                f'correction {self.correction} needs n_step above 1',
+            ),
+            (
+                self.aggregate != 'mean' and self.critics == 1,
+                f'aggregate {self.aggregate} needs critics above 1',
+            ),
+            (
+                self.norm != 'none' and self.layer_norm,
+                f'norm {self.norm} excludes layer_norm, which is for the critic too',
+            ),
+            (
+                self.norm == 'batch' and self.target != 'none',
+                'norm batch needs target none: both values come from one pass',
+            ),
+            (
+                chosen and not replays_later,
+                f'goal_choice {self.goal_choice} needs future or near goals',
+            ),
+            (
+                self.goal_choice == 'uncertain' and self.critics == 1,
+                'goal_choice uncertain needs critics above 1',
+            ),
+            (
+                conditioned and (chosen or weighted),
+                f'condition {self.condition} excludes goal_choice and importance',
+            ),
+            (
+                self.condition == 'horizon' and self.n_step > 1,
+                'condition horizon excludes n_step above 1',
+            ),
+            (
+                self.condition == 'threshold' and self.reward_type == 'dense',
+                'condition threshold needs reward_type sparse',
+            ),
+            (weighted and self.n_step > 1, 'importance density excludes n_step above 1'),
+            (
+                weighted and self.strategy == 'none' and not self.goals,
+                'importance density needs goals chosen in hindsight',
+            ),
+            (
+                bool(self.init_from) and not plain,
+                'init_from excludes condition, norm and critics above 1',
+            ),
+        ]
 
 
 _CHOICES = {
@@ -180,6 +266,12 @@ _CHOICES = {
     'goal_features': GOAL_FEATURES,
     'episode_weights': ('moved', 'energy'),
     'importance': ('none', 'density'),
+    'goal_choice': ('uniform', 'bellman', 'uncertain'),
+    'condition': ('none', 'threshold', 'horizon'),
+    'correction': ('none', 'lambda', 'cut'),
+    'target': ('polyak', 'none'),
+    'norm': ('none', 'layer', 'batch'),
+    'aggregate': ('mean', 'min', 'truncated'),
     'precision': ('auto', 'float32', 'bfloat16'),
     'device': ('auto', 'cpu', 'cuda'),
 }
@@ -191,6 +283,10 @@ _RANGES = (
     ('reward_rotation', 1e-3, 1000),
     ('moved_share', 0, 1),
     ('ticks_after_drop', -1, _INFINITY),
+    ('n_step', 1, 100),
+    ('trace', 0, 1 - 1e-6),
+    ('cut_distance', 0, 2),
+    ('critics', 1, 100),
     ('noise_spread', 0, 1),
     ('critic_first', 0, _INFINITY),
     ('total_steps', 1, _INFINITY),

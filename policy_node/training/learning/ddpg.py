@@ -6,6 +6,7 @@ import contextlib
 import copy
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -13,24 +14,28 @@ from torch import Tensor, nn
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.conditions import ACTING_INPUT, fold
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.critics import AGGREGATES, make_critic
 from policy_node.training.learning.density_ratio import DensityRatio, GoalView
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.learner import Losses
+from policy_node.training.learning.replay import Array
 from policy_node.training.learning.transitions import Transitions
 
+# Fields of `Transitions` that every batch has.
+_ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'discount')
 
-class Critic(nn.Module):
-    """Action value of normalised features and an action in [-1, 1]."""
 
-    def __init__(self, shape: NetworkShape) -> None:
-        super().__init__()
-        self.network = MLP(shape.feature_size + shape.action_size, 1, shape)
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """What the networks see of a batch: inputs of both states, actions, rewards, discounts."""
 
-    def forward(self, features: Tensor, action: Tensor) -> Tensor:
-        """Returns values (batch,), float32."""
-        value: Tensor = self.network(torch.cat([features, action], dim=-1))
-        return value.squeeze(-1)
+    features: Tensor
+    next_features: Tensor
+    action: Tensor
+    reward: Tensor
+    discount: Tensor
 
 
 class DDPG:
@@ -53,13 +58,23 @@ class DDPG:
         self.config = config
         self.device = device
         self._workers = workers
-        self.actor = Actor(shape).to(device)
-        self.critic = Critic(shape).to(device)
+        conditioned = config.condition != 'none'
+        inputs = shape.feature_size + conditioned
+        self.actor = Actor(shape)
+        if conditioned:
+            self.actor.network = MLP(inputs, shape.action_size, shape)
+        self.actor.to(device)
+        inputs += shape.action_size
+        self.critic = make_critic(inputs, shape, config.norm, config.critics).to(device)
+        # A batch normalisation learns its statistics where values are learnt, nowhere else.
+        self.critic.eval()
         self._actor_parameters = list(self.actor.network.parameters())
         self._critic_parameters = list(self.critic.parameters())
         workers.broadcast([*self._actor_parameters, *self._critic_parameters])
-        self.target_actor = copy.deepcopy(self.actor.network)
-        self.target_critic = copy.deepcopy(self.critic)
+        self.target_actor, self.target_critic = self.actor.network, self.critic
+        if config.target == 'polyak':
+            self.target_actor = copy.deepcopy(self.actor.network)
+            self.target_critic = copy.deepcopy(self.critic)
         self.average_actor = copy.deepcopy(self.actor.network)
         self.actor_optimizer = self._adam(self._actor_parameters)
         self.critic_optimizer = self._adam(self._critic_parameters)
@@ -77,53 +92,83 @@ class DDPG:
 
     def update(self, batch: Transitions) -> Losses:
         """Improves critic and actor on a batch and, when due, moves the targets."""
-        tensors = [self._tensor(getattr(batch, name)) for name in Transitions.__slots__]
-        observation, next_observation, goal, action, reward, discount = tensors
-        features = self.actor.features(observation, goal)
-        next_features = self.actor.features(next_observation, goal)
-        targets = self.targets(reward, discount, next_features)
-        weight = None
-        if self._ratio is not None:
-            weight = self._weights(self._ratio, observation, next_observation, goal, action)
-        critic_loss = self._update_critic(features, action, targets, weight)
+        known = self._known(batch)
+        weight = None if self._ratio is None else self._weights(self._ratio, batch, known.action)
+        critic_loss = self._update_critic(known, weight)
+        features = known.features
         actor_loss, value = self._update_actor(features)
         self.updates += 1
         if self.updates % self.config.target_update_interval == 0:
             self._move_targets()
         return Losses(critic_loss.detach(), actor_loss.detach(), value.detach())
 
-    @torch.no_grad()
     def targets(self, reward: Tensor, discount: Tensor, next_features: Tensor) -> Tensor:
+        """Targets (batch,) from reward, discount and the features of the next state."""
+        next_action = torch.tanh(self.target_actor(next_features))
+        return self._bootstrap(reward, discount, self.target_critic(next_features, next_action))
+
+    def _bootstrap(self, reward: Tensor, discount: Tensor, next_value: Tensor) -> Tensor:
         """Targets (batch,), clipped to the range of returns of rewards in [-1, 0].
 
         Episodes are cut, never terminated, so every next state is bootstrapped from.
         """
-        with self._precision():
-            next_action = torch.tanh(self.target_actor(next_features))
-            value = self.target_critic(next_features, next_action)
-            lowest = -1.0 / (1.0 - self.config.gamma)
-            target: Tensor = reward + discount * value
-            return target.clamp(lowest, 0.0)
+        config = self.config
+        value = next_value if config.critics == 1 else AGGREGATES[config.aggregate](next_value)
+        lowest = -1.0 / (1.0 - config.gamma)
+        target: Tensor = reward + discount * value
+        return target.clamp(lowest, 0.0)
 
-    def _update_critic(
-        self, features: Tensor, action: Tensor, target: Tensor, weight: Tensor | None
-    ) -> Tensor:
+    def _known(self, batch: Transitions) -> _Known:
+        """What the networks see of a batch."""
+        observation, next_observation, goal, action, reward, discount = (
+            self._tensor(getattr(batch, name)) for name in _ALWAYS
+        )
+        features = self.actor.features(observation, goal)
+        next_features = self.actor.features(next_observation, goal)
+        if batch.condition is not None:
+            features = torch.cat([features, self._tensor(batch.condition)], dim=-1)
+            next_condition = self._tensor(batch.next_condition)
+            next_features = torch.cat([next_features, next_condition], dim=-1)
+        return _Known(features, next_features, action, reward, discount)
+
+    def _update_critic(self, known: _Known, weight: Tensor | None) -> Tensor:
         with self._precision():
-            error: Tensor = self.critic(features, action) - target
+            error = self._errors(known)
             square = error.square() if weight is None else weight * error.square()
             loss = square.mean()
         self._step(self.critic_optimizer, loss, self._critic_parameters)
         return loss
 
-    def _weights(
-        self,
-        ratio: DensityRatio,
-        observation: Tensor,
-        next_observation: Tensor,
-        goal: Tensor,
-        action: Tensor,
-    ) -> Tensor:
+    def _errors(self, known: _Known) -> Tensor:
+        """Values less targets: (batch,), of several critics (critics, batch)."""
+        if self.config.norm == 'batch':
+            return self._joint_errors(known)
+        with torch.no_grad():
+            target = self.targets(known.reward, known.discount, known.next_features)
+        error: Tensor = self.critic(known.features, known.action) - target
+        return error
+
+    def _joint_errors(self, known: _Known) -> Tensor:
+        """The same from one pass over states and next states, as CrossQ (arXiv 1902.05605).
+
+        A batch normalisation would otherwise see next actions that its statistics do not know.
+        """
+        with torch.no_grad():
+            next_action = torch.tanh(self.target_actor(known.next_features))
+        self.critic.train()
+        both = self.critic(
+            torch.cat([known.features, known.next_features]),
+            torch.cat([known.action, next_action]),
+        )
+        self.critic.eval()
+        value, next_value = both.chunk(2, dim=-1)
+        error: Tensor = value - self._bootstrap(known.reward, known.discount, next_value.detach())
+        return error
+
+    def _weights(self, ratio: DensityRatio, batch: Transitions, action: Tensor) -> Tensor:
         """Importance weights (batch,) of transitions with goals chosen in hindsight."""
+        names = ('observation', 'next_observation', 'goal')
+        observation, next_observation, goal = (self._tensor(getattr(batch, n)) for n in names)
         achieved = slice(self._achieved_start, self._achieved_start + goal.shape[-1])
 
         def view(of: Tensor) -> GoalView:
@@ -157,6 +202,8 @@ class DDPG:
 
     @torch.no_grad()
     def _move_targets(self) -> None:
+        if self.config.target == 'none':
+            return
         weight = 1.0 - self.config.polyak
         old: list[Tensor] = [*self.target_actor.parameters(), *self.target_critic.parameters()]
         new: list[Tensor] = [*self._actor_parameters, *self._critic_parameters]
@@ -171,13 +218,47 @@ class DDPG:
 
     def acting_actor(self) -> Actor:
         """A copy, on the CPU, of the actor that collects."""
-        return copy.deepcopy(self.actor).cpu().eval()
+        return self._plain(self.actor.network)
 
     def evaluation_actor(self) -> Actor:
         """A copy, on the CPU, of the actor to evaluate: averaged weights, current normalisers."""
+        return self._plain(self.average_actor)
+
+    def _plain(self, network: MLP) -> Actor:
+        """A copy of the actor with this network, at the condition under which it acts."""
         actor = copy.deepcopy(self.actor)
-        actor.network.load_state_dict(self.average_actor.state_dict())
+        if self.config.condition == 'none':
+            actor.network.load_state_dict(network.state_dict())
+        else:
+            actor.network = fold(network, actor.shape, ACTING_INPUT[self.config.condition])
         return actor.cpu().eval()
+
+    @torch.no_grad()
+    def act(self, observation: Array, goal: Array) -> Array:
+        """Actions (batch, action_size) of the actor, without noise."""
+        inputs = self._tensor(observation), self._tensor(goal)
+        features = self.actor.features(*inputs)
+        if self.config.condition != 'none':
+            acting = features.new_full((len(features), 1), ACTING_INPUT[self.config.condition])
+            features = torch.cat([features, acting], dim=-1)
+        action: Array = self.actor(features).cpu().numpy()
+        return action
+
+    @torch.no_grad()
+    def surprise(self, batch: Transitions) -> Array:
+        """Absolute error of each value, (batch,); of several critics the mean."""
+        known = self._known(batch)
+        target = self.targets(known.reward, known.discount, known.next_features)
+        error = (self.critic(known.features, known.action) - target).abs()
+        found: Array = (error if error.ndim == 1 else error.mean(dim=0)).cpu().numpy()
+        return found
+
+    @torch.no_grad()
+    def disagreement(self, batch: Transitions) -> Array:
+        """Standard deviation of each value over the critics, (batch,)."""
+        known = self._known(batch)
+        spread: Array = self.critic(known.features, known.action).std(dim=0).cpu().numpy()
+        return spread
 
     def modules(self) -> dict[str, nn.Module]:
         """What a training state holds, by name."""

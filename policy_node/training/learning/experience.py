@@ -10,14 +10,12 @@ from policy_node.policies.actor import Actor
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.episode_weights import episode_weights, ticks_until_dropped
-from policy_node.training.learning.hindsight import (
-    RewardFunction,
-    goal_mixture,
-    parse_mixture,
-)
+from policy_node.training.learning.goal_choice import Judge
+from policy_node.training.learning.hindsight import goal_mixture, parse_mixture
 from policy_node.training.learning.normalizer import RunningStatistics
 from policy_node.training.learning.replay import EpisodeReplay, Episodes
-from policy_node.training.learning.transitions import Transitions, TransitionSampler
+from policy_node.training.learning.sampling import TransitionSampler
+from policy_node.training.learning.transitions import Transitions
 
 
 class Experience:
@@ -27,10 +25,11 @@ class Experience:
         config: The configuration; `replay_transitions` and `batch_size` are totals.
         spec: The task.
         workers: This worker among all.
-        compute_reward: Reward of relabelled goals.
+        sampler: Makes transitions.
         generator: Source of all randomness.
 
     Attributes:
+        judge: Who chooses goals and cuts returns, where the configuration asks for it.
         replay: The episodes held.
         statistics: Running statistics of observations and goals, by name.
         generator: Source of relabelling and drawing.
@@ -42,12 +41,13 @@ class Experience:
         config: TrainConfig,
         spec: TaskSpec,
         workers: Workers,
-        compute_reward: RewardFunction,
+        sampler: TransitionSampler,
         generator: np.random.Generator,
     ) -> None:
         self._config = config
         self._workers = workers
-        self._sampler = TransitionSampler(compute_reward, config.gamma)
+        self._sampler = sampler
+        self.judge: Judge | None = None
         self.generator = generator
         self.batch_size = workers.share(config.batch_size)
         self.statistics = {
@@ -81,7 +81,7 @@ class Experience:
         if len(episodes):
             row = np.repeat(np.arange(len(episodes)), episodes.ticks)
             valid = None if self._count_ticks is None else self._count_ticks(episodes)
-            goal = self._sample(episodes, row, env_steps, valid).goal
+            goal = self._sample(episodes, row, env_steps, valid, judge=None).goal
         for name, values, normalizer in (
             ('observation_statistics', observation, actor.observation_normalizer),
             ('goal_statistics', goal, actor.goal_normalizer),
@@ -92,7 +92,8 @@ class Experience:
     def batch(self, env_steps: int) -> Transitions:
         """Draws the transitions of one update, after `env_steps` environment steps."""
         row = self.replay.draw(self.batch_size, self._config.moved_share, self.generator)
-        return self._sample(self.replay.episodes, row, env_steps, self.replay.valid_ticks)
+        valid = self.replay.valid_ticks
+        return self._sample(self.replay.episodes, row, env_steps, valid, self.judge)
 
     def _sample(
         self,
@@ -100,9 +101,10 @@ class Experience:
         row: NDArray[np.int64],
         env_steps: int,
         valid_ticks: NDArray[np.int64] | None,
+        judge: Judge | None,
     ) -> Transitions:
         mixture = self._mixture(env_steps)
-        return self._sampler.sample(episodes, row, mixture, self.generator, valid_ticks)
+        return self._sampler.sample(episodes, row, mixture, self.generator, valid_ticks, judge)
 
     def _mixture(self, env_steps: int) -> dict[str, float]:
         config = self._config

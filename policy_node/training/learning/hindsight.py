@@ -6,7 +6,7 @@ mixture is from Pitis et al. 2020 (arXiv 2007.02832).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,14 +77,34 @@ def relabel(
     A transition leads from state `tick` to state `tick + 1`; `future` takes any state from
     `tick + 1` to the last, so the goal may be what this very step achieved.
     """
-    goal = episodes.desired_goal.take(row, axis=0)
+    source = draw_sources(mixture, len(row), generator)
+    return goals_of(episodes, row, tick, source, list(mixture), generator, valid_ticks)
+
+
+def draw_sources(
+    mixture: dict[str, float], count: int, generator: np.random.Generator
+) -> NDArray[np.intp]:
+    """Draws where goals come from: indices (count,) into the names of the mixture."""
     bounds = np.cumsum(list(mixture.values()))
-    choice = np.searchsorted(bounds / bounds[-1], generator.random(len(row)), side='right')
-    for index, source in enumerate(mixture):
-        chosen = np.flatnonzero(choice == index)
-        if source != 'real' and len(chosen):
+    return np.searchsorted(bounds / bounds[-1], generator.random(count), side='right')
+
+
+def goals_of(
+    episodes: Episodes,
+    row: NDArray[np.int64],
+    tick: NDArray[np.int64],
+    source: NDArray[np.intp],
+    names: Sequence[str],
+    generator: np.random.Generator,
+    valid_ticks: NDArray[np.int64] | None = None,
+) -> Array:
+    """Returns goals (batch, goal_size), each from the source `names[source]`."""
+    goal = episodes.desired_goal.take(row, axis=0)
+    for index, name in enumerate(names):
+        chosen = np.flatnonzero(source == index)
+        if name != 'real' and len(chosen):
             place = row[chosen], tick[chosen]
-            goal[chosen] = _goals(episodes, source, *place, generator, valid_ticks)
+            goal[chosen] = _goals(episodes, name, *place, generator, valid_ticks)
     return goal
 
 
@@ -113,8 +133,9 @@ def _goals(
         state = last
     else:
         state = generator.integers(1, last + 1)
-    return _flat(episodes.achieved_goal).take(row * (ticks + 1) + state, axis=0)
+    return flat(episodes.achieved_goal).take(row * (ticks + 1) + state, axis=0)
 
 
-def _flat(values: Array) -> Array:
+def flat(values: Array) -> Array:
+    """Rows of all episodes, one after the other."""
     return values.reshape(-1, values.shape[-1])

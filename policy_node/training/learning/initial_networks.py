@@ -97,6 +97,7 @@ def read_initial_networks(name: str) -> InitialNetworks:
 def _of_run(folder: Path) -> InitialNetworks:
     state = read_state(folder / STATE_FILE)
     config = config_from_dict(state.extra['config'])
+    _require_plain(config, str(folder))
     kept = ('actor', 'critic', 'target_', 'average_actor', 'observation_stat', 'goal_stat')
     tensors = {
         key: value
@@ -113,6 +114,13 @@ def _of_run(folder: Path) -> InitialNetworks:
     return InitialNetworks(tensors, network_shape(config), config.goal_features, origin)
 
 
+def _require_plain(config: TrainConfig, name: str) -> None:
+    """Refuses networks of a run that no other run has the like of."""
+    if (config.critics, config.norm, config.condition) != (1, 'none', 'none'):
+        found = f'critics {config.critics}, norm {config.norm}, condition {config.condition}'
+        raise ValueError(f'{name} cannot be started from: {found}')
+
+
 def _of_actor(name: str, path: Path) -> InitialNetworks:
     actor, info = checkpoint.load(path)
     tensors = {f'actor.{key}': value for key, value in actor.state_dict().items()}
@@ -127,6 +135,7 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         state = read_state(source)
         if state.extra.get('actor_sha256', digest) != digest:
             raise ValueError(f'{source} is the critic of another actor than {path}')
+        _require_plain(config_from_dict(state.extra['config']), str(source))
         critic = part_of(state.tensors, 'critic')
         tensors |= {f'critic.{key}': value for key, value in critic.items()}
     origin = {

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
@@ -27,12 +26,13 @@ from policy_node.training.learning.initial_networks import (
     InitialNetworks,
     network_shape,
 )
-from policy_node.training.learning.learner import Learner, Losses
+from policy_node.training.learning.learner import Losses
 from policy_node.training.learning.progress_row import Speed, progress_row
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.replay_file import load_replay
 from policy_node.training.learning.run_folder import RunFolder
 from policy_node.training.learning.run_log import RunLog
+from policy_node.training.learning.sampling import make_sampler
 from policy_node.training.learning.saving import NAME, Saver
 from policy_node.training.learning.simulations import make_simulation
 from policy_node.training.learning.threads import split_threads
@@ -122,11 +122,11 @@ class Trainer:
 
     def _build_learner(self) -> None:
         config, spec = self.config, self.spec
-        self.learner: Learner = DDPG(network_shape(config), config, self.device, self.workers)
-        shares = config.reward_distance, config.reward_rotation
-        compute_reward = scale_thresholds(self.simulation.metric, *shares).reward
+        self.learner = DDPG(network_shape(config), config, self.device, self.workers)
+        sampler = make_sampler(config, self.simulation.metric)
         generator = self._seed(env_steps=0)
-        self.experience = Experience(config, spec, self.workers, compute_reward, generator)
+        self.experience = Experience(config, spec, self.workers, sampler, generator)
+        self.experience.judge = self.learner
 
     def stop(self, reason: str) -> None:
         """Asks the run to end after the current cycle, with a checkpoint."""
@@ -338,14 +338,6 @@ class _Clock:
         """Writes both times into the counters."""
         counters.seconds = time.monotonic() - self._started
         counters.processor_seconds = time.process_time() - self._processor_started
-
-
-def scale_thresholds(metric: GoalMetric, distance: float, rotation: float) -> GoalMetric:
-    """A metric with these shares of the success distance and rotation of `metric`."""
-    spec = replace(metric.spec, distance_threshold=metric.spec.distance_threshold * distance)
-    if spec.rotation_threshold is not None:
-        spec = replace(spec, rotation_threshold=spec.rotation_threshold * rotation)
-    return replace(metric, spec=spec)
 
 
 def _run_now(function: Callable[..., Collected], *arguments: Any) -> Future[Collected]:

@@ -12,7 +12,7 @@ from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.gamble import GambleSimulation
 from policy_node.training.learning.replay import Episodes
-from policy_node.training.learning.transitions import TransitionSampler
+from policy_node.training.learning.sampling import TransitionSampler
 
 torch.set_num_threads(1)
 

@@ -13,7 +13,7 @@ from policy_node.training.learning.hindsight import (
     relabel,
 )
 from policy_node.training.learning.replay import Episodes
-from policy_node.training.learning.transitions import TransitionSampler
+from policy_node.training.learning.sampling import TransitionSampler
 
 COUNT, TICKS = 6, 10
 
@@ -189,7 +189,9 @@ def test_batches_are_consistent_transitions_with_recomputed_rewards(episodes: Ep
     reached = (batch.goal == batch.next_observation[:, :2]).all(axis=1)
     assert 0.1 < reached.mean() < 0.5
     assert (batch.reward == np.where(reached, 0.0, -1.0)).all()
-    assert all(getattr(batch, name).dtype == np.float32 for name in type(batch).__slots__)
+    assert batch.condition is None and batch.next_condition is None
+    for name in ('observation', 'next_observation', 'goal', 'action', 'reward', 'discount'):
+        assert getattr(batch, name).dtype == np.float32
 
 
 def test_the_same_generator_gives_the_same_batch(episodes: Episodes) -> None:

@@ -91,7 +91,9 @@ def test_a_study_runs_measures_and_gives_the_same_bits_again(
     assert all(float(row['processor_seconds']) > 0 for row in runs)
     page = (report / 'README.md').read_text()
     assert page.startswith('# Before') and page.endswith('after\n') and 'old' not in page
-    assert '\n| FetchReach | `weighted`: the same with importance weights | 1 | ' in page
+    assert (
+        '\n| FetchReach | `weighted`: half future, half actual, importance weights | 1 | ' in page
+    )
     assert (report / 'figure.png').read_bytes()[:4] == b'\x89PNG'
     about = json.loads((report / 'study.json').read_text())
     assert about['request'] == 2 and len(about['source_revisions']) == 1

@@ -23,11 +23,11 @@ from policy_node.training.learning.config import TrainConfig, recipe_config
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.logged_episodes import read_experience
 from policy_node.training.learning.run_log import read_progress
+from policy_node.training.learning.sampling import scale_thresholds
 from policy_node.training.learning.trainer import (
     Collected,
     Trainer,
     TrainingError,
-    scale_thresholds,
 )
 from policy_node.training.learning.training_state import read_state
 from policy_node.training.ship_actor import main as ship_actor

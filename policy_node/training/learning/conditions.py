@@ -1,0 +1,155 @@
+"""Value functions with one input more: how close is close enough, or how much time is left.
+
+A transition is then learnt from under a value of that input drawn at random, as it is for a goal
+chosen in hindsight. The actor acts at one value of it for good, so that what is saved is an actor
+like any other: the input is a constant, and its column goes into the bias of the first layer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from policy_node.policies.actor import MLP
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.replay import Array
+
+Goals = NDArray[np.float64]
+# Thresholds drawn, as shares of the task's own.
+SMALLEST_THRESHOLD, LARGEST_THRESHOLD = 0.5, 8.0
+
+
+class Condition(Protocol):
+    """What a value is conditioned on, beside state, action and goal."""
+
+    def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+        """Draws the values (count,) that transitions are learnt from under."""
+        ...
+
+    def inputs(self, drawn: NDArray[np.float64]) -> Array:
+        """What the networks see of them, (count, 1)."""
+        ...
+
+    def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
+        """Reward (count,) of goals under them."""
+        ...
+
+    def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Their values one step later, (count,)."""
+        ...
+
+    def goes_on(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether anything after this step counts, (count,)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """The success threshold, a multiple of the task's own, log-uniform.
+
+    From coarse goals, which are reached often, the value of fine ones can be generalised.
+
+    Attributes:
+        metric: Distances and thresholds of the task.
+    """
+
+    metric: GoalMetric
+
+    def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+        """Draws multiples of the threshold."""
+        low, high = np.log(SMALLEST_THRESHOLD), np.log(LARGEST_THRESHOLD)
+        return np.asarray(np.exp(generator.uniform(low, high, count)))
+
+    def inputs(self, drawn: NDArray[np.float64]) -> Array:
+        """Their logarithms."""
+        return np.log(drawn).astype(np.float32)[:, None]
+
+    def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
+        """0 within that multiple of the threshold, else -1."""
+        distance, rotation = self.metric.distances(achieved, desired)
+        spec = self.metric.spec
+        reached = distance < drawn * spec.distance_threshold
+        if spec.rotation_threshold is not None:
+            reached &= rotation < drawn * spec.rotation_threshold
+        return reached.astype(np.float64) - 1.0
+
+    def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same."""
+        return drawn
+
+    def goes_on(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Always."""
+        return np.ones(len(drawn), np.bool_)
+
+
+@dataclass(frozen=True, slots=True)
+class Horizon:
+    """The number of steps left: values are rewards of that many, as in TDM (arXiv 1802.09081).
+
+    Attributes:
+        ticks: Steps of an episode, the most that can be left.
+        compute_reward: (achieved_goal, desired_goal) -> reward, batched.
+    """
+
+    ticks: int
+    compute_reward: Callable[[Goals, Goals], Goals]
+
+    def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+        """Draws from 1 to the length of an episode."""
+        return generator.integers(1, self.ticks + 1, count).astype(np.float64)
+
+    def inputs(self, drawn: NDArray[np.float64]) -> Array:
+        """The share of an episode."""
+        return (drawn / self.ticks).astype(np.float32)[:, None]
+
+    def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
+        """That of the task."""
+        del drawn
+        return self.compute_reward(achieved, desired)
+
+    def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """One less."""
+        return drawn - 1.0
+
+    def goes_on(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether a step is left after this one."""
+        return drawn > 1.0
+
+
+# The input at which an actor acts: the threshold of the task itself; a whole episode left.
+ACTING_INPUT = {'threshold': 0.0, 'horizon': 1.0}
+
+
+def make_condition(
+    kind: str, metric: GoalMetric, compute_reward: Callable[[Goals, Goals], Goals]
+) -> Condition | None:
+    """Returns the condition called `kind`; None for `none`."""
+    if kind == 'threshold':
+        return Threshold(metric)
+    if kind == 'horizon':
+        return Horizon(metric.spec.episode_ticks, compute_reward)
+    return None
+
+
+@torch.no_grad()
+def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
+    """A network without its last input, which is `value` for good.
+
+    Args:
+        network: Its first layer takes `shape.feature_size` + 1 inputs.
+        shape: Of the network to make.
+        value: That input.
+    """
+    folded = MLP(shape.feature_size, shape.action_size, shape)
+    state = network.state_dict()
+    weight = state['hidden.0.weight']
+    state['hidden.0.weight'] = weight[:, :-1].clone()
+    state['hidden.0.bias'] = state['hidden.0.bias'] + value * weight[:, -1]
+    folded.load_state_dict(state)
+    return folded

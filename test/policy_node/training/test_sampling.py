@@ -1,0 +1,189 @@
+"""Returns of several steps, chosen goals and conditions, on a chain whose values are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.tasks import task_spec
+from policy_node.policies.actor import Actor
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.conditions import Horizon, Threshold, fold
+from policy_node.training.learning.config import recipe_config
+from policy_node.training.learning.ddpg import DDPG
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.multi_step import StepCounter
+from policy_node.training.learning.replay import Array, Episodes
+from policy_node.training.learning.sampling import TransitionSampler
+from policy_node.training.learning.transitions import Transitions
+
+torch.set_num_threads(1)
+
+TICKS = 6
+REAL = {'real': 1.0}
+
+
+@pytest.fixture
+def walk() -> Episodes:
+    """Twenty walks from place 0 to 6, a step each; the goal is place 4; actions are 1."""
+    place = np.tile(np.arange(TICKS + 1, dtype=np.float32)[None, :, None], (20, 1, 1))
+    goal = np.full((20, 1), 4.0, np.float32)
+    return Episodes(place, place, goal, np.ones((20, TICKS, 1), np.float32))
+
+
+def at_goal(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    return (np.abs(achieved - goal).max(axis=-1) < 0.5) - 1.0
+
+
+def draw(
+    episodes: Episodes, sampler: TransitionSampler, mixture: dict[str, float] = REAL
+) -> Transitions:
+    generator = np.random.default_rng(0)
+    row = generator.integers(len(episodes), size=4_000)
+    return sampler.sample(episodes, row, mixture, generator, judge=Judge())
+
+
+class Judge:
+    """Acts as the walk does before place 3 and otherwise after; likes goals near 5."""
+
+    def act(self, observation: Array, goal: Array) -> Array:
+        return np.where(observation < 3.0, 1.0, -1.0).astype(np.float32)
+
+    def surprise(self, batch: Transitions) -> Array:
+        return -np.abs(batch.goal[:, 0] - 5.0)
+
+    def disagreement(self, batch: Transitions) -> Array:
+        return batch.goal[:, 0]
+
+
+def test_a_return_sums_discounted_rewards_and_bootstraps_where_it_ends(walk: Episodes) -> None:
+    batch = draw(walk, TransitionSampler(at_goal, 0.5, StepCounter(3)))
+    first, last = batch.observation[:, 0], batch.next_observation[:, 0]
+    assert (last == np.minimum(first + 3, TICKS)).all(), 'never beyond the episode'
+    np.testing.assert_allclose(batch.discount, 0.5 ** (last - first))
+    # From place 2 the goal 4 is the second step of three; from 4 on it was left again.
+    expected = {0.0: -1.75, 1.0: -1.5, 2.0: -1.25, 3.0: -0.75, 4.0: -1.5, 5.0: -1.0}
+    assert {float(p): float(r) for p, r in zip(first, batch.reward, strict=True)} == expected
+
+
+def test_several_steps_of_one_are_one_step(walk: Episodes) -> None:
+    plain = draw(walk, TransitionSampler(at_goal, 0.9))
+    counted = draw(walk, TransitionSampler(at_goal, 0.9, StepCounter(1)))
+    for name in ('observation', 'next_observation', 'action', 'reward', 'discount', 'goal'):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(counted, name))
+
+
+def test_lambda_draws_the_weights_of_the_lambda_return(walk: Episodes) -> None:
+    batch = draw(walk, TransitionSampler(at_goal, 0.5, StepCounter(3, 'lambda', trace=0.6)))
+    start = batch.observation[:, 0] == 0.0
+    steps = (batch.next_observation - batch.observation)[start, 0]
+    shares = [float((steps == n).mean()) for n in (1, 2, 3)]
+    assert shares == pytest.approx([0.4, 0.24, 0.36], abs=0.05)
+
+
+def test_cut_ends_a_return_before_an_action_the_actor_would_not_take(walk: Episodes) -> None:
+    batch = draw(walk, TransitionSampler(at_goal, 0.5, StepCounter(5, 'cut')))
+    first, last = batch.observation[:, 0], batch.next_observation[:, 0]
+    # At places 3 and up it would turn round; the first action of a return is always its own.
+    expected = np.where(first < 3, 3, first + 1)
+    assert (last == expected).all()
+
+
+@pytest.mark.parametrize(('choice', 'lowest'), [('bellman', 4.0), ('uncertain', 4.0)])
+def test_the_best_of_several_future_goals_is_taken(
+    walk: Episodes, choice: str, lowest: float
+) -> None:
+    mixture = {'future': 0.5, 'real': 0.5}
+    any_goal = draw(walk, TransitionSampler(at_goal, 0.9), mixture)
+    batch = draw(walk, TransitionSampler(at_goal, 0.9, goal_choice=choice), mixture)
+    early = batch.observation[:, 0] == 0.0
+    wanted = 5.0 if choice == 'bellman' else 6.0
+    share = (batch.goal[early, 0] == wanted).mean()
+    # One of eight uniform draws from six places is the best with 1 - (5/6)^8 = .77; half stay real.
+    assert share == pytest.approx(0.5 * 0.77, abs=0.07)
+    assert (any_goal.goal[early, 0] == wanted).mean() < 0.15
+    assert (batch.goal[early, 0] == 4.0).mean() >= 0.45
+    assert (batch.goal[:, 0] >= np.minimum(batch.observation[:, 0] + 1, lowest)).all()
+
+
+def test_a_threshold_is_in_the_reward_and_in_the_input() -> None:
+    metric = GoalMetric(task_spec('FetchReach'))
+    condition = Threshold(metric)
+    drawn = condition.draw(2_000, np.random.default_rng(0))
+    assert 0.5 <= drawn.min() < 0.55 and 7.0 < drawn.max() <= 8.0
+    assert np.median(drawn) == pytest.approx(2.0, abs=0.2), 'log-uniform'
+    achieved, desired = np.zeros((3, 3)), np.array([[0.09, 0, 0]] * 3)
+    reward = condition.reward(achieved, desired, np.array([1.0, 1.7, 1.9]))
+    assert reward.tolist() == [-1.0, -1.0, 0.0]
+    np.testing.assert_allclose(condition.inputs(np.array([1.0, np.e])), [[0.0], [1.0]], atol=1e-6)
+
+
+def past_goal(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    return (achieved > goal - 0.5)[:, 0] - 1.0
+
+
+def test_values_count_the_rewards_of_the_steps_left(walk: Episodes) -> None:
+    torch.manual_seed(0)
+    options = {'precision': 'float32', 'gamma': 0.5, 'learning_rate': 3e-3, 'target': 'none'}
+    config = recipe_config('FetchReach', 'paper', condition='horizon', **options)
+    learner = DDPG(NetworkShape(1, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
+    sampler = TransitionSampler(past_goal, 0.5, condition=Horizon(3, past_goal))
+    generator = np.random.default_rng(0)
+    # Whatever is done, a walk goes on: values of all actions are alike.
+    walk.action[:] = generator.uniform(-1, 1, walk.action.shape)
+    for _ in range(400):
+        row = generator.integers(len(walk), size=64)
+        learner.update(sampler.sample(walk, row, REAL, generator))
+    found = {}
+    for place in (0.0, 5.0):
+        features = learner.actor.features(torch.full((3, 1), place), torch.full((3, 1), 4.0))
+        inputs = torch.cat([features, torch.tensor([[1.0], [2.0], [3.0]]) / 3], dim=-1)
+        with torch.no_grad():
+            found[place] = learner.critic(inputs, torch.ones(3, 1)).tolist()
+    assert found[0.0] == pytest.approx([-1.0, -1.5, -1.75], abs=0.15), 'of 1, 2 and 3 steps'
+    assert found[5.0] == pytest.approx([0.0, 0.0, 0.0], abs=0.15)
+
+
+def test_an_actor_at_one_condition_is_an_actor_like_any_other() -> None:
+    options = {'precision': 'float32', 'condition': 'threshold'}
+    config = recipe_config('FetchReach', 'paper', **options)
+    learner = DDPG(NetworkShape(4, 3, 2, (16, 16)), config, torch.device('cpu'), Workers())
+    plain = learner.acting_actor()
+    assert isinstance(plain, Actor) and plain.network.hidden[0].in_features == 7
+    observation, goal = np.random.default_rng(0).normal(size=(2, 5, 4))[0], np.ones((5, 3))
+    action, _ = plain.predict({'observation': observation, 'desired_goal': goal})
+    own = learner.act(observation.astype(np.float32), goal.astype(np.float32))
+    np.testing.assert_allclose(action, own, atol=1e-6)
+    folded = fold(learner.actor.network, plain.shape, 2.0)
+    features = torch.randn(5, 7)
+    wide = torch.cat([features, torch.full((5, 1), 2.0)], dim=-1)
+    torch.testing.assert_close(folded(features), learner.actor.network(wide))
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'correction': 'cut'}, 'correction cut needs n_step above 1'),
+        ({'aggregate': 'min'}, 'aggregate min needs critics above 1'),
+        ({'norm': 'layer', 'layer_norm': True}, 'norm layer excludes layer_norm'),
+        ({'norm': 'batch'}, 'norm batch needs target none'),
+        ({'goal_choice': 'bellman', 'goals': 'actual=.8'}, 'bellman needs future or near goals'),
+        ({'goal_choice': 'uncertain'}, 'goal_choice uncertain needs critics above 1'),
+        ({'condition': 'horizon', 'n_step': 3}, 'condition horizon excludes n_step above 1'),
+        ({'condition': 'threshold', 'reward_type': 'dense'}, 'needs reward_type sparse'),
+        ({'condition': 'horizon', 'importance': 'density'}, 'excludes goal_choice and importance'),
+        ({'importance': 'density', 'strategy': 'none'}, 'needs goals chosen in hindsight'),
+        (
+            {'init_from': 'FetchReach', 'critics': 2},
+            'init_from excludes condition',
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(
+    changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message) as raised:
+        recipe_config('FetchReach', 'best', **changes)
+    assert '\n' not in str(raised.value)
