@@ -1,6 +1,6 @@
 """`view`: a running robot, or episode files, on a page in the browser.
 
-`live.py` follows a robot over ROS, `player.py` plays files without it; `page.py` draws what either
+`live.py` follows a robot over ROS, `player.py` plays files without it; `page/` draws what either
 says, in MuJoCo's web viewer, which `web.py` serves behind `guard.py`.
 """
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
-from fetch_hand_sim.view.messages import Graphs, Series
+from fetch_hand_sim.view.picture import Graphs, Series
 from msgs_spec.tasks import TaskSpec
 
 Array = NDArray[np.float64]

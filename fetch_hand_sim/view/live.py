@@ -13,14 +13,8 @@ from rclpy.node import Node
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import tracked_position
 from fetch_hand_sim.view.curves import Curves
-from fetch_hand_sim.view.messages import (
-    TRAIL_TICKS,
-    Facts,
-    LatestRequest,
-    Picture,
-    Request,
-    SetGoal,
-)
+from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Picture
+from fetch_hand_sim.view.requests import LatestRequest, Request, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RobotRequests
 from fetch_hand_sim.view.robot_watch import ANY_TASK, WATCHING, RobotWatch, SeenTick
 from msgs_spec.codecs import decode_status
@@ -42,6 +36,7 @@ class LiveRobot:
             may_command: Whether the page may act.
         """
         self._may_command = may_command
+        self._name = node.get_fully_qualified_name()
         self._sim_name = f'{node.get_namespace().rstrip("/")}/sim_node'
         self._facts = Facts(may_command=may_command)
         self._commander = ''
@@ -136,6 +131,14 @@ class LiveRobot:
                     commander=values.get('commanders', '-'),
                     push_limit=self._requests.push_limit,
                 )
+                self._yield_to_others()
+
+    def _yield_to_others(self) -> None:
+        """Stops to command where somebody else does: two would fight over the robot."""
+        others = [each for each in self._facts.commander.split(', ') if each != self._name]
+        if self._facts.is_commanding and others not in ([], ['-']):
+            self._requests.perform(SetCommanding(False))
+            self._update_facts(notice=f'{", ".join(others)} commands: your sliders do not')
 
     def _update_facts(self, **changes: Any) -> None:
         self._facts = dataclasses.replace(self._facts, **changes)

@@ -13,19 +13,16 @@ from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.films.recording import Recording, load_recording
 from fetch_hand_sim.simulation.scene import tracked_position
 from fetch_hand_sim.view.curves import Curves
-from fetch_hand_sim.view.messages import (
-    TRAIL_TICKS,
+from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Picture, Timeline
+from fetch_hand_sim.view.requests import (
     ChangeEpisode,
-    Facts,
     LatestRequest,
     OpenEpisode,
-    Picture,
     Request,
     Seek,
     SetPaused,
     SetSpeed,
     StepOnce,
-    Timeline,
 )
 
 Array = NDArray[np.float64]

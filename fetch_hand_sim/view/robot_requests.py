@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 
 from fetch_hand_sim.episodes.perturbations import bounded_wrench
-from fetch_hand_sim.view.messages import (
+from fetch_hand_sim.view.remote_node import RemoteNode
+from fetch_hand_sim.view.requests import (
     ChooseActor,
     LatestRequest,
     Push,
@@ -25,7 +26,6 @@ from fetch_hand_sim.view.messages import (
     SetSpeed,
     StepOnce,
 )
-from fetch_hand_sim.view.remote_node import RemoteNode
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_message
 from msgs_spec.ros import rclpy_profile, ros_message_class

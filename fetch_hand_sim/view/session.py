@@ -8,8 +8,9 @@ from typing import Protocol
 from mujoco.studio import messages, plugin, viewer_handle
 
 from fetch_hand_sim.simulation.scene import Scene
-from fetch_hand_sim.view.messages import LatestRequest, Picture, Push, Request, ShowScene
 from fetch_hand_sim.view.page.body_drag import pulls
+from fetch_hand_sim.view.picture import Picture, ShowScene
+from fetch_hand_sim.view.requests import LatestRequest, Push, Request
 
 
 class Source(Protocol):

@@ -20,7 +20,16 @@ import rclpy
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.view.live import LiveRobot
-from fetch_hand_sim.view.messages import ChooseActor, Push, Reset, SetGoal, SetPaused, StepOnce
+from fetch_hand_sim.view.requests import (
+    ChooseActor,
+    Push,
+    Reset,
+    SetCommand,
+    SetCommanding,
+    SetGoal,
+    SetPaused,
+    StepOnce,
+)
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import task_spec
@@ -110,6 +119,32 @@ def test_another_actor_takes_over(start_process: Start) -> None:
         follower.until(has_changed, 'random commands')
 
 
+def test_the_page_commands_until_somebody_else_does(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    with client(REACH) as connection:
+        connection.subscribe('applied_command')
+        follower = Follower(connection)
+        follower.until(lambda p: p.frame is not None and p.facts.rate > 0.0, 'picture')
+        values = np.array([0.25, -0.5, 0.75, 1.0])
+        follower.robot.perform(SetCommanding(True))
+
+        def is_obeyed(picture):
+            follower.robot.perform(SetCommand(values))
+            return picture.command is not None and np.allclose(picture.command, values)
+
+        follower.until(is_obeyed, 'command that is applied')
+        start_process(*POLICY_NODE)
+        follower.until(
+            lambda p: not p.facts.is_commanding and 'your sliders do not' in p.facts.notice,
+            'page that gives way',
+        )
+        assert connection.node.count_publishers('/commands') == 1
+        follower.robot.perform(SetCommand(values))
+        stamp = follower.picture.stamp_ns
+        follower.until(lambda p: p.stamp_ns > stamp + 10**9, 'a second more')
+        assert not np.allclose(follower.picture.command, values)
+
+
 def test_who_may_only_watch_changes_nothing(start_process: Start) -> None:
     start_process(*SIM_NODE, *ros_args(task='FetchReach'))
     with client(REACH) as connection:
@@ -188,6 +223,30 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
         assert small.shape == picture.shape and small.std() > 10.0
     node.send_signal(signal.SIGINT)
     assert node.wait(10) == 0
+
+
+def test_without_opengl_the_camera_says_so_and_the_rest_goes_on(
+    start_process: Start, ros_environment: dict[str, str]
+) -> None:
+    from sensor_msgs.msg import Image
+
+    start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    environment = ros_environment | {'MUJOCO_GL': 'disabled'}
+    node = start_process(*VISUALIZATION, env=environment)
+    with client(REACH) as connection:
+        scalars: list[object] = []
+        (distance, *_) = scalar_topics(REACH)
+        for name, kind, profile, take in (
+            ('camera/image_raw', Image, distance.qos, lambda _: None),
+            (distance.name, ros_message_class(distance.type_name), distance.qos, scalars.append),
+        ):
+            connection.node.create_subscription(kind, name, take, rclpy_profile(profile))
+        connection.spin_until(lambda: len(scalars) > 25, 'scalars')
+    node.send_signal(signal.SIGINT)
+    output, errors = node.communicate(timeout=20)
+    assert node.returncode == 0
+    (line,) = [line for line in errors.splitlines() if 'ERROR' in line]
+    assert 'rendering needs OpenGL: apt install' in line and 'Traceback' not in output + errors
 
 
 def test_scalars_are_those_of_the_tick_with_their_stamp(start_process: Start) -> None:

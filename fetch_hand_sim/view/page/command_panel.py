@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.messages import Facts, Picture, SetCommand, SetCommanding
 from fetch_hand_sim.view.page.teleoperation import Teleoperation
 from fetch_hand_sim.view.page.windows import ITEM_WIDTH, Send, say
+from fetch_hand_sim.view.picture import Facts, Picture
+from fetch_hand_sim.view.requests import SetCommand, SetCommanding
 from msgs_spec.tasks import TaskSpec
 
 _SELECTED = imgui.Vec4(0.1, 0.45, 0.85, 1.0)

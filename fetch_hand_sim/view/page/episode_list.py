@@ -10,8 +10,8 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.summary import read_summary
-from fetch_hand_sim.view.messages import OpenEpisode
 from fetch_hand_sim.view.page.windows import Send
+from fetch_hand_sim.view.requests import OpenEpisode
 
 
 def describe(path: Path) -> str:

@@ -6,8 +6,8 @@ import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from numpy.typing import NDArray
 
-from fetch_hand_sim.view.messages import ReleaseGoal, SetGoal
 from fetch_hand_sim.view.page.windows import ITEM_WIDTH, Send
+from fetch_hand_sim.view.requests import ReleaseGoal, SetGoal
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler
 from msgs_spec.tasks import GoalKind, TaskSpec
 

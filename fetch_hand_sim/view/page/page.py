@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.rendering import make_options
 from fetch_hand_sim.simulation.scene import Frame, Scene
-from fetch_hand_sim.view.messages import LatestRequest, Picture, Request, SetGoal, ShowScene
 from fetch_hand_sim.view.page.body_drag import BodyDrag
 from fetch_hand_sim.view.page.goal_drag import Handle, find_handle, moved_goal
 from fetch_hand_sim.view.page.introduction import drag_hint
 from fetch_hand_sim.view.page.panels import Panels
 from fetch_hand_sim.view.page.ray import MousePlace, Ray, mouse_ray
+from fetch_hand_sim.view.picture import Picture, ShowScene
+from fetch_hand_sim.view.requests import LatestRequest, Request, SetGoal
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.messages import Facts, Picture, Timeline
 from fetch_hand_sim.view.page.episode_list import EpisodeList
 from fetch_hand_sim.view.page.plots import draw_plots
 from fetch_hand_sim.view.page.robot_panel import RobotPanel
@@ -19,6 +18,7 @@ from fetch_hand_sim.view.page.windows import (
     say,
     untitled_window,
 )
+from fetch_hand_sim.view.picture import Facts, Picture, Timeline
 from msgs_spec.tasks import task_spec
 
 _TIMELINE_HEIGHT = 74.0

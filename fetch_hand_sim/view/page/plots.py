@@ -7,7 +7,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 from numpy.typing import NDArray
 
-from fetch_hand_sim.view.messages import Graphs, Series
+from fetch_hand_sim.view.picture import Graphs, Series
 from msgs_spec.tasks import TaskSpec
 
 Array = NDArray[np.float64]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.messages import Push
 from fetch_hand_sim.view.page.windows import ITEM_WIDTH, Send
+from fetch_hand_sim.view.requests import Push
 from msgs_spec.tasks import TaskSpec
 
 

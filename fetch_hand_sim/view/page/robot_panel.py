@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.messages import ChooseActor, Facts, Picture, Reset
 from fetch_hand_sim.view.page.command_panel import CommandPanel
 from fetch_hand_sim.view.page.goal_panel import draw_goal_sliders
 from fetch_hand_sim.view.page.introduction import drag_hint, introduction
 from fetch_hand_sim.view.page.push_panel import PushPanel
 from fetch_hand_sim.view.page.time_controls import draw_pause, draw_speed, draw_step
 from fetch_hand_sim.view.page.windows import ITEM_WIDTH, Send, say
+from fetch_hand_sim.view.picture import Facts, Picture
+from fetch_hand_sim.view.requests import ChooseActor, Reset
 from msgs_spec.tasks import TaskSpec
 
 _GREEN = imgui.Vec4(0.1, 0.55, 0.2, 1.0)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.messages import SetPaused, SetSpeed, StepOnce
 from fetch_hand_sim.view.page.windows import Send
+from fetch_hand_sim.view.requests import SetPaused, SetSpeed, StepOnce
 
 _SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0)
 

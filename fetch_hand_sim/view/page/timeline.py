@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.messages import ChangeEpisode, Facts, Seek, Timeline
 from fetch_hand_sim.view.page.time_controls import draw_pause, draw_speed, draw_step
 from fetch_hand_sim.view.page.windows import Send
+from fetch_hand_sim.view.picture import Facts, Timeline
+from fetch_hand_sim.view.requests import ChangeEpisode, Seek
 
 
 def draw_timeline(timeline: Timeline, facts: Facts, send: Send) -> None:

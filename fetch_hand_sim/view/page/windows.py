@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.messages import LatestRequest, Request
+from fetch_hand_sim.view.requests import LatestRequest, Request
 
 Send = Callable[[Request | LatestRequest], None]
 

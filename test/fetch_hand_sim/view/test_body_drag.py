@@ -12,9 +12,9 @@ from mujoco.studio import messages
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rendering import make_options, simulation_frame
 from fetch_hand_sim.simulation.scene import GHOST, Scene
-from fetch_hand_sim.view.messages import Push
 from fetch_hand_sim.view.page.body_drag import BodyDrag, can_be_pulled, pulls
 from fetch_hand_sim.view.page.ray import mouse_ray
+from fetch_hand_sim.view.requests import Push
 from fetch_hand_sim.view.session import Requests
 from msgs_spec.tasks import TASKS
 

@@ -11,7 +11,8 @@ from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.films.recording import load_recording
 from fetch_hand_sim.view.file_session import find_playable
-from fetch_hand_sim.view.messages import (
+from fetch_hand_sim.view.player import Player
+from fetch_hand_sim.view.requests import (
     ChangeEpisode,
     OpenEpisode,
     Seek,
@@ -19,7 +20,6 @@ from fetch_hand_sim.view.messages import (
     SetSpeed,
     StepOnce,
 )
-from fetch_hand_sim.view.player import Player
 from msgs_spec.tasks import TASKS
 from support.episode_recorder import Recorder
 
