@@ -1,0 +1,92 @@
+"""What the page may do to a robot, and what never leaves it."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import rclpy
+
+from fetch_hand_sim.view.requests import OpenEpisode, Push, SetCommand, SetCommanding
+from fetch_hand_sim.view.robot_requests import RobotRequests
+from msgs_spec.codecs import decode
+from msgs_spec.ros import rclpy_profile, ros_message_class
+from msgs_spec.tasks import task_spec
+from msgs_spec.topics import topic
+
+SPEC = task_spec('FetchPush')
+WRENCH = np.array([30.0, 0.0, 40.0, 0.0, 0.0, 0.0])
+
+
+class Desk:
+    """The page's side and somebody who hears what it sends."""
+
+    def __init__(self, name):
+        self.node = rclpy.create_node('page')
+        self.told = {}
+        self.requests = RobotRequests(self.node, self.told.update)
+        self.requests.take_task(SPEC)
+        self.source, self.heard = topic(SPEC, name), []
+        self.node.create_subscription(
+            ros_message_class(self.source.type_name),
+            name,
+            self.heard.append,
+            rclpy_profile(self.source.qos),
+        )
+
+    def count_publishers(self):
+        return self.node.count_publishers(self.source.name)
+
+    def wait_for_message(self):
+        end = time.monotonic() + 20.0
+        while not self.heard and time.monotonic() < end:
+            rclpy.spin_once(self.node, timeout_sec=0.1)
+        return self.heard[-1]
+
+
+@pytest.fixture
+def desk(request):
+    rclpy.init()
+    desk = Desk(request.param)
+    yield desk
+    desk.node.destroy_node()
+    rclpy.shutdown()
+
+
+@pytest.mark.parametrize('desk', ['perturb'], indirect=True)
+def test_nothing_is_pushed_where_the_robot_takes_none(desk):
+    desk.requests.perform(Push('object0', WRENCH))
+    assert desk.count_publishers() == 0
+    assert 'perturb_limit' in desk.told['notice']
+
+
+@pytest.mark.parametrize('desk', ['perturb'], indirect=True)
+def test_a_push_beyond_the_limit_leaves_within_it(desk):
+    desk.requests.push_limit = 10.0
+    desk.requests.perform(Push('object0', WRENCH))
+    message = desk.wait_for_message()
+    assert message.header.frame_id == 'object0'
+    sent = decode(desk.source, message)
+    np.testing.assert_allclose(sent, 0.2 * WRENCH, rtol=1e-6)
+    assert np.linalg.norm(sent[:3]) <= 10.0
+
+
+@pytest.mark.parametrize('desk', ['commands'], indirect=True)
+def test_sliders_command_only_while_they_are_switched_on(desk):
+    values = np.array([0.1, 0.2, 0.3, -1.0])
+    desk.requests.perform(SetCommand(values))
+    assert desk.count_publishers() == 0
+    desk.requests.perform(SetCommanding(True))
+    desk.requests.perform(SetCommand(values))
+    np.testing.assert_array_equal(decode(desk.source, desk.wait_for_message()), values)
+    desk.requests.perform(SetCommanding(False))
+    desk.requests.perform(SetCommand(values))
+    assert desk.count_publishers() == 0
+    assert desk.told['is_commanding'] is False
+
+
+@pytest.mark.parametrize('desk', ['perturb'], indirect=True)
+def test_what_only_files_understand_is_nothing_to_a_robot(desk):
+    desk.requests.perform(OpenEpisode(1))
+    assert desk.told == {}
