@@ -95,9 +95,9 @@ class LiveRobot:
         frame = dataclasses.replace(tick.frame, desired_goal=goal)
         self._trail.append(tracked_position(frame))
         self._curves.add(tick.stamp_ns * 1e-9, frame, tick.reward, tick.command)
-        facts = self._facts
+        facts, steps = self._facts, int(tick.command is not None)
         self._update_facts(
-            tick=facts.tick + 1, episode_return=facts.episode_return + (tick.reward or 0.0)
+            tick=facts.tick + steps, episode_return=facts.episode_return + (tick.reward or 0.0)
         )
         self._picture = Picture(
             task=spec.name,

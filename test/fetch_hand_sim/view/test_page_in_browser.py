@@ -43,9 +43,8 @@ VIEW = (sys.executable, '-m', 'fetch_hand_sim.view')
 BAR = 32
 # Seconds in which a page changes: a machine without a GPU that does other things too is slow.
 PATIENCE = 120.0
-# Of a list; and the colour of headers.
+# Of a list.
 ROW = 18.0
-HEADER = (230, 232, 235)
 
 
 @pytest.fixture
@@ -85,7 +84,9 @@ def wait_for(browser: Browser, condition: Callable[[np.ndarray], bool], what: st
     """Waits until the page looks as it should; returns what it then looks like."""
     end = time.monotonic() + PATIENCE
     while not condition(picture := browser.screenshot()):
-        assert time.monotonic() < end, f'no {what}'
+        if time.monotonic() > end:
+            keep(f'without {what}', picture)
+            raise AssertionError(f'no {what}')
         browser.wait(0.5)
     return picture
 
@@ -121,10 +122,15 @@ def is_goal(pixel: np.ndarray) -> bool:
 
 
 def headers(picture: np.ndarray) -> list[float]:
-    """Where headers and chosen rows of the panels on the left are, from above."""
-    is_header = (np.abs(picture[40:500, 325].astype(int) - HEADER) < 3).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], is_header, [0]])))
-    return [40.0 + (a + b) / 2.0 for a, b in edges.reshape(-1, 2) if b - a > 12]
+    """Where headers and chosen rows of the panels on the left are, from above, in any theme."""
+    column = picture[40:500, 325].astype(int)
+    colors, counts = np.unique(column, axis=0, return_counts=True)
+    is_panel = (np.abs(column - colors[counts.argmax()]) < 4).all(axis=1)
+    same = (np.abs(np.diff(column, axis=0)) < 4).all(axis=1) & ~is_panel[1:]
+    same[np.flatnonzero(is_panel).max() - 1 :] = False
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same, [0]])))
+    runs = edges.reshape(-1, 2)
+    return [41.0 + (start + end) / 2.0 for start, end in runs if 12 < end - start < 26]
 
 
 @pytest.fixture
