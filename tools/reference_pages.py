@@ -17,7 +17,8 @@ from sphinx.pycode import ModuleAnalyzer
 from fetch_hand_sim.commands.main import COMMANDS, Command
 from msgs_spec.tasks import TASKS
 from policy_node.training.learning import config
-from policy_node.training.learning.config import TrainConfig, recipe_config
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.recipes import recipe_config
 
 _COLUMNS = '88'
 # One task for each group of equal values in the recipe `best`.

@@ -22,8 +22,8 @@ from policy_node.training.learning.config import (
     TrainConfig,
     config_from_dict,
     parse_assignment,
-    recipe_config,
 )
+from policy_node.training.learning.recipes import recipe_config
 
 if TYPE_CHECKING:
     from policy_node.training.learning.replay import Episodes

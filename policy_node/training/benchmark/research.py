@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from policy_node.training.benchmark.jobs import Arm, Job
-from policy_node.training.learning.config import recipe_config
+from policy_node.training.learning.recipes import recipe_config
 
 # Fresh episodes behind the final success of a run.
 FINAL_EPISODES = 500

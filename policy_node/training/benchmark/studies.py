@@ -8,7 +8,7 @@ from typing import Any
 
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, Job
-from policy_node.training.learning.config import recipe_config
+from policy_node.training.learning.recipes import recipe_config
 
 # The long ones first. What XYZ has learnt of turning a block serves every other task of the block;
 # likewise the egg and the pen.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +17,7 @@ from policy_node.training.learning.conditions import ACTING_INPUT, fold
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.critics import AGGREGATES, make_critic
 from policy_node.training.learning.density_ratio import DensityRatio, GoalView
+from policy_node.training.learning.devices import uses_bfloat16
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.learner import Losses
 from policy_node.training.learning.replay import Array
@@ -293,25 +293,3 @@ class DDPG:
 
     def _tensor(self, values: object) -> Tensor:
         return torch.as_tensor(values).to(self.device, non_blocking=True)
-
-
-def uses_bfloat16(precision: str, device: torch.device) -> bool:
-    """Whether matrix products run in bfloat16; `auto` asks the processor."""
-    if precision != 'auto':
-        return precision == 'bfloat16'
-    if device.type == 'cuda':
-        return bool(torch.cuda.is_bf16_supported())
-    return bool(torch.cpu._is_avx512_bf16_supported())
-
-
-def choose_device(name: str) -> torch.device:
-    """Returns the device called `auto`, `cpu` or `cuda`; `auto` takes a GPU where torch sees one.
-
-    Raises:
-        ValueError: If `cuda` is asked for and torch sees none.
-    """
-    if name == 'cuda' and not torch.cuda.is_available():
-        raise ValueError('device cuda: torch sees no GPU; allowed: auto, cpu')
-    if name == 'cpu' or not torch.cuda.is_available():
-        return torch.device('cpu')
-    return torch.device('cuda', int(os.environ.get('LOCAL_RANK', '0')))

@@ -13,7 +13,7 @@ from types import FrameType
 from fetch_hand_sim.episodes.context import source_revision
 from msgs_spec.command_line import CommandError, UsageError, complain, require_extra
 from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.ddpg import choose_device
+from policy_node.training.learning.devices import choose_device
 from policy_node.training.learning.distributed import is_first_worker, join_workers, leave_workers
 from policy_node.training.learning.initial_networks import (
     InitialNetworks,

@@ -18,7 +18,8 @@ from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
 from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.ddpg import DDPG, choose_device
+from policy_node.training.learning.ddpg import DDPG
+from policy_node.training.learning.devices import choose_device
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
 from policy_node.training.learning.initial_networks import (

@@ -20,7 +20,7 @@ from policy_node.training.benchmark.command import jobs_from_arguments, main, pa
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.studies import STARTS_FROM
 from policy_node.training.benchmark.workers import LOG_FILE, Outcome, run_jobs
-from policy_node.training.learning.config import recipe_config
+from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import read_progress
 
 torch.set_num_threads(1)

@@ -17,8 +17,8 @@ from policy_node.training.learning.config import (
     TrainConfig,
     config_from_dict,
     parse_assignment,
-    recipe_config,
 )
+from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.threads import split_threads
 
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.config import recipe_config
 from policy_node.training.learning.critics import AGGREGATES, Ensemble, make_critic
 from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.transitions import Transitions
 
 torch.set_num_threads(1)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from msgs_spec.tasks import GoalKind, task_spec
-from policy_node.training.learning.config import recipe_config
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.episode_weights import (
     episode_energy,
@@ -14,6 +13,7 @@ from policy_node.training.learning.episode_weights import (
     ticks_until_dropped,
 )
 from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import EpisodeReplay, Episodes
 
 PEN = task_spec('HandManipulatePenRotate')

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.config import recipe_config
 from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.gamble import GambleSimulation
+from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.sampling import TransitionSampler
 

@@ -12,9 +12,10 @@ import torch
 from policy_node.policies import checkpoint
 from policy_node.policies.loading import load_actor
 from policy_node.policies.shipped import shipped_actors
-from policy_node.training.learning.config import TrainConfig, recipe_config
+from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.initial_networks import read_initial_networks
+from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.trainer import Trainer
 from policy_node.training.ship_actor import main as ship_actor

@@ -18,8 +18,9 @@ import pytest
 import torch
 
 from policy_node.policies.tensor_file import read_tensors, write_tensors
-from policy_node.training.learning.config import TrainConfig, recipe_config
+from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import EpisodeReplay
 from policy_node.training.learning.replay_file import load_replay, save_replay
 from policy_node.training.learning.run import lock_run

@@ -11,10 +11,10 @@ from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.conditions import Horizon, Threshold, fold
-from policy_node.training.learning.config import recipe_config
 from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.multi_step import StepCounter
+from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import Array, Episodes
 from policy_node.training.learning.sampling import TransitionSampler
 from policy_node.training.learning.transitions import Transitions

@@ -19,9 +19,10 @@ from policy_node.policies import checkpoint
 from policy_node.policies.tensor_file import read_tensors
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.generate_episodes import main as generate_episodes
-from policy_node.training.learning.config import TrainConfig, recipe_config
+from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.logged_episodes import read_experience
+from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.sampling import scale_thresholds
 from policy_node.training.learning.trainer import (
