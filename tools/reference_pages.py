@@ -5,14 +5,15 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import inspect
+import itertools
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-
-from sphinx.pycode import ModuleAnalyzer
 
 from fetch_hand_sim.commands.main import COMMANDS, Command
 from msgs_spec.tasks import TASKS
@@ -41,19 +42,20 @@ def commands_page() -> str:
         '# Commands\n\n`fetch_hand_sim <command>`; a node or tool of another name for `ros2 run '
         'fetch_hand_sim <executable>` is named beside. What each prints for `--help`:'
     ]
-    for path, command in _leaves(COMMANDS):
+    for path, command in leaves(COMMANDS):
         also = f' Executable: `{command.executable}`.' if command.executable else ''
         parts.append(f'## {" ".join(path)}\n\n{_sentence(command.help)}{also}')
-        parts.append(f'```\n{_help_of(path)}\n```')
+        parts.append(f'```\n{help_of(path)}\n```')
     return '\n\n'.join(parts) + '\n'
 
 
-def _leaves(
+def leaves(
     commands: dict[str, Command], path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Command]]:
+    """Yields every command that runs something, with the words that name it."""
     for name, command in commands.items():
         if command.commands:
-            yield from _leaves(command.commands, (*path, name))
+            yield from leaves(command.commands, (*path, name))
         else:
             yield (*path, name), command
 
@@ -62,7 +64,8 @@ def _sentence(text: str) -> str:
     return f'{text[0].upper()}{text[1:]}.'
 
 
-def _help_of(path: tuple[str, ...]) -> str:
+def help_of(path: tuple[str, ...]) -> str:
+    """Returns what a command prints for `--help`."""
     command = [sys.executable, '-m', 'fetch_hand_sim', *path, '--help']
     environment = os.environ | {'COLUMNS': _COLUMNS, 'NO_COLOR': '1'}
     result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
@@ -71,13 +74,13 @@ def _help_of(path: tuple[str, ...]) -> str:
 
 def train_config_page() -> str:
     """Returns the fields of `TrainConfig`, and where the recipes differ from their defaults."""
-    documented = ModuleAnalyzer.for_module(config.__name__).find_attr_docs()
-    ranges = {name: _range(low, high) for name, low, high in config._RANGES}
-    choices = {name: ', '.join(map(_code, values)) for name, values in config._CHOICES.items()}
+    documented = field_docstrings(TrainConfig)
+    ranges = {name: _range(low, high) for name, low, high in config.RANGES}
+    choices = {name: ', '.join(map(_code, values)) for name, values in config.CHOICES.items()}
     allowed = {'task': f'one of the {len(TASKS)} tasks'} | ranges | choices
     rows = []
     for field in dataclasses.fields(TrainConfig):
-        meaning = ' '.join(documented[('TrainConfig', field.name)]).strip()
+        meaning = documented[field.name]
         default = '' if field.default is dataclasses.MISSING else _code(_value(field.default))
         rows.append((_code(field.name), default, allowed.get(field.name, ''), meaning))
     return (
@@ -96,6 +99,18 @@ def train_config_page() -> str:
         )
         + '\n'
     )
+
+
+def field_docstrings(kind: type) -> dict[str, str]:
+    """Returns what stands below each field of a class, on one line."""
+    (definition,) = ast.parse(inspect.getsource(kind)).body
+    assert isinstance(definition, ast.ClassDef)
+    found = {}
+    for field, below in itertools.pairwise(definition.body):
+        match field, below:
+            case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                found[name] = ' '.join(text.split())
+    return found
 
 
 def _recipes() -> str:

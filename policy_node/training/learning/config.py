@@ -173,11 +173,11 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         spec = task_spec(self.task)
-        for name, allowed in _CHOICES.items():
+        for name, allowed in CHOICES.items():
             value = getattr(self, name)
             if value not in allowed:
                 raise ValueError(f'{name} {value!r}; allowed: {", ".join(allowed)}')
-        for name, lowest, highest in _RANGES:
+        for name, lowest, highest in RANGES:
             value = getattr(self, name)
             if not lowest <= value <= highest:
                 raise ValueError(f'{name} {value}; allowed: {lowest:.6g} ... {highest:.6g}')
@@ -258,7 +258,7 @@ class TrainConfig:
         ]
 
 
-_CHOICES = {
+CHOICES = {
     'recipe': RECIPES,
     'reward_type': ('sparse', 'dense'),
     'success_rule': ('gymnasium', 'paper'),
@@ -275,8 +275,9 @@ _CHOICES = {
     'precision': ('auto', 'float32', 'bfloat16'),
     'device': ('auto', 'cpu', 'cuda'),
 }
+"""Allowed values of the fields that have a few."""
 _INFINITY = float('inf')
-_RANGES = (
+RANGES = (
     ('seed', 0, 2**31 - 1),
     ('hindsight_k', 1, 1000),
     ('reward_distance', 1e-3, 1000),
@@ -316,6 +317,7 @@ _RANGES = (
     ('simulation_threads', 0, 1024),
     ('torch_threads', 0, 1024),
 )
+"""Least and largest value of the fields that have them."""
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:
