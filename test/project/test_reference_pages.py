@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import runpy
 
-from policy_node.training.learning.config import TrainConfig, recipe_config
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.recipes import recipe_config
 from support import ROOT
 
 TOOL = runpy.run_path(str(ROOT / 'tools' / 'reference_pages.py'))
