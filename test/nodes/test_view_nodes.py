@@ -171,6 +171,7 @@ def test_a_viewer_that_dies_or_hangs_is_not_noticed(start_process: Start, number
         connection.spin_until(lambda: connection.received['achieved_goal'], 'tick')
         view = start_process(*VIEW)
         assert re.search(r'http://127.0.0.1:\d+/', view.stdout.readline())
+        assert set(niceness_of_threads(view.pid)) == {10}
         connection.spin(0.5)
         os.kill(view.pid, number)
         count, began = len(connection.received['achieved_goal']), connection.received_at
@@ -294,6 +295,12 @@ def test_scalars_are_those_of_the_tick_with_their_stamp(start_process: Start) ->
         if stamp in seen['scalars/reward']:
             assert seen['scalars/reward'][stamp] == metric.reward(achieved, desired)
     assert set(seen['scalars/distance']) - set(seen['scalars/reward']), 'a reset has a reward'
+
+
+def niceness_of_threads(process: int) -> list[int]:
+    """The priority of each thread of a process, 0 as usual, higher for less."""
+    files = Path(f'/proc/{process}/task').glob('*/stat')
+    return [int(file.read_text().rpartition(')')[2].split()[16]) for file in files]
 
 
 def processes_of_session(session: int) -> list[str]:
