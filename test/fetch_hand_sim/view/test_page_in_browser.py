@@ -42,7 +42,7 @@ VIEW = (sys.executable, '-m', 'fetch_hand_sim.view')
 # What the browser draws below the scene.
 BAR = 32
 # Seconds in which a page changes: a machine without a GPU that does other things too is slow.
-PATIENCE = 120.0
+PATIENCE = 180.0
 # Of a list.
 ROW = 18.0
 
@@ -208,6 +208,8 @@ def test_a_robot_is_pulled_with_control_and_the_mouse(browser, start_process, ro
     browser.move(x, y)
     browser.press_key('Control')
     browser.press(x, y)
+    # What is taken is what is under the mouse when the page draws its next frame.
+    browser.wait(4.0)
     for step in range(1, 9):
         browser.move(x + 8.0 * step, y - 8.0 * step, pressed=True)
 
