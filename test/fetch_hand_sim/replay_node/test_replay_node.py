@@ -5,11 +5,9 @@ from __future__ import annotations
 import itertools
 import shutil
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -21,11 +19,10 @@ from fetch_hand_sim.replay_node.schedule import Playhead, ReplaySchedule
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.ros import ros_message_class
 from msgs_spec.schemas import deserialize, serialize
-from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics
-from policy_node.policies import checkpoint
-from policy_node.policies.actor import Actor
 from policy_node.training import generate_episodes
+from support.fresh_actor import fresh_actor
 from support.graph import POLICY_NODE, SIM_NODE, TIMEOUT, client, ros_args
 from support.ros_messages import from_ros
 
@@ -78,29 +75,12 @@ def record(start_process, directory, task, actor):
     return min(directory.iterdir())
 
 
-def untrained_actor(directory: Path, task: str) -> Path:
-    """A checkpoint with random weights: as good as any for the question whether bits agree."""
-    spec = TASKS[task]
-    info = checkpoint.ActorInfo(
-        task=task,
-        observation_layout=checkpoint.observation_layout(spec),
-        goal_size=spec.goal.size,
-        action_size=spec.robot.action_size,
-        hidden_sizes=(64, 64),
-        layer_norm=False,
-        control_hz=25.0,
-        seed=0,
-    )
-    torch.manual_seed(0)
-    path = directory / 'untrained.safetensors'
-    checkpoint.save(path, Actor(info.shape), info)
-    return path
-
-
 @pytest.mark.parametrize('task', ['FetchReach', 'HandManipulateBlockFull'])
 def test_actor_on_a_replay_repeats_the_recorded_commands(start_process, tmp_path, task):
     """FetchReach with the shipped actor, a hand task with an untrained one."""
-    actor = 'FetchReach' if task == 'FetchReach' else untrained_actor(tmp_path, task)
+    actor: object = 'FetchReach'
+    if task != actor:
+        fresh_actor(actor := tmp_path / 'untrained.safetensors', task)
     path = record(start_process, tmp_path / 'episodes', task, actor)
     spec = task_spec(task)
     recorded = [m.data for m in read_episode(path).topics['/commands'].messages]

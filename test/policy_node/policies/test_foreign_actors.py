@@ -15,7 +15,6 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from test_loading import fresh_actor, observations
 
 import fetch_hand_sim  # noqa: F401  registers the environments
 from fetch_hand_sim.episodes.runner import EpisodeRunner
@@ -27,6 +26,7 @@ from policy_node.policies import checkpoint
 from policy_node.policies.export_actor import main as export_actor
 from policy_node.policies.loading import TaskMissing, load_actor, load_policy
 from policy_node.policies.shipped import shipped_actors
+from support.fresh_actor import fresh_actor, observations
 
 REACH = task_spec('FetchReach')
 

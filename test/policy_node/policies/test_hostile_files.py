@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-from test_loading import fresh_actor
 
 from policy_node.policies.loading import load_policy
 from policy_node.policies.onnx_export import export
 from support import peak_memory, reset_peak_memory
+from support.fresh_actor import fresh_actor
 
 # What stands in the metadata of files by people who mean harm, or cannot count.
 VALUES = [

@@ -8,56 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from threadpoolctl import threadpool_info
 
-from msgs_spec.tasks import TASKS, TaskSpec, task_spec
+from msgs_spec.tasks import TASKS, task_spec
 from policy_node import load_policy
 from policy_node.policies import checkpoint
-from policy_node.policies.actor import Actor
-from policy_node.policies.checkpoint import ActorInfo
 from policy_node.policies.loading import TaskMissing
 from policy_node.policies.numpy_actor import NumpyActor
 from policy_node.policies.policy import RandomPolicy
 from policy_node.policies.shipped import shipped_actors
-
-
-def observations(spec: TaskSpec, *leading: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Observations in which quaternions are what they should be."""
-    generator = np.random.default_rng(seed)
-    parts = {'observation': spec.observation_size, 'desired_goal': spec.goal.size}
-    values = {name: generator.normal(size=(*leading, size)) for name, size in parts.items()}
-    if spec.goal.size == 7:
-        start = spec.achieved_goal_start + 3
-        for quaternion in (
-            values['observation'][..., start : start + 4],
-            values['desired_goal'][..., 3:],
-        ):
-            quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    return {**values, 'achieved_goal': values['desired_goal']}
-
-
-def fresh_actor(path: Path, task: str, **changes: object) -> Actor:
-    """Writes an actor nobody trained, with normalisers that are not trivial."""
-    torch.manual_seed(1)
-    spec = task_spec(task)
-    fields = {
-        'task': task,
-        'observation_layout': checkpoint.observation_layout(spec),
-        'goal_size': spec.goal.size,
-        'action_size': spec.robot.action_size,
-        'hidden_sizes': (32, 16),
-        'layer_norm': False,
-        'control_hz': 25.0,
-        'seed': 0,
-    }
-    info = ActorInfo(**(fields | changes))
-    actor = Actor(info.shape).eval()
-    for normalizer in (actor.observation_normalizer, actor.goal_normalizer):
-        normalizer.mean.uniform_(-1, 1)
-        normalizer.std.uniform_(0.5, 2)
-    checkpoint.save(path, actor, info)
-    return actor
+from support.fresh_actor import fresh_actor, observations
 
 
 @pytest.mark.parametrize('task', shipped_actors())
