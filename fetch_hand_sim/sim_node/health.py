@@ -198,5 +198,6 @@ def waiting_line(robot: Robot, surroundings: Surroundings) -> str:
 
 def _who_commands(surroundings: Surroundings) -> str:
     if surroundings.commanders:
-        return f'{", ".join(surroundings.commanders)} sends none'
+        verb = 'sends' if len(surroundings.commanders) == 1 else 'send'
+        return f'{", ".join(surroundings.commanders)} {verb} none'
     return '; '.join(['nobody publishes any', *surroundings.waiting_elsewhere])

@@ -97,6 +97,7 @@ def test_only_who_publishes_the_clock_minds_others_who_do(make):
             'nobody publishes any; /policy_node waits for a robot on /episode_status',
         ),
         ('stopped', Level.WARN, 'commands have stopped, the robot holds; /policy_node sends none'),
+        ('two stopped', Level.WARN, 'the robot holds; /a, /policy_node send none'),
         ('diverged', Level.ERROR, 'MuJoCo lost the state 1 times'),
     ],
 )
@@ -106,6 +107,7 @@ def test_report_says_what_went_wrong_in_the_robot(make, monkeypatch, problem, le
     surroundings = {
         'stalled': replace(FINE, commanders=[]),
         'elsewhere': replace(FINE, commanders=[], waiting_elsewhere=waiting),
+        'two stopped': replace(FINE, commanders=['/a', '/policy_node']),
     }.get(problem, FINE)
     health = Health(case.robot, '/sim_node', case.clock.now)
     case.robot.tick_when_due()
@@ -120,7 +122,7 @@ def test_report_says_what_went_wrong_in_the_robot(make, monkeypatch, problem, le
         monkeypatch.setattr(case.robot.runner.simulation, 'divergences', 1)
     elif problem == 'far out':
         case.robot.buffer.accept([0.0, 100.0, 0.0, 0.0])
-    elif problem == 'stopped':
+    elif problem in ('stopped', 'two stopped'):
         case.robot.buffer.accept([0.0] * 4)
     case.clock.now += 1.1
     report = health.report(surroundings, case.clock.now)
