@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import subprocess
 import sys
+import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,9 @@ from msgs_spec.topics import topic  # noqa: E402
 from msgs_spec.view_topics import view_topic  # noqa: E402
 
 _TICKS_PER_SECOND = os.sysconf('SC_CLK_TCK')
+# Seconds before each measurement.
+_SETTLING = 4.0
+_END_TIMEOUT = 60.0
 
 
 def processor_seconds(pid: int) -> float:
@@ -41,57 +46,40 @@ def processor_seconds(pid: int) -> float:
     return (user + system) / _TICKS_PER_SECOND
 
 
-class Viewer:
-    """Takes pictures, as a tool would, in a node of its own."""
-
-    def __init__(self, task: str, name: str) -> None:
-        """Subscribes."""
-        self.count = self.bytes = 0
-        self._node = rclpy.create_node('looking')
-        source = view_topic(task_spec(task), name)
-        self._node.create_subscription(
-            ros_message_class(source.type_name),
-            source.name,
-            self._take,
-            rclpy_profile(source.qos),
-            raw=True,
-        )
-        self._loop = EventLoop(self._node)
-
-    def _take(self, data: bytes) -> None:
-        self.count, self.bytes = self.count + 1, self.bytes + len(data)
-
-    def serve(self) -> None:
-        """Takes what is there."""
-        self._loop.serve_pending(10)
-
-    def close(self) -> None:
-        """Leaves."""
-        self._loop.close()
-        self._node.destroy_node()
+def look(task: str, name: str, seconds: float) -> None:
+    """Takes pictures for a while, as a tool would, and prints how many came."""
+    keep_discovery_local()
+    rclpy.init()
+    node, sizes = rclpy.create_node('looking'), list[int]()
+    source = view_topic(task_spec(task), name)
+    node.create_subscription(
+        ros_message_class(source.type_name),
+        source.name,
+        lambda data: sizes.append(len(data)),
+        rclpy_profile(source.qos),
+        raw=True,
+    )
+    loop = EventLoop(node)
+    for duration in (_SETTLING, seconds):
+        sizes.clear()
+        end = time.monotonic() + duration
+        while (left := end - time.monotonic()) > 0.0:
+            loop.wait(left)
+    size = sum(sizes) / max(1, len(sizes)) / 1e3
+    print(f'  {len(sizes) / seconds:.1f} pictures/s of {size:.0f} kB', flush=True)
+    loop.close()
+    node.destroy_node()
+    rclpy.shutdown()
 
 
-def watch(watcher: Watcher, viewer: Viewer | None, seconds: float) -> None:
-    """Watches the robot and takes pictures for a while."""
-    for _ in range(round(seconds / 0.1)):
-        watcher.watch(0.1)
-        if viewer is not None:
-            viewer.serve()
-
-
-def measure(watcher: Watcher, pid: int, viewer: Viewer | None, label: str, seconds: float) -> None:
+def measure(watcher: Watcher, pid: int, label: str, seconds: float) -> None:
     """Prints the figures of one measurement."""
-    watch(watcher, viewer, 3.0)
+    watcher.watch(_SETTLING)
     watcher.times.clear()
     missed, used = watcher.missed, processor_seconds(pid)
-    before = (viewer.count, viewer.bytes) if viewer else (0, 0)
-    watch(watcher, viewer, seconds)
+    watcher.watch(seconds)
     share = 100.0 * (processor_seconds(pid) - used) / seconds
-    line = f'{label}: visualization_node takes {share:.1f} % of a processor'
-    if viewer is not None:
-        count, size = viewer.count - before[0], viewer.bytes - before[1]
-        line += f', {count / seconds:.1f} pictures/s of {size / max(1, count) / 1e3:.0f} kB'
-    print(line, flush=True)
+    print(f'{label}: visualization_node takes {share:.1f} % of a processor', flush=True)
     report('  joint_states', watcher.times, watcher.missed - missed, 1.0)
 
 
@@ -102,7 +90,11 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, default=20.0, help='per measurement')
     parser.add_argument('--hz', type=float, default=10.0, help='pictures per second')
     parser.add_argument('--size', default='640x480', help='of the pictures')
+    parser.add_argument('--look', default='', help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.look:
+        look(options.task, options.look, options.seconds)
+        return
     width, _, height = options.size.partition('x')
     keep_discovery_local()
     rclpy.init()
@@ -118,15 +110,16 @@ def main() -> None:
         words = [word for item in settings.items() for word in ('-p', ':='.join(map(str, item)))]
         node = start(stack, 'fetch_hand_sim.visualization_node', '--ros-args', *words)
         watcher.wait_for_ticks()
-        measure(watcher, node.pid, None, 'nobody looks', options.seconds)
+        measure(watcher, node.pid, 'nobody looks', options.seconds)
         for name, label in (
             ('camera/image_raw', 'raw pictures'),
             ('camera/image_raw/compressed', 'JPEG'),
         ):
-            viewer = Viewer(options.task, name)
-            measure(watcher, node.pid, viewer, label, options.seconds)
-            viewer.close()
-        measure(watcher, node.pid, None, 'nobody any more', options.seconds)
+            words = ['--task', options.task, '--seconds', str(options.seconds), '--look', name]
+            viewer = subprocess.Popen([sys.executable, __file__, *words])
+            measure(watcher, node.pid, label, options.seconds)
+            viewer.wait(_END_TIMEOUT)
+        measure(watcher, node.pid, 'nobody any more', options.seconds)
     rclpy.shutdown()
 
 

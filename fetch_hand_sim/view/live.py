@@ -13,7 +13,7 @@ from rclpy.node import Node
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import tracked_position
 from fetch_hand_sim.view.curves import Curves
-from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Picture
+from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Graphs, Picture
 from fetch_hand_sim.view.requests import LatestRequest, Request, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RobotRequests
 from fetch_hand_sim.view.robot_watch import ANY_TASK, WATCHING, RobotWatch, SeenTick
@@ -61,7 +61,9 @@ class LiveRobot:
         if not self._is_new or self._picture is None:
             return None
         self._is_new = False
-        return dataclasses.replace(self._picture, facts=self._current_facts())
+        # Curves are copied as often as they are drawn, not as often as the robot ticks.
+        graphs = self._curves.graphs() if self._curves is not None else Graphs()
+        return dataclasses.replace(self._picture, graphs=graphs, facts=self._current_facts())
 
     def perform(self, request: Request | LatestRequest) -> None:
         """Does what the page asks for, unless it may only watch."""
@@ -104,7 +106,6 @@ class LiveRobot:
             frame=frame,
             stamp_ns=tick.stamp_ns,
             trail=tuple(self._trail),
-            graphs=self._curves.graphs(),
             command=tick.command,
         )
 

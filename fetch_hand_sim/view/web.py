@@ -23,6 +23,7 @@ from mujoco.studio import (
     web_viewer,
 )
 from mujoco.studio.web import web_server
+from websockets.exceptions import ConnectionClosed
 
 from fetch_hand_sim.view.guard import Guard, guarded_serve, is_loopback, new_token
 from msgs_spec.command_line import CommandError
@@ -109,6 +110,7 @@ def open_page(
     web_server.serve = guarded_serve(guard)
     web_viewer._print_url_banner = lambda *_: None
     logging.getLogger('WebServer').setLevel(logging.WARNING)
+    logging.getLogger('asyncio').addFilter(is_no_farewell)
     viewer_plugins, sim_plugins = plugin.split_plugins(plugins)
 
     def run(endpoint: endpoints.ViewerEndpoint) -> None:
@@ -123,6 +125,12 @@ def open_page(
         handle.close()
         raise
     return handle, address
+
+
+def is_no_farewell(record: logging.LogRecord) -> bool:
+    """Whether a line of the log is about more than a visitor who has left."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, ConnectionClosed)
 
 
 def _bind(host: str, port: int) -> socket.socket:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import http.client
+import logging
 
 import pytest
 from websockets.datastructures import Headers
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosedOK, InvalidStatus
 from websockets.sync.client import connect
 
 from fetch_hand_sim.view.guard import Guard, is_loopback
@@ -110,6 +111,14 @@ def test_server_refuses_web_sockets_of_other_sites(address):
     for origin in ('http://evil.example', None):
         with pytest.raises(InvalidStatus):
             connect(url, origin=origin)
+
+
+@pytest.mark.parametrize(
+    ('error', 'is_said'), [(ConnectionClosedOK(None, None), False), (ValueError('x'), True)]
+)
+def test_a_visitor_who_leaves_is_no_error(address, caplog, error, is_said):
+    logging.getLogger('asyncio').error('Task exception was never retrieved', exc_info=error)
+    assert ('never retrieved' in caplog.text) == is_said
 
 
 def test_a_taken_port_is_one_line(address):
