@@ -203,6 +203,7 @@ def test_a_robot_is_pulled_with_control_and_the_mouse(browser, start_process, ro
     browser.open(address_of(start_process(*VIEW)))
     wait_for_scene(browser)
     # Nobody commands, so it stays where it is.
+    robot.spin_until(lambda: robot.received['achieved_goal'], 'gripper')
     rest = latest(robot, 'achieved_goal')
     x, y = place_of('FetchReach', rest)
     browser.move(x, y)
@@ -222,7 +223,7 @@ def test_a_robot_is_pulled_with_control_and_the_mouse(browser, start_process, ro
     browser.release_key('Control')
     # The next episode, if not this one, is one that nobody pushes.
     robot.spin_until(
-        lambda: np.linalg.norm(latest(robot, 'achieved_goal') - rest) < 1e-4, 'gripper at rest'
+        lambda: np.linalg.norm(latest(robot, 'achieved_goal') - rest) < 5e-4, 'gripper at rest'
     )
 
 
