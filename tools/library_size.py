@@ -39,6 +39,10 @@ ABILITIES = {
     'inputs that know geometry, prioritised replay': (
         r'.*/(goal_features|episode_weights|initial_networks|replay_file)\.py'
     ),
+    'more ways to learn, and studies of them': (
+        r'.*/benchmark/(final|measures|research\w*)\.py|.*/learning/(conditions|critics|density_ratio'
+        r'|devices|gamble|goal_choice|multi_step|sampling)\.py'
+    ),
     'studies in parallel, tables of actors': r'.*/(studies|workers|actors_table)\.py',
     'contract and wire': r'msgs_spec/',
     'file format': r'.*/episode_log/',
