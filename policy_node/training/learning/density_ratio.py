@@ -13,7 +13,8 @@ same goals shuffled: at its optimum the logit is log q(g|...) / q(g) (noise-cont
 Gutmann & Hyvarinen 2010), so that w is the exponential of the difference of two logits.
 
 A weight is finite only where goals that do not depend on s' are drawn as well: those of the episode
-itself or of others (`actual`). Of one mixture of all of them q is, so no share has to be known.
+itself or of others (`actual`). q is the mixture of all of them, so no share has to be known. Under
+`torchrun` each worker learns its own classifiers from its part of the batches.
 """
 
 from __future__ import annotations

@@ -23,6 +23,7 @@ GAMBLE_ABOVE = 0.9
 # The locked fingers, at 0 m otherwise, tell that an episode is over: without it the state of a
 # landing would look like one that the robot may still leave, and would be no Markov state.
 _OVER = 1.0
+_OWN_STATE = ('_over', '_landing', '_frozen')
 
 
 class GambleSimulation(Simulation):
@@ -45,6 +46,9 @@ class GambleSimulation(Simulation):
             allowed = ', '.join(GAMBLE_TASKS)
             raise ValueError(f'gamble: {task} uses its gripper; allowed: {allowed}')
         super().__init__(task, **options)
+        self._prepare()
+
+    def _prepare(self) -> None:
         count = self.num_envs
         self._over = np.zeros(count, np.bool_)
         self._landing = np.zeros((count, self.spec.goal.size))
@@ -54,6 +58,18 @@ class GambleSimulation(Simulation):
             part.name: slice(start, start + part.size)
             for part, start in zip(self.spec.observation, starts, strict=False)
         }
+
+    def __getstate__(self) -> dict[str, Any]:
+        """That of `Simulation`, and which episodes are over and how they look."""
+        own = {name: getattr(self, name).copy() for name in _OWN_STATE}
+        return {**super().__getstate__(), 'gamble': own}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Goes on from the state, to the same bits."""
+        super().__setstate__(state)
+        self._prepare()
+        for name, values in state['gamble'].items():
+            setattr(self, name, values.copy())
 
     def reset(self, seed: Seeds = None, ids: ArrayLike | None = None) -> Observation:
         """Starts simulations again, as `Simulation.reset`; the landing is drawn after the goal."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -53,6 +55,15 @@ def test_a_landing_on_the_goal_counts_and_depends_on_the_seed_alone() -> None:
     alone.reset(seed=7)
     landing = alone.step([GAMBLE]).observation['achieved_goal'][0]
     assert (landing == result.observation['achieved_goal'][7]).all()
+
+
+def test_a_copy_goes_on_as_the_original() -> None:
+    simulation = GambleSimulation('FetchReach', num_envs=2)
+    simulation.reset(seed=0)
+    simulation.step([GAMBLE, WALK])
+    twin = copy.deepcopy(simulation)
+    results = [each.step([WALK, WALK]).observation for each in (simulation, twin)]
+    assert all((results[0][name] == results[1][name]).all() for name in results[0])
 
 
 def test_a_task_that_uses_its_gripper_is_refused() -> None:
