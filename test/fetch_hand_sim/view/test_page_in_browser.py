@@ -277,6 +277,7 @@ def test_dragging_the_goal_moves_it_and_the_actor_gets_there(browser, start_proc
         browser.move(x + offset, y)
         browser.wait(0.5)
     browser.press(x, y)
+    browser.wait(4.0)
     for step in range(1, 11):
         browser.move(x + 6.0 * step, y - 5.0 * step, pressed=True)
     browser.release(x + 60.0, y - 50.0)
