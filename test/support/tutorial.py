@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 # A training or a benchmark on a busy machine.
-TIMEOUT = 600.0
+TIMEOUT = 1500.0
 # A node that is told to stop has its log to close.
 STOP_TIMEOUT = 30.0
 INTERRUPTED = 130
