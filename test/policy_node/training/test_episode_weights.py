@@ -15,6 +15,7 @@ from policy_node.training.learning.episode_weights import (
 from policy_node.training.learning.experience import Experience
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import EpisodeReplay, Episodes
+from policy_node.training.learning.sampling import TransitionSampler
 
 PEN = task_spec('HandManipulatePenRotate')
 TICKS = 10
@@ -121,7 +122,8 @@ def test_a_batch_follows_the_configuration() -> None:
         np.zeros((3, PEN.episode_ticks, 20), np.float32),
     )
     reward = lambda achieved, desired: -np.ones(len(achieved))  # noqa: E731
-    experience = Experience(config, PEN, Workers(), reward, np.random.default_rng(0))
+    sampler = TransitionSampler(reward, config.gamma)
+    experience = Experience(config, PEN, Workers(), sampler, np.random.default_rng(0))
     experience.replay.add(episodes)
     batch = experience.batch(env_steps=0)
     assert set(batch.observation[:, -7]) == {1.0}
