@@ -272,8 +272,17 @@ def test_scalars_are_those_of_the_tick_with_their_stamp(start_process: Start) ->
 
         for source in scalar_topics(spec):
             subscribe(source)
-        # The reward comes with the first step of an episode, everything else with its reset too.
-        connection.spin_until(lambda: len(seen.get('scalars/reward', {})) > 120, 'scalars', 60.0)
+
+        def ticks_seen_whole():
+            goals = (connection.received[name] for name in ('achieved_goal', 'desired_goal'))
+            return set.intersection(
+                set(seen.get('scalars/distance', ())),
+                set(seen.get('scalars/reward', ())),
+                *({message_stamp(message) for message in messages} for messages in goals),
+            )
+
+        # Subscriptions connect one after the other. More than an episode, so that a reset is seen.
+        connection.spin_until(lambda: len(ticks_seen_whole()) > 120, 'scalars', 60.0)
         assert set(seen) == {s.name for s in scalar_topics(spec)}
         goals = {
             name: {
