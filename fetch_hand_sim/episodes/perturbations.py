@@ -24,8 +24,8 @@ def bounded_wrench(wrench: Array, limit: float) -> Array:
         wrench: N and N m.
         limit: Largest force, N.
     """
-    force, torque = np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])
-    share = max(float(force) / limit, float(torque) / (_LEVER * limit))
+    force, torque = _sizes(wrench)
+    share = max(force / limit, torque / (_LEVER * limit))
     # A hair within the limit, whatever rounding does.
     return wrench if share <= _WITHIN else wrench * (_WITHIN / share)
 
@@ -49,7 +49,7 @@ def accept_perturbation(
     if runner.is_between_episodes:
         raise ValueError('no episode is running')
     wrench = decode(topic, message)
-    force, torque = np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])
+    force, torque = _sizes(wrench)
     # Not "beyond the limit": what is not a number is refused as well.
     if not (force <= limit and torque <= _LEVER * limit):
         raise ValueError(
@@ -57,3 +57,8 @@ def accept_perturbation(
             f'{_LEVER * limit:g} N m'
         )
     runner.perturb(message.header.frame_id, wrench)
+
+
+def _sizes(wrench: Array) -> tuple[float, float]:
+    """Sizes of the force, N, and of the torque, N m."""
+    return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))

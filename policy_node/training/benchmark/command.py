@@ -23,6 +23,7 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -192,12 +193,8 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 
 def _run_where_asked(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> bool:
-    renew = None
-    if options.study in STUDIES:
-
-        def renew() -> None:
-            _report_study(options, jobs, command)
-
+    is_research = options.study in STUDIES
+    renew = partial(_report_study, options, jobs, command) if is_research else None
     if options.ray:
         return run_jobs(jobs, Ray(command), renew)
     cores = len(os.sched_getaffinity(0))

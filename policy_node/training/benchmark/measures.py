@@ -9,7 +9,8 @@ import numpy as np
 
 from policy_node.training.benchmark.final import read_final
 from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
-from policy_node.training.benchmark.results import Curve, read_curve
+from policy_node.training.benchmark.results import Curve
+from policy_node.training.learning.run_folder import COMMAND_FILE
 from policy_node.training.learning.run_log import read_progress
 
 GOOD_SUCCESS = 0.9
@@ -26,14 +27,17 @@ def area_under(curve: Curve, total_steps: int) -> float:
     return float(np.trapezoid(success, steps) / total_steps)
 
 
-def measure_run(job: Job) -> dict[str, Any]:
+def measure_run(job: Job, curve: Curve) -> dict[str, Any]:
     """One row of `runs.csv`.
 
     Steps to success are empty where no evaluation got there: the run is censored at its budget.
     `parts` counts how often the run was started: more than one is no longer the same to the bit.
+
+    Args:
+        job: A finished job.
+        curve: Its evaluations.
     """
-    rows, curve = read_progress(job.folder / PROGRESS_FILE), read_curve(job.folder / PROGRESS_FILE)
-    final, last = read_final(job.folder), rows[-1]
+    final, last = read_final(job.folder), read_progress(job.folder / PROGRESS_FILE)[-1]
     reached = curve.steps_to(GOOD_SUCCESS)
     samples = last['updates'] * job.config.batch_size
     processor_seconds = last['processor_seconds']
@@ -51,7 +55,7 @@ def measure_run(job: Job) -> dict[str, Any]:
         'processor_seconds': round(processor_seconds, 1),
         'samples_per_processor_second': round(samples / processor_seconds, 1),
         'last_mean_value': last.get('mean_value', ''),
-        'parts': len((job.folder / 'command.txt').read_text().splitlines()),
+        'parts': len((job.folder / COMMAND_FILE).read_text().splitlines()),
     }
 
 

@@ -41,22 +41,20 @@ def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -
         command: Command line, for the record.
     """
     output.mkdir(parents=True, exist_ok=True)
-    runs = [measure_run(job) for job in jobs]
+    found = [read_curve(job.folder / PROGRESS_FILE) for job in jobs]
+    runs = [measure_run(job, curve) for job, curve in zip(jobs, found, strict=True)]
     groups: dict[str, dict[str, list[dict[str, Any]]]] = {}
     curves: dict[str, dict[str, list[Curve]]] = {}
-    for job, run in zip(jobs, runs, strict=True):
+    for job, run, curve in zip(jobs, runs, found, strict=True):
         groups.setdefault(job.config.task, {}).setdefault(job.arm.name, []).append(run)
-        curve = read_curve(job.folder / PROGRESS_FILE)
         curves.setdefault(job.config.task, {}).setdefault(job.arm.name, []).append(curve)
     order = [arm.name for arm in study.arms]
     arms = [sum_up(groups[task][name]) for task in groups for name in order if name in groups[task]]
     _write_csv(runs, output / 'runs.csv')
     _write_csv(arms, output / 'arms.csv')
-    named = [(job, read_curve(job.folder / PROGRESS_FILE)) for job in jobs]
-    write_curves(
-        [(job.config.task, job.arm.name, job.config.seed, curve) for job, curve in named],
-        output / 'curves.csv',
-    )
+    names = [(job.config.task, job.arm.name, job.config.seed) for job in jobs]
+    named = [(*name, curve) for name, curve in zip(names, found, strict=True)]
+    write_curves(named, output / 'curves.csv')
     (output / 'study.json').write_text(json.dumps(_about(study, jobs, command), indent=2) + '\n')
     labels = {arm.name: arm.label for arm in study.arms}
     bands = {

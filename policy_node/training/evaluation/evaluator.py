@@ -29,10 +29,11 @@ class Evaluator:
 
         "Cannot" means that it lies above the 95 % interval of the episodes so far.
         """
+        rule = self._config.success_rule
 
         def hopeless(outcomes: EpisodeOutcomes) -> bool:
-            successes = int(self.successes(outcomes).sum())
-            return wilson_interval(successes, len(outcomes))[1] < best_success
+            count = int(successes(outcomes, rule).sum())
+            return wilson_interval(count, len(outcomes))[1] < best_success
 
         episodes = self._config.evaluation_episodes
         return evaluate(self._simulation, actor, episodes, EVALUATION_SEED, hopeless)
@@ -41,16 +42,13 @@ class Evaluator:
         """Whether an evaluation ran all its episodes; only then it may decide what is best."""
         return len(outcomes) >= self._config.evaluation_episodes
 
-    def successes(self, outcomes: EpisodeOutcomes) -> NDArray[np.bool_]:
-        """Success of each episode at the last step, by the rule of the run."""
-        return successes(outcomes, self._config.success_rule)
-
-    def success_rate(self, outcomes: EpisodeOutcomes) -> float:
-        """Share of episodes that succeed."""
-        return float(self.successes(outcomes).mean())
-
 
 def successes(outcomes: EpisodeOutcomes, success_rule: str) -> NDArray[np.bool_]:
     """Success of each episode at the last step, by a rule."""
     paper = success_rule == 'paper'
     return outcomes.success_paper if paper else outcomes.success_gymnasium
+
+
+def success_rate(outcomes: EpisodeOutcomes, success_rule: str) -> float:
+    """Share of episodes that succeed at the last step, by a rule."""
+    return float(successes(outcomes, success_rule).mean())

@@ -11,7 +11,12 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies import checkpoint
 from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, summarize
 from policy_node.training.evaluation.table import print_table
-from policy_node.training.learning.run_folder import BEST_FILE, STATE_FILE, companion_file
+from policy_node.training.learning.run_folder import (
+    BEST_FILE,
+    COMMAND_FILE,
+    STATE_FILE,
+    companion_file,
+)
 from policy_node.training.learning.run_log import draw_curve, read_progress
 from policy_node.training.learning.training_state import TrainingState, read_state, write_state
 
@@ -93,7 +98,7 @@ def ship_critic(state_file: Path, actor: Path) -> None:
 
 def commands_of(run: Path) -> str:
     """Every command of a run in order, the first and those that resumed it; '' if unknown."""
-    path = run / 'command.txt'
+    path = run / COMMAND_FILE
     # The same command again goes on where it stopped: once is enough to say it.
     return ' && '.join(dict.fromkeys(path.read_text().splitlines())) if path.is_file() else ''
 

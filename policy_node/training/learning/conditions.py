@@ -126,14 +126,12 @@ class Horizon:
 ACTING_INPUT = {'threshold': 0.0, 'horizon': 1.0}
 
 
-def make_condition(
-    kind: str, metric: GoalMetric, compute_reward: Callable[[Goals, Goals], Goals]
-) -> Condition | None:
+def make_condition(kind: str, metric: GoalMetric) -> Condition | None:
     """Returns the condition called `kind`; None for `none`."""
     if kind == 'threshold':
         return Threshold(metric)
     if kind == 'horizon':
-        return Horizon(metric.spec.episode_ticks, compute_reward)
+        return Horizon(metric.spec.episode_ticks, metric.reward)
     return None
 
 

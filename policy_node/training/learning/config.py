@@ -7,9 +7,18 @@ import typing
 from dataclasses import dataclass
 from typing import Any
 
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind, TaskSpec, task_spec
+from msgs_spec.tasks import (
+    DEFAULT_CONTROL_HZ,
+    REWARD_TYPES,
+    SUCCESS_RULES,
+    GoalKind,
+    TaskSpec,
+    task_spec,
+)
 from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
+from policy_node.training.learning.goal_choice import GOAL_CHOICES
 from policy_node.training.learning.hindsight import parse_mixture
+from policy_node.training.learning.multi_step import CORRECTIONS
 
 RECIPES = ('paper', 'best')
 # Tasks that ignore their gripper action.
@@ -186,6 +195,11 @@ class TrainConfig:
         if not self.hidden_sizes or min(self.hidden_sizes) < 1:
             raise ValueError(f'hidden_sizes {self.hidden_sizes}; allowed: one or more widths >= 1')
 
+    @property
+    def has_plain_networks(self) -> bool:
+        """Whether other runs have networks of the same kind, so that they can start from these."""
+        return (self.critics, self.norm, self.condition) == (1, 'none', 'none')
+
     def _refuse_what_has_no_effect(self, spec: TaskSpec) -> None:
         if self.goals:
             parse_mixture(self.goals)
@@ -194,9 +208,8 @@ class TrainConfig:
         for wrong, reason in self._contradictions():
             if wrong:
                 raise ValueError(reason)
-        if self.gamble and self.task not in GAMBLE_TASKS:
-            allowed = ', '.join(GAMBLE_TASKS)
-            raise ValueError(f'gamble: {self.task} uses its gripper; allowed: {allowed}')
+        if self.gamble:
+            require_idle_gripper(self.task)
         if self.ticks_after_drop >= 0 and spec.goal is not GoalKind.POSE:
             raise ValueError(f'ticks_after_drop: {self.task} has no palm to drop an object from')
         if self.reward_rotation != 1.0 and spec.rotation_threshold is None:
@@ -208,7 +221,6 @@ class TrainConfig:
         replays_later = 'future' in sources or 'near' in sources
         conditioned, chosen = self.condition != 'none', self.goal_choice != 'uniform'
         weighted = self.importance != 'none'
-        plain = (self.critics, self.norm, self.condition) == (1, 'none', 'none')
         return [
             (
                 self.correction != 'none' and self.n_step == 1,
@@ -252,23 +264,34 @@ class TrainConfig:
                 'importance density needs goals chosen in hindsight',
             ),
             (
-                bool(self.init_from) and not plain,
+                bool(self.init_from) and not self.has_plain_networks,
                 'init_from excludes condition, norm and critics above 1',
             ),
         ]
 
 
+def require_idle_gripper(task: str) -> None:
+    """Refuses a task that has no action to spare for a gamble.
+
+    Raises:
+        ValueError: One line names the tasks that have.
+    """
+    if task not in GAMBLE_TASKS:
+        allowed = ', '.join(GAMBLE_TASKS)
+        raise ValueError(f'gamble: {task} uses its gripper; allowed: {allowed}')
+
+
 CHOICES = {
     'recipe': RECIPES,
-    'reward_type': ('sparse', 'dense'),
-    'success_rule': ('gymnasium', 'paper'),
+    'reward_type': REWARD_TYPES,
+    'success_rule': SUCCESS_RULES,
     'strategy': ('final', 'future', 'episode', 'random', 'futureactual', 'none'),
     'goal_features': GOAL_FEATURES,
     'episode_weights': ('moved', 'energy'),
     'importance': ('none', 'density'),
-    'goal_choice': ('uniform', 'bellman', 'uncertain'),
+    'goal_choice': ('uniform', *GOAL_CHOICES),
     'condition': ('none', 'threshold', 'horizon'),
-    'correction': ('none', 'lambda', 'cut'),
+    'correction': CORRECTIONS,
     'target': ('polyak', 'none'),
     'norm': ('none', 'layer', 'batch'),
     'aggregate': ('mean', 'min', 'truncated'),

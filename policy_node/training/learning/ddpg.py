@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -29,8 +29,11 @@ _ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'disco
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """What the networks see of a batch: inputs of both states, actions, rewards, discounts."""
+    """A batch as tensors, and what the networks see of both its states."""
 
+    observation: Tensor
+    next_observation: Tensor
+    goal: Tensor
     features: Tensor
     next_features: Tensor
     action: Tensor
@@ -93,7 +96,7 @@ class DDPG:
     def update(self, batch: Transitions) -> Losses:
         """Improves critic and actor on a batch and, when due, moves the targets."""
         known = self._known(batch)
-        weight = None if self._ratio is None else self._weights(self._ratio, batch, known.action)
+        weight = None if self._ratio is None else self._weights(self._ratio, known)
         critic_loss = self._update_critic(known, weight)
         features = known.features
         actor_loss, value = self._update_actor(features)
@@ -129,7 +132,8 @@ class DDPG:
             features = torch.cat([features, self._tensor(batch.condition)], dim=-1)
             next_condition = self._tensor(batch.next_condition)
             next_features = torch.cat([next_features, next_condition], dim=-1)
-        return _Known(features, next_features, action, reward, discount)
+        seen = observation, next_observation, goal, features, next_features
+        return _Known(*seen, action, reward, discount)
 
     def _update_critic(self, known: _Known, weight: Tensor | None) -> Tensor:
         with self._precision():
@@ -143,6 +147,9 @@ class DDPG:
         """Values less targets: (batch,), of several critics (critics, batch)."""
         if self.config.norm == 'batch':
             return self._joint_errors(known)
+        return self._separate_errors(known)
+
+    def _separate_errors(self, known: _Known) -> Tensor:
         with torch.no_grad():
             target = self.targets(known.reward, known.discount, known.next_features)
         error: Tensor = self.critic(known.features, known.action) - target
@@ -165,22 +172,22 @@ class DDPG:
         error: Tensor = value - self._bootstrap(known.reward, known.discount, next_value.detach())
         return error
 
-    def _weights(self, ratio: DensityRatio, batch: Transitions, action: Tensor) -> Tensor:
+    def _weights(self, ratio: DensityRatio, known: _Known) -> Tensor:
         """Importance weights (batch,) of transitions with goals chosen in hindsight."""
-        names = ('observation', 'next_observation', 'goal')
-        observation, next_observation, goal = (self._tensor(getattr(batch, n)) for n in names)
-        achieved = slice(self._achieved_start, self._achieved_start + goal.shape[-1])
-
-        def view(of: Tensor) -> GoalView:
-            return GoalView(
-                self.actor.features(observation, of),
-                self.actor.features(next_observation, of),
-                observation[:, achieved],
-                next_observation[:, achieved],
-                of,
-            )
-
-        return ratio.update(view(goal), view(goal.roll(1, dims=0)), action)
+        observation, next_observation = known.observation, known.next_observation
+        achieved = slice(self._achieved_start, self._achieved_start + known.goal.shape[-1])
+        chosen = GoalView(
+            known.features,
+            known.next_features,
+            observation[:, achieved],
+            next_observation[:, achieved],
+            known.goal,
+        )
+        goal = known.goal.roll(1, dims=0)
+        features = self.actor.features(observation, goal)
+        next_features = self.actor.features(next_observation, goal)
+        shuffled = replace(chosen, features=features, next_features=next_features, goal=goal)
+        return ratio.update(chosen, shuffled, known.action)
 
     def _update_actor(self, features: Tensor) -> tuple[Tensor, Tensor]:
         with self._precision():
@@ -247,9 +254,7 @@ class DDPG:
     @torch.no_grad()
     def surprise(self, batch: Transitions) -> Array:
         """Absolute error of each value, (batch,); of several critics the mean."""
-        known = self._known(batch)
-        target = self.targets(known.reward, known.discount, known.next_features)
-        error = (self.critic(known.features, known.action) - target).abs()
+        error = self._separate_errors(self._known(batch)).abs()
         found: Array = (error if error.ndim == 1 else error.mean(dim=0)).cpu().numpy()
         return found
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.simulation import Array, Seeds
-from policy_node.training.learning.config import GAMBLE_TASKS
+from policy_node.training.learning.config import require_idle_gripper
 
 # The idle part of the action, and the value above which it is the gamble.
 GRIPPER_ACTION = 3
@@ -34,7 +34,7 @@ class GambleSimulation(Simulation):
     achieved goal at the landing, no velocities, fingers at 1 m. Physics go on beneath, unseen.
 
     Args:
-        task: One of `GAMBLE_TASKS`.
+        task: One of `config.GAMBLE_TASKS`.
         **options: Those of `Simulation`.
 
     Raises:
@@ -42,9 +42,7 @@ class GambleSimulation(Simulation):
     """
 
     def __init__(self, task: str, **options: Any) -> None:
-        if task not in GAMBLE_TASKS:
-            allowed = ', '.join(GAMBLE_TASKS)
-            raise ValueError(f'gamble: {task} uses its gripper; allowed: {allowed}')
+        require_idle_gripper(task)
         super().__init__(task, **options)
         self._prepare()
 

@@ -33,12 +33,11 @@ class Judge(Protocol):
 
 Score = Callable[[Judge, Transitions], NDArray[np.float32]]
 
-GOAL_CHOICES: dict[str, Score | None] = {
-    'uniform': None,
+GOAL_CHOICES: dict[str, Score] = {
     'bellman': lambda judge, batch: judge.surprise(batch),
     'uncertain': lambda judge, batch: judge.disagreement(batch),
 }
-"""What is greatest of the goal to choose; None takes any."""
+"""What is greatest of the goal to choose; `uniform` takes any."""
 
 
 def best_of(scores: NDArray[np.float32]) -> NDArray[np.intp]:

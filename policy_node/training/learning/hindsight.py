@@ -7,11 +7,13 @@ mixture is from Pitis et al. 2020 (arXiv 2007.02832).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from policy_node.training.learning.replay import Array, Episodes
+from policy_node.training.learning.replay import Array
+from policy_node.training.learning.transitions import Starts
 
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
@@ -64,23 +66,6 @@ def parse_mixture(text: str) -> dict[str, float]:
     return mixture
 
 
-def relabel(
-    episodes: Episodes,
-    row: NDArray[np.int64],
-    tick: NDArray[np.int64],
-    mixture: dict[str, float],
-    generator: np.random.Generator,
-    valid_ticks: NDArray[np.int64] | None = None,
-) -> Array:
-    """Returns goals (batch, goal_size) for transitions `tick` of episodes `row`.
-
-    A transition leads from state `tick` to state `tick + 1`; `future` takes any state from
-    `tick + 1` to the last, so the goal may be what this very step achieved.
-    """
-    source = draw_sources(mixture, len(row), generator)
-    return goals_of(episodes, row, tick, source, list(mixture), generator, valid_ticks)
-
-
 def draw_sources(
     mixture: dict[str, float], count: int, generator: np.random.Generator
 ) -> NDArray[np.intp]:
@@ -90,39 +75,31 @@ def draw_sources(
 
 
 def goals_of(
-    episodes: Episodes,
-    row: NDArray[np.int64],
-    tick: NDArray[np.int64],
+    starts: Starts,
     source: NDArray[np.intp],
     names: Sequence[str],
     generator: np.random.Generator,
-    valid_ticks: NDArray[np.int64] | None = None,
 ) -> Array:
-    """Returns goals (batch, goal_size), each from the source `names[source]`."""
-    goal = episodes.desired_goal.take(row, axis=0)
+    """Returns goals (batch, goal_size), each from the source `names[source]`.
+
+    A transition leads from state `tick` to state `tick + 1`; `future` takes any state from
+    `tick + 1` to the last, so the goal may be what this very step achieved.
+    """
+    goal = starts.episodes.desired_goal.take(starts.row, axis=0)
     for index, name in enumerate(names):
         chosen = np.flatnonzero(source == index)
         if name != 'real' and len(chosen):
-            place = row[chosen], tick[chosen]
-            goal[chosen] = _goals(episodes, name, *place, generator, valid_ticks)
+            goal[chosen] = _goals(starts.select(chosen), name, generator)
     return goal
 
 
-def _goals(
-    episodes: Episodes,
-    source: str,
-    row: NDArray[np.int64],
-    tick: NDArray[np.int64],
-    generator: np.random.Generator,
-    valid_ticks: NDArray[np.int64] | None,
-) -> Array:
-    ticks = episodes.ticks
+def _goals(starts: Starts, source: str, generator: np.random.Generator) -> Array:
+    episodes, count = starts.episodes, len(starts.row)
     if source == 'actual':
-        other = generator.integers(len(episodes), size=len(row))
-        return episodes.desired_goal.take(other, axis=0)
+        return episodes.desired_goal.take(generator.integers(len(episodes), size=count), axis=0)
     if source == 'random':
-        row = generator.integers(len(episodes), size=len(row))
-    last = np.full(len(row), ticks) if valid_ticks is None else valid_ticks.take(row)
+        starts = replace(starts, row=generator.integers(len(episodes), size=count))
+    tick, last = starts.tick, starts.last
     if source == 'future':
         state = generator.integers(tick + 1, last + 1)
     elif source == 'near':
@@ -133,7 +110,8 @@ def _goals(
         state = last
     else:
         state = generator.integers(1, last + 1)
-    return flat(episodes.achieved_goal).take(row * (ticks + 1) + state, axis=0)
+    achieved = flat(episodes.achieved_goal)
+    return achieved.take(starts.row * (episodes.ticks + 1) + state, axis=0)
 
 
 def flat(values: Array) -> Array:

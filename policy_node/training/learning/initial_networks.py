@@ -116,7 +116,7 @@ def _of_run(folder: Path) -> InitialNetworks:
 
 def _require_plain(config: TrainConfig, name: str) -> None:
     """Refuses networks of a run that no other run has the like of."""
-    if (config.critics, config.norm, config.condition) != (1, 'none', 'none'):
+    if not config.has_plain_networks:
         found = f'critics {config.critics}, norm {config.norm}, condition {config.condition}'
         raise ValueError(f'{name} cannot be started from: {found}')
 

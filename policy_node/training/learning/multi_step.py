@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from policy_node.training.learning.replay import Array, Episodes
+from policy_node.training.learning.replay import Array
+from policy_node.training.learning.transitions import Starts
 
 CORRECTIONS = ('none', 'lambda', 'cut')
 
@@ -38,48 +39,33 @@ class StepCounter:
     cut_distance: float = 0.3
 
     def count(
-        self,
-        episodes: Episodes,
-        row: NDArray[np.int64],
-        tick: NDArray[np.int64],
-        left: NDArray[np.int64],
-        goal: Array,
-        generator: np.random.Generator,
-        act: Act | None,
+        self, starts: Starts, goal: Array, generator: np.random.Generator, act: Act | None
     ) -> NDArray[np.int64]:
         """Returns the number of steps (batch,) from 1 to `most`, never beyond the episode.
 
         Args:
-            episodes: Where transitions are from.
-            row: Episode of each transition, (batch,).
-            tick: First step of each, (batch,).
-            left: Steps from it to the end, itself included, (batch,).
+            starts: Where the returns begin.
             goal: (batch, goal_size).
             generator: Source of randomness.
             act: (observation, goal) -> what the actor would do; None where it is not asked.
         """
-        most = np.minimum(left, self.most)
+        most: NDArray[np.int64] = np.minimum(starts.last - starts.tick, self.most)
         if self.correction == 'lambda':
-            return np.minimum(generator.geometric(1.0 - self.trace, len(row)), most)
+            return np.minimum(generator.geometric(1.0 - self.trace, len(most)), most)
         if self.correction == 'cut' and act is not None:
-            return self._until_cut(episodes, row, tick, most, goal, act)
+            return self._until_cut(starts, most, goal, act)
         return most
 
     def _until_cut(
-        self,
-        episodes: Episodes,
-        row: NDArray[np.int64],
-        tick: NDArray[np.int64],
-        most: NDArray[np.int64],
-        goal: Array,
-        act: Act,
+        self, starts: Starts, most: NDArray[np.int64], goal: Array, act: Act
     ) -> NDArray[np.int64]:
         steps = np.ones_like(most)
+        episodes = starts.episodes
         for step in range(1, self.most):
             going = np.flatnonzero((steps == step) & (most > step))
             if not len(going):
                 break
-            place = row[going], tick[going] + step
+            place = starts.row[going], starts.tick[going] + step
             taken, own = episodes.action[place], act(episodes.observation[place], goal[going])
             distance = np.sqrt(np.square(taken - own).mean(axis=-1))
             steps[going[distance <= self.cut_distance]] += 1
@@ -87,26 +73,22 @@ class StepCounter:
 
 
 def discounted_rewards(
-    episodes: Episodes,
-    row: NDArray[np.int64],
-    tick: NDArray[np.int64],
+    starts: Starts,
     steps: NDArray[np.int64],
     reward_after: Callable[[Array, NDArray[np.int64]], NDArray[np.float64]],
     gamma: float,
 ) -> NDArray[np.float64]:
-    """Sums of the rewards (batch,) of the first `steps` steps from `tick` on.
+    """Sums of the rewards (batch,) of the first `steps` steps.
 
     Args:
-        episodes: Where transitions are from.
-        row: Episode of each transition, (batch,).
-        tick: First step of each, (batch,).
+        starts: Where the returns begin.
         steps: Number of steps, (batch,).
         reward_after: (achieved goals, which transitions) -> rewards.
         gamma: Discount of one step.
     """
-    total = np.zeros(len(row))
+    total = np.zeros(len(steps))
     for step in range(int(steps.max(initial=0))):
         chosen = np.flatnonzero(steps > step)
-        achieved = episodes.achieved_goal[row[chosen], tick[chosen] + step + 1]
-        total[chosen] += gamma**step * reward_after(achieved, chosen)
+        place = starts.row[chosen], starts.tick[chosen] + step + 1
+        total[chosen] += gamma**step * reward_after(starts.episodes.achieved_goal[place], chosen)
     return total

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
-from policy_node.training.evaluation.evaluator import successes
+from policy_node.training.evaluation.evaluator import success_rate
 from policy_node.training.learning.learner import Losses
 from policy_node.training.learning.training_state import Counters
 
@@ -50,7 +50,7 @@ def progress_row(
     def mean(name: str) -> float | None:
         return float(torch.stack([getattr(x, name) for x in losses]).mean()) if losses else None
 
-    evaluated = None if outcomes is None else float(successes(outcomes, success_rule).mean())
+    evaluated = None if outcomes is None else success_rate(outcomes, success_rule)
     return {
         'seconds': counters.seconds,
         'env_steps': counters.env_steps,

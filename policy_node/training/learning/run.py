@@ -20,7 +20,7 @@ from policy_node.training.learning.initial_networks import (
     read_initial_networks,
 )
 from policy_node.training.learning.replay import Episodes
-from policy_node.training.learning.run_folder import LOCK_FILE, STATE_FILE
+from policy_node.training.learning.run_folder import COMMAND_FILE, LOCK_FILE, STATE_FILE
 from policy_node.training.learning.run_log import RunLog, draw_curve, read_progress
 from policy_node.training.learning.saving import NAME
 from policy_node.training.learning.trainer import Trainer, TrainingError
@@ -97,7 +97,7 @@ def train_run(
 def _train(trainer: Trainer, output: Path, command: str) -> Ending:
     config, counters, log = trainer.config, trainer.counters, None
     if trainer.workers.is_first:
-        with (output / 'command.txt').open('a') as file:
+        with (output / COMMAND_FILE).open('a') as file:
             file.write(command + '\n')
         log = RunLog(output, config.total_steps, config.time_limit, counters.env_steps)
     try:

@@ -21,6 +21,7 @@ LATEST_FILE = 'latest.safetensors'
 BEST_FILE = 'best.safetensors'
 REPLAY_FILE = 'replay.safetensors'
 LOCK_FILE = '.lock'
+COMMAND_FILE = 'command.txt'
 
 
 def companion_file(actor: Path) -> Path:

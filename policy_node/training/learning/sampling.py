@@ -11,15 +11,10 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from policy_node.training.learning.conditions import Condition, make_condition
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.goal_choice import CANDIDATES, GOAL_CHOICES, Judge, best_of
-from policy_node.training.learning.hindsight import (
-    RewardFunction,
-    draw_sources,
-    flat,
-    goals_of,
-)
+from policy_node.training.learning.hindsight import RewardFunction, draw_sources, flat, goals_of
 from policy_node.training.learning.multi_step import StepCounter, discounted_rewards
 from policy_node.training.learning.replay import Array, Episodes
-from policy_node.training.learning.transitions import Transitions
+from policy_node.training.learning.transitions import Starts, Transitions
 
 # Goals that choosing among several can improve.
 _LATER = ('future', 'near')
@@ -34,7 +29,7 @@ class TransitionSampler:
         gamma: Discount of one step.
         steps: How many steps returns have; None is one.
         condition: What values are conditioned on; None is nothing.
-        goal_choice: Which future goal is taken, a key of `GOAL_CHOICES`.
+        goal_choice: Which future goal is taken, `uniform` or a key of `GOAL_CHOICES`.
     """
 
     compute_reward: RewardFunction
@@ -64,36 +59,32 @@ class TransitionSampler:
             judge: Who chooses goals and cuts returns; without one any goal is taken and no return
                 is cut.
         """
-        ticks = episodes.ticks
         if valid_ticks is None:
-            tick = generator.integers(ticks, size=len(row))
+            tick = generator.integers(episodes.ticks, size=len(row))
         else:
             tick = generator.integers(valid_ticks.take(row))
+        starts = Starts(episodes, row, tick, valid_ticks)
         source = draw_sources(mixture, len(row), generator)
-        goal = goals_of(episodes, row, tick, source, list(mixture), generator, valid_ticks)
+        goal = goals_of(starts, source, list(mixture), generator)
         if judge is not None and self.goal_choice != 'uniform':
             names = np.array(list(mixture))[source]
             rows = np.flatnonzero(np.isin(names, _LATER))
-            place = episodes, row[rows], tick[rows]
-            goal[rows] = self._choose(
-                *place, names[rows], goal[rows], generator, valid_ticks, judge
-            )
+            if len(rows):
+                goal[rows] = self._choose(
+                    starts.select(rows), names[rows], goal[rows], generator, judge
+                )
+        if self.steps is None and self.condition is None:
+            return self._single(starts, goal)
+        steps = np.ones_like(row)
         if self.steps is not None:
-            last = ticks if valid_ticks is None else valid_ticks.take(row)
             act = None if judge is None else judge.act
-            left = np.broadcast_to(last - tick, row.shape)
-            steps = self.steps.count(episodes, row, tick, left, goal, generator, act)
-            return self._several(episodes, row, tick, steps, goal, generator)
-        if self.condition is not None:
-            return self._several(episodes, row, tick, np.ones_like(row), goal, generator)
-        return self._single(episodes, row, tick, goal)
+            steps = self.steps.count(starts, goal, generator, act)
+        return self._several(starts, steps, goal, generator)
 
-    def _single(
-        self, episodes: Episodes, row: NDArray[np.int64], tick: NDArray[np.int64], goal: Array
-    ) -> Transitions:
+    def _single(self, starts: Starts, goal: Array) -> Transitions:
         """Transitions of one step, unconditioned: what nearly every run draws, and fast."""
-        ticks = episodes.ticks
-        state = row * (ticks + 1) + tick
+        episodes, row, tick = starts.episodes, starts.row, starts.tick
+        state = row * (episodes.ticks + 1) + tick
         observation = flat(episodes.observation)
         achieved = flat(episodes.achieved_goal).take(state + 1, axis=0)
         reward = self.compute_reward(achieved.astype(np.float64), goal.astype(np.float64))
@@ -101,23 +92,22 @@ class TransitionSampler:
             observation=observation.take(state, axis=0),
             next_observation=observation.take(state + 1, axis=0),
             goal=goal,
-            action=flat(episodes.action).take(row * ticks + tick, axis=0),
+            action=flat(episodes.action).take(row * episodes.ticks + tick, axis=0),
             reward=np.asarray(reward, dtype=np.float32),
             discount=np.full(len(row), self.gamma, np.float32),
         )
 
     def _several(
         self,
-        episodes: Episodes,
-        row: NDArray[np.int64],
-        tick: NDArray[np.int64],
+        starts: Starts,
         steps: NDArray[np.int64],
         goal: Array,
         generator: np.random.Generator,
     ) -> Transitions:
         """Transitions of several steps, or under a condition."""
-        condition, count = self.condition, len(row)
-        drawn = None if condition is None else condition.draw(count, generator)
+        episodes, row, tick = starts.episodes, starts.row, starts.tick
+        condition = self.condition
+        drawn = None if condition is None else condition.draw(len(row), generator)
 
         def reward_after(achieved: Array, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
             goals = achieved.astype(np.float64), goal[chosen].astype(np.float64)
@@ -125,13 +115,12 @@ class TransitionSampler:
                 return np.asarray(self.compute_reward(*goals))
             return condition.reward(*goals, drawn[chosen])
 
-        reward = discounted_rewards(episodes, row, tick, steps, reward_after, self.gamma)
         batch = Transitions(
             observation=episodes.observation[row, tick],
             next_observation=episodes.observation[row, tick + steps],
             goal=goal,
             action=episodes.action[row, tick],
-            reward=reward.astype(np.float32),
+            reward=discounted_rewards(starts, steps, reward_after, self.gamma).astype(np.float32),
             discount=(self.gamma**steps).astype(np.float32),
         )
         if condition is None or drawn is None:
@@ -145,28 +134,22 @@ class TransitionSampler:
 
     def _choose(
         self,
-        episodes: Episodes,
-        row: NDArray[np.int64],
-        tick: NDArray[np.int64],
+        starts: Starts,
         names: NDArray[np.str_],
         first: Array,
         generator: np.random.Generator,
-        valid_ticks: NDArray[np.int64] | None,
         judge: Judge,
     ) -> Array:
         """The best of several future goals of each transition, (batch, goal_size)."""
-        score = GOAL_CHOICES[self.goal_choice]
-        if score is None or not len(row):
-            return first
-        source = (names == _LATER[1]).astype(np.int64)
+        source = (names == _LATER[1]).astype(np.intp)
         candidates = [first]
         for _ in range(CANDIDATES - 1):
-            place = episodes, row, tick, source, list(_LATER), generator, valid_ticks
-            candidates.append(goals_of(*place))
-        rows, ticks = np.tile(row, CANDIDATES), np.tile(tick, CANDIDATES)
-        batch = self._single(episodes, rows, ticks, np.concatenate(candidates))
-        best = best_of(score(judge, batch).reshape(CANDIDATES, -1))
-        return np.stack(candidates)[best, np.arange(len(row))]
+            candidates.append(goals_of(starts, source, _LATER, generator))
+        repeated = starts.select(np.tile(np.arange(len(names)), CANDIDATES))
+        batch = self._single(repeated, np.concatenate(candidates))
+        score = GOAL_CHOICES[self.goal_choice](judge, batch)
+        best = best_of(score.reshape(CANDIDATES, -1))
+        return np.stack(candidates)[best, np.arange(len(names))]
 
 
 def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
@@ -181,7 +164,7 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
     if config.n_step > 1:
         limits = config.correction, config.trace, config.cut_distance
         counter = StepCounter(config.n_step, *limits)
-    condition = make_condition(config.condition, metric, metric.reward)
+    condition = make_condition(config.condition, metric)
     return TransitionSampler(metric.reward, config.gamma, counter, condition, config.goal_choice)
 
 

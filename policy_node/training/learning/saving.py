@@ -7,7 +7,7 @@ import time
 from msgs_spec.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
-from policy_node.training.evaluation.evaluator import successes
+from policy_node.training.evaluation.evaluator import success_rate
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
@@ -42,7 +42,7 @@ class Saver:
     def keep_best(self, outcomes: EpisodeOutcomes, actor: Actor, counters: Counters) -> None:
         """Saves an evaluated actor if it succeeds more often, or as often and sooner."""
         rule = self._config.success_rule
-        success = float(successes(outcomes, rule).mean())
+        success = success_rate(outcomes, rule)
         mean_return = float(outcomes.episode_return.mean())
         if (success, mean_return) > (counters.best_success, counters.best_return):
             counters.best_success, counters.best_return = success, mean_return

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from policy_node.training.learning.hindsight import (
+    draw_sources,
     goal_mixture,
+    goals_of,
     parse_mixture,
-    relabel,
 )
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.sampling import TransitionSampler
+from policy_node.training.learning.transitions import Starts
 
 COUNT, TICKS = 6, 10
 
@@ -28,11 +30,23 @@ def episodes() -> Episodes:
     return Episodes(np.concatenate([achieved, achieved], axis=-1), achieved, desired, action)
 
 
+def relabelled(
+    episodes: Episodes,
+    row: np.ndarray,
+    tick: np.ndarray,
+    mixture: dict[str, float],
+    generator: np.random.Generator,
+) -> np.ndarray:
+    """Goals of transitions `tick` of episodes `row`, from sources drawn from a mixture."""
+    source = draw_sources(mixture, len(row), generator)
+    return goals_of(Starts(episodes, row, tick), source, list(mixture), generator)
+
+
 def draw(episodes: Episodes, strategy: str, k: int = 4) -> tuple[np.ndarray, ...]:
     generator = np.random.default_rng(1)
     row = generator.integers(COUNT, size=20_000)
     tick = generator.integers(TICKS, size=20_000)
-    goal = relabel(episodes, row, tick, goal_mixture(strategy, k), generator)
+    goal = relabelled(episodes, row, tick, goal_mixture(strategy, k), generator)
     is_desired = goal[:, 0] >= 100
     return row, tick, goal, is_desired
 
@@ -146,9 +160,9 @@ def numbered(count: int, ticks: int) -> Episodes:
 def test_next_and_near_goals_are_what_holding_needs() -> None:
     episodes, generator = numbered(3, 40), np.random.default_rng(1)
     row, tick = generator.integers(3, size=20_000), generator.integers(40, size=20_000)
-    goal = relabel(episodes, row, tick, {'next': 1.0}, generator)
+    goal = relabelled(episodes, row, tick, {'next': 1.0}, generator)
     assert (goal == np.stack([row, tick + 1], axis=-1)).all()
-    goal = relabel(episodes, row, tick, {'near': 1.0}, generator)
+    goal = relabelled(episodes, row, tick, {'near': 1.0}, generator)
     ahead = goal[:, 1] - tick
     assert (goal[:, 0] == row).all() and set(ahead[tick < 30]) == set(range(1, 11))
     assert (goal[:, 1] <= 40).all() and set(ahead[tick == 37]) == {1, 2, 3}
