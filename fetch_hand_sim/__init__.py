@@ -1,6 +1,11 @@
 """The robots: thirteen tasks on MuJoCo, from one batched simulation, and the ROS node around it."""
 
-from fetch_hand_sim.gym_envs.registration import (
+from msgs_spec.loading import guard_loading
+
+# Before anything that takes long to import.
+guard_loading()
+
+from fetch_hand_sim.gym_envs.registration import (  # noqa: E402
     make_vec,
     register_environments,
     register_gymnasium_robotics,

@@ -17,10 +17,13 @@ from importlib.util import find_spec
 from types import FrameType
 from typing import Any, NoReturn
 
+from msgs_spec.loading import EXIT_INTERRUPTED as EXIT_INTERRUPTED
+from msgs_spec.loading import is_nobodys
+
 # Done; done, and something is wrong; not begun, because of what was given.
 EXIT_SUCCESS, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
-# As shells say it: 128 + SIGINT, 128 + SIGPIPE.
-EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 130, 141
+# As shells say it: 128 + SIGPIPE.
+EXIT_CLOSED_PIPE = 141
 
 # Modules by which an extra of this package is recognised, since ROS brings its own by apt.
 EXTRAS = {
@@ -113,7 +116,7 @@ def run_command(name: str, run: Callable[[], int]) -> int:
         What `run` returns, or the exit code of what it raised: 1 or 2 for a `CommandError`, 130 for
         Ctrl-C (it is acknowledged at once with a line), 141 if nobody reads the output any more.
     """
-    with _stopping_is_said(name):
+    with _stopping_is_said(name) as stopping:
         try:
             code = run()
             sys.stdout.flush()
@@ -125,6 +128,11 @@ def run_command(name: str, run: Callable[[], int]) -> int:
         except BrokenPipeError:
             _discard_output()
             return EXIT_CLOSED_PIPE
+        except ImportError:
+            # What becomes of KeyboardInterrupt in the initialisation of many a library.
+            if not stopping:
+                raise
+            return EXIT_INTERRUPTED
     return code
 
 
@@ -188,24 +196,30 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 @contextmanager
-def _stopping_is_said(name: str) -> Iterator[None]:
-    """Ctrl-C says `stopping` before it raises KeyboardInterrupt; a second one ends the process."""
+def _stopping_is_said(name: str) -> Iterator[list[int]]:
+    """Ctrl-C says `stopping` before it raises KeyboardInterrupt; a second one ends the process.
+
+    Yields:
+        A list that will hold the signal.
+    """
+    received: list[int] = []
 
     def handle(number: int, frame: FrameType | None) -> None:
+        received.append(number)
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         complain(name, 'stopping')
         signal.default_int_handler(number, frame)
 
     is_main_thread = threading.current_thread() is threading.main_thread()
-    if not is_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if not is_main_thread or not is_nobodys():
         # A command inside of another one, or somebody else's handler: theirs stays.
-        yield
+        yield received
         return
-    signal.signal(signal.SIGINT, handle)
+    before = signal.signal(signal.SIGINT, handle)
     try:
-        yield
+        yield received
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, before)
 
 
 def _discard_output() -> None:

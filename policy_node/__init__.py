@@ -7,11 +7,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from msgs_spec.loading import guard_loading
+
 if TYPE_CHECKING:
     from policy_node.policies.actor import Actor
     from policy_node.policies.loading import load_actor, load_policy
 
 __all__ = ['Actor', 'load_actor', 'load_policy']
+
+# Before anything that takes long to import.
+guard_loading()
 
 
 def __getattr__(name: str) -> Any:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import IO
 
 from fetch_hand_sim.commands.executables import executable
+from msgs_spec.command_line import EXIT_SUCCESS
 
 _SHUTDOWN_TIMEOUT = 10.0
 
@@ -39,11 +40,14 @@ def start_node(
 
 
 def stop_node(process: subprocess.Popen[str]) -> int:
-    """Asks a node to end and returns its exit code."""
-    if process.poll() is None:
-        process.send_signal(signal.SIGINT)
+    """Asks a node to end; returns its exit code, 0 also for one that was still being loaded."""
+    if process.poll() is not None:
+        return process.returncode
+    # Not SIGINT, which is a traceback as long as Python itself starts.
+    process.terminate()
     try:
-        return process.wait(_SHUTDOWN_TIMEOUT)
+        code = process.wait(_SHUTDOWN_TIMEOUT)
     except subprocess.TimeoutExpired:
         process.kill()
         return process.wait()
+    return EXIT_SUCCESS if code == -signal.SIGTERM else code

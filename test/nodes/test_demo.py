@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import signal
 import sys
+import tempfile
+import time
 
 import pytest
 
+from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import read_summary
 
 
@@ -32,3 +35,13 @@ def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, 
     assert read_summary(paths[0]).is_complete
     # The robot had time to close what it was logging.
     assert not [path for path in paths if path.name.startswith('.')]
+
+
+@pytest.mark.parametrize('seconds', [0.0, 0.1, 0.4])
+def test_a_node_that_is_still_loaded_ends_quietly(seconds):
+    with tempfile.TemporaryFile('w+') as log:
+        process = start_node('sim_node', ['task:=FetchReach'], log)
+        time.sleep(seconds)
+        assert stop_node(process) == 0
+        log.seek(0)
+        assert log.read() == ''

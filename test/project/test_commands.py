@@ -14,7 +14,8 @@ import pytest
 
 from fetch_hand_sim.commands.executables import executable, find_executable
 from msgs_spec.command_line import EXTRAS
-from support import ROOT, script_environment
+from support import script_environment
+from support.entry_points import console_scripts, started_as_modules
 
 NODES = {'sim_node', 'policy_node', 'replay_node', 'visualization_node'}
 # What each executable needs beyond the base installation.
@@ -60,8 +61,7 @@ def run(monkeypatch, capsys):
 
 
 def test_every_executable_says_what_it_needs():
-    points = distribution('fetch_hand_sim').entry_points
-    assert points.select(group='console_scripts').names == set(NEEDS)
+    assert set(console_scripts()) == set(NEEDS)
 
 
 @pytest.mark.parametrize(
@@ -98,21 +98,6 @@ for module in {modules!r}:
         os._exit(code)
     print(f'exit {{os.waitstatus_to_exitcode(os.wait()[1])}}', file=sys.stderr, flush=True)
 """
-
-
-def started_as_modules() -> list[str]:
-    """What `python -m` can start."""
-    found = []
-    for package in ('fetch_hand_sim', 'policy_node'):
-        for path in sorted((ROOT / package).rglob('*.py')):
-            parts = path.relative_to(ROOT).with_suffix('').parts
-            if parts == ('policy_node', 'policies', 'onnx'):
-                continue  # A child that tries a file out; nobody else starts it.
-            if path.name == '__main__.py':
-                found.append('.'.join(parts[:-1]))
-            elif "__name__ == '__main__'" in path.read_text():
-                found.append('.'.join(parts))
-    return found
 
 
 def test_modules_without_any_extra_end_without_traceback(tmp_path):

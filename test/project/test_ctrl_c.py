@@ -1,0 +1,95 @@
+"""Ctrl-C while a command is being loaded: one line and 130, wherever it comes; no traceback."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from msgs_spec.loading import EXECUTABLES
+from support import script_environment
+from support.entry_points import console_scripts, started_as_modules
+
+# As pip writes it into the folder of programs.
+SCRIPT = 'import sys\nfrom {module} import {function}\nsys.exit({function}())\n'
+# What `python -X importtime` says after each import begins so.
+IMPORT = 'import time:'
+# The last import before Ctrl-C is answered.
+GUARD = 'msgs_spec.loading'
+
+
+def interrupt(command: Sequence[str | Path], imports: int, after: str = GUARD) -> tuple[int, str]:
+    """Presses Ctrl-C when so many modules have been loaded after one; returns code and stderr."""
+    process = subprocess.Popen(
+        [sys.executable, '-X', 'importtime', *command],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=script_environment(),
+        start_new_session=True,
+    )
+    said, left = [], None
+    for line in process.stderr:
+        if not line.startswith(IMPORT):
+            said.append(line)
+        elif left is None and line.split('|')[-1].strip() == after:
+            left = imports
+        elif left:
+            left -= 1
+            if left == 0:
+                process.send_signal(signal.SIGINT)
+    return process.wait(60), ''.join(said)
+
+
+@pytest.fixture(scope='module')
+def programs(tmp_path_factory) -> Path:
+    """A folder of programs, as an installation makes it."""
+    folder = tmp_path_factory.mktemp('bin')
+    for name, (module, function) in console_scripts().items():
+        (folder / name).write_text(SCRIPT.format(module=module, function=function))
+    return folder
+
+
+def test_the_names_of_executables_are_known():
+    assert frozenset(console_scripts()) == EXECUTABLES
+
+
+@pytest.mark.parametrize('name', sorted(EXECUTABLES))
+def test_a_program_that_has_hardly_begun(name, programs):
+    assert interrupt([programs / name], 1) == (130, f'{name}: stopping\n')
+
+
+@pytest.mark.parametrize('module', started_as_modules())
+def test_a_module_that_has_hardly_begun(module):
+    name = module.rpartition('.')[2]
+    assert interrupt(['-m', module], 1) == (130, f'{name}: stopping\n')
+
+
+@pytest.mark.parametrize(
+    ('name', 'words'),
+    [
+        ('list_episodes', ['.']),
+        ('check_episode', ['.']),
+        ('fetch_hand_sim', ['demo']),
+        ('train_her', ['--task', 'FetchReach', '--output', 'run']),
+        ('view', ['--no-browser']),
+    ],
+)
+@pytest.mark.parametrize('imports', [60, 200, 400])
+def test_a_command_at_any_moment(name, words, imports, programs, tmp_path):
+    code, said = interrupt([programs / name, *words], imports)
+    assert (code, said) == (130, f'{name}: stopping\n')
+
+
+def test_a_program_of_somebody_else_keeps_its_own_answer(tmp_path):
+    program = tmp_path / 'view'
+    program.write_text(
+        'import signal, fetch_hand_sim, policy_node\n'
+        'assert signal.getsignal(signal.SIGINT) is signal.default_int_handler\n'
+    )
+    subprocess.run([sys.executable, program], check=True, env=script_environment())
