@@ -85,10 +85,13 @@ class Row:
 
 
 class Watcher:
-    """A plain subscriber that follows an episode's progress."""
+    """A plain subscriber that follows an episode's progress.
+
+    Args:
+        spec: The task of the robot.
+    """
 
     def __init__(self, spec: TaskSpec) -> None:
-        """Subscribes to the robot of a task."""
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
 
@@ -122,10 +125,14 @@ class Watcher:
 
 
 class Demo:
-    """Runs the two nodes until the episodes are done."""
+    """Runs the two nodes until the episodes are done.
+
+    Args:
+        options: Of the command line.
+        console: Where it prints.
+    """
 
     def __init__(self, options: argparse.Namespace, console: Console) -> None:
-        """Takes the options of the command line."""
         self._options = options
         self._console = console
         self._spec = task_spec(options.task)

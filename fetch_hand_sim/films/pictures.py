@@ -24,10 +24,15 @@ _FRAME = 3
 
 
 class Studio:
-    """Draws recordings of any tasks in one size; each model is compiled once."""
+    """Draws recordings of any tasks in one size; each model is compiled once.
+
+    Args:
+        width: Of pictures, pixels.
+        height: Likewise.
+        camera: Of the models, by name; None for the usual view.
+    """
 
     def __init__(self, width: int, height: int, camera: str | None = None) -> None:
-        """Takes the size in pixels, and a camera of the models by name or None for the usual."""
         self.width, self.height = width, height
         self._camera = camera
         self._renderers: dict[str, SceneRenderer] = {}

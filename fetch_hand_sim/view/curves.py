@@ -14,10 +14,15 @@ Array = NDArray[np.float64]
 
 
 class Curves:
-    """The latest ticks as curves."""
+    """The latest ticks as curves.
+
+    Args:
+        spec: The task.
+        metric: Measures how far its goals are.
+        length: Ticks that are kept.
+    """
 
     def __init__(self, spec: TaskSpec, metric: GoalMetric, length: int = 250) -> None:
-        """Keeps `length` ticks."""
         self._spec = spec
         self._metric = metric
         commands = spec.robot.action_size

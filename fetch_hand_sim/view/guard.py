@@ -57,10 +57,12 @@ class Guard:
     Without a token only addresses of this machine are served, so that a name which an attacker
     points at 127.0.0.1 is not. With a token, whoever has it. A web socket must come from the page
     itself, never from a page of another site.
+
+    Args:
+        token: What visitors must show; None for nothing.
     """
 
     def __init__(self, token: str | None = None) -> None:
-        """Takes the token that visitors must show; None for none."""
         self.token = token
 
     def refusal(self, target: str, headers: Headers) -> Refusal | None:

@@ -26,15 +26,14 @@ Array = NDArray[np.float64]
 
 
 class LiveRobot:
-    """Follows one robot and passes on what the page asks for."""
+    """Follows the robot in the node's namespace and passes on what the page asks for.
+
+    Args:
+        node: Of this process.
+        may_command: Whether the page may act.
+    """
 
     def __init__(self, node: Node, may_command: bool) -> None:
-        """Listens for a robot in the node's namespace.
-
-        Args:
-            node: Of this process.
-            may_command: Whether the page may act.
-        """
         self._may_command = may_command
         self._name = node.get_fully_qualified_name()
         self._sim_name = f'{node.get_namespace().rstrip("/")}/sim_node'

@@ -32,18 +32,17 @@ _PAUSE_AT_END = 1.0
 
 
 class Player:
-    """Shows one frame after the other, as fast as asked for."""
+    """Shows one frame after the other, as fast as asked for.
+
+    Args:
+        paths: Episodes, at least one.
+        clock: A steady clock, seconds.
+
+    Raises:
+        EpisodeReadError: If the first one cannot be read.
+    """
 
     def __init__(self, paths: Sequence[Path], clock: Callable[[], float] = time.monotonic) -> None:
-        """Opens the first episode.
-
-        Args:
-            paths: Episodes, at least one.
-            clock: A steady clock, seconds.
-
-        Raises:
-            EpisodeReadError: If the first one cannot be read.
-        """
         self._paths = list(paths)
         self._clock = clock
         self._number = 0

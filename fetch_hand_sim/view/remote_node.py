@@ -13,16 +13,15 @@ _SET_PARAMETERS = 'rcl_interfaces/srv/SetParameters'
 
 
 class RemoteNode:
-    """A node in the namespace of ours, by name."""
+    """A node in the namespace of ours, by name.
+
+    Args:
+        node: Of this process.
+        name: Of the other one.
+        notice: Gets a line about what a call led to.
+    """
 
     def __init__(self, node: Node, name: str, notice: Callable[[str], None]) -> None:
-        """Takes what is needed to call it.
-
-        Args:
-            node: Of this process.
-            name: Of the other one.
-            notice: Gets a line about what a call led to.
-        """
         self._node = node
         self._name = name
         self._notice = notice

@@ -40,19 +40,17 @@ _GOAL_PATIENCE = 0.5
 
 
 class RobotRequests:
-    """Passes on what the page asks for.
+    """Passes on what the page asks for to the nodes in the namespace of ours.
+
+    Args:
+        node: Of this process.
+        tell: Gets changed fields of `Facts`, by name.
 
     Attributes:
         push_limit: Largest force that the robot takes, N; 0 for none.
     """
 
     def __init__(self, node: Node, tell: Callable[..., None]) -> None:
-        """Connects to the nodes in the namespace of ours.
-
-        Args:
-            node: Of this process.
-            tell: Gets changed fields of `Facts`, by name.
-        """
         self._node = node
         self._tell = tell
         self._sim = RemoteNode(node, 'sim_node', self._notice)

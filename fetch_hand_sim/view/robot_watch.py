@@ -53,7 +53,13 @@ class SeenTick:
 
 
 class RobotWatch:
-    """Subscribes to one robot."""
+    """Subscribes to the robot in the node's namespace.
+
+    Args:
+        node: Of this process.
+        on_status: Gets what the robot says of its episode; the task may be another one.
+        on_tick: Gets every tick.
+    """
 
     def __init__(
         self,
@@ -61,13 +67,6 @@ class RobotWatch:
         on_status: Callable[[EpisodeStatus], None],
         on_tick: Callable[[SeenTick], None],
     ) -> None:
-        """Listens for a robot in the node's namespace.
-
-        Args:
-            node: Of this process.
-            on_status: Gets what the robot says of its episode; the task may be another one.
-            on_tick: Gets every tick.
-        """
         self._node = node
         self._on_status = on_status
         self._on_tick = on_tick

@@ -28,10 +28,12 @@ class Requests(plugin.SimPlugin):
 
     What the viewer's own tools send would change a model that is only looked at: pulls at bodies
     are passed on, all else is dropped.
+
+    Args:
+        perform: Does what is asked for.
     """
 
     def __init__(self, perform: Callable[[Request | LatestRequest], None]) -> None:
-        """Takes who does it."""
         self._perform = perform
 
     @messages.handler
@@ -75,10 +77,14 @@ class Requests(plugin.SimPlugin):
 
 
 class Session:
-    """One page and what it shows."""
+    """One page and what it shows.
+
+    Args:
+        handle: The viewer's.
+        source: What there is to see.
+    """
 
     def __init__(self, handle: viewer_handle.ViewerHandle, source: Source) -> None:
-        """Connects the two."""
         self._handle = handle
         self._source = source
         self._scene: Scene | None = None

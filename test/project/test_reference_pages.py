@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import runpy
+from collections.abc import Iterator
 
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.recipes import recipe_config
@@ -30,3 +32,19 @@ def test_the_recipes_are_those_that_train() -> None:
 def test_a_command_is_shown_with_what_it_prints() -> None:
     assert ('episodes', 'list') in dict(TOOL['leaves'](TOOL['COMMANDS']))
     assert TOOL['help_of'](('episodes', 'list')).startswith('usage: list_episodes [-h]')
+
+
+def constructors() -> Iterator[tuple[str, str]]:
+    """Name of each class, where it is, and what its `__init__` says."""
+    for package in ('msgs_spec', 'fetch_hand_sim', 'policy_node'):
+        for path in (ROOT / package).rglob('*.py'):
+            for node in ast.walk(ast.parse(path.read_text())):
+                for method in node.body if isinstance(node, ast.ClassDef) else ():
+                    if isinstance(method, ast.FunctionDef) and method.name == '__init__':
+                        yield f'{path}: {node.name}', ast.get_docstring(method) or ''
+
+
+def test_arguments_of_a_class_are_documented_in_the_class() -> None:
+    found = dict(constructors())
+    assert len(found) > 50
+    assert [name for name, text in found.items() if 'Args:' in text] == []

@@ -51,10 +51,13 @@ def pulls(model: mujoco.MjModel, snapshot: messages.PerturbSnapshot) -> list[tup
 
 
 class BodyDrag:
-    """A spring between the mouse and the body at which it was pressed."""
+    """A spring between the mouse and the body at which it was pressed.
+
+    Args:
+        perturb: The perturbation that a viewer draws.
+    """
 
     def __init__(self, perturb: mujoco.MjvPerturb) -> None:
-        """Takes the perturbation that a viewer draws."""
         self._perturb = perturb
 
     @property

@@ -14,10 +14,13 @@ _SELECTED = imgui.Vec4(0.1, 0.45, 0.85, 1.0)
 
 
 class CommandPanel:
-    """The part of the robot's panel that commands, where nobody else does."""
+    """The part of the robot's panel that commands, where nobody else does.
+
+    Args:
+        send: Gets the commands.
+    """
 
     def __init__(self, send: Send) -> None:
-        """Takes who gets the commands."""
         self._send = send
         self._task = ''
         self._teleoperation: Teleoperation | None = None

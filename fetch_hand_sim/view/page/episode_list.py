@@ -27,18 +27,17 @@ def describe(path: Path) -> str:
 
 
 class EpisodeList:
-    """A list that can be clicked; what is not seen of it is not read."""
+    """A list that can be clicked; what is not seen of it is not read.
+
+    Args:
+        paths: Episodes.
+        send: Gets what people choose.
+        describe: Says what an episode is.
+    """
 
     def __init__(
         self, paths: tuple[Path, ...], send: Send, describe: Callable[[Path], str] = describe
     ) -> None:
-        """Reads nothing yet.
-
-        Args:
-            paths: Episodes.
-            send: Gets what people choose.
-            describe: Says what an episode is.
-        """
         self._paths = paths
         self._send = send
         self._describe = cache(describe)

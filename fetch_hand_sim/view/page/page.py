@@ -34,14 +34,13 @@ class _GoalDrag:
 
 
 class Page(plugin.ViewerPlugin):
-    """Draws what pictures say and sends what people do."""
+    """Draws what pictures say and sends what people do.
+
+    Args:
+        episodes: Files to choose from, where files are played.
+    """
 
     def __init__(self, episodes: tuple[Path, ...] = ()) -> None:
-        """Shows nothing yet.
-
-        Args:
-            episodes: Files to choose from, where files are played.
-        """
         self._scene: Scene | None = None
         self._picture: Picture | None = None
         self._panels = Panels(self._send, episodes)

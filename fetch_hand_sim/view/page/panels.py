@@ -26,15 +26,14 @@ _LEAST_LIST = 100.0
 
 
 class Panels:
-    """All panels, with what people have typed into them."""
+    """All panels, with what people have typed into them.
+
+    Args:
+        send: Gets what people ask for.
+        episodes: What there is to choose from, of files.
+    """
 
     def __init__(self, send: Send, episodes: tuple[Path, ...] = ()) -> None:
-        """Shows nothing yet.
-
-        Args:
-            send: Gets what people ask for.
-            episodes: What there is to choose from, of files.
-        """
         self._send = send
         self._windows = Windows()
         self._robot_panel = RobotPanel(send)

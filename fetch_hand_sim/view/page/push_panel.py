@@ -17,10 +17,13 @@ def pushable_bodies(spec: TaskSpec) -> list[str]:
 
 
 class PushPanel:
-    """A body, a force, and a button that pushes while it is held."""
+    """A body, a force, and a button that pushes while it is held.
+
+    Args:
+        send: Gets the pushes.
+    """
 
     def __init__(self, send: Send) -> None:
-        """Takes who gets the pushes."""
         self._send = send
         self._body = 0
         self._force = np.zeros(3)

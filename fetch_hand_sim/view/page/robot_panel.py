@@ -20,10 +20,13 @@ _RED = imgui.Vec4(0.75, 0.2, 0.15, 1.0)
 
 
 class RobotPanel:
-    """The panel, with what people have typed into it."""
+    """The panel, with what people have typed into it.
+
+    Args:
+        send: Gets what people ask for.
+    """
 
     def __init__(self, send: Send) -> None:
-        """Takes who gets what people ask for."""
         self._send = send
         self._seed = 0
         self._actor = 0

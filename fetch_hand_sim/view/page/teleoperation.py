@@ -23,18 +23,16 @@ def is_move(part: CommandPart) -> bool:
 class Teleoperation:
     """One command, changed by sliders and keys.
 
+    Args:
+        robot: The robot.
+        start: (action size,) the command before; None for one at rest.
+
     Attributes:
         values: (action size,) command units.
         selected: Which part the keys change.
     """
 
     def __init__(self, robot: RobotSpec, start: Array | None) -> None:
-        """Begins where the robot is told to be.
-
-        Args:
-            robot: The robot.
-            start: (action size,) the command before; None for one at rest.
-        """
         self._parts = robot.command
         self.values = resting_command(robot) if start is None else start.copy()
         for index, part in enumerate(self._parts):

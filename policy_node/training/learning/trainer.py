@@ -58,7 +58,16 @@ class Collected:
 
 
 class Trainer:
-    """One run of one configuration, on one of several workers."""
+    """One run of one configuration, on one of several workers.
+
+    Args:
+        config: What to train and how.
+        output: Folder for checkpoints and logs.
+        workers: This worker among all.
+        command: Command line, for the metadata of checkpoints.
+        source_revision: Revision of the source, likewise.
+        init_from: Networks to start from; None starts from random ones.
+    """
 
     def __init__(
         self,
@@ -69,16 +78,6 @@ class Trainer:
         source_revision: str = '',
         init_from: InitialNetworks | None = None,
     ) -> None:
-        """Prepares simulations, networks and the output folder.
-
-        Args:
-            config: What to train and how.
-            output: Folder for checkpoints and logs.
-            workers: This worker among all.
-            command: Command line, for the metadata of checkpoints.
-            source_revision: Revision of the source, likewise.
-            init_from: Networks to start from; None starts from random ones.
-        """
         self.config = config
         self.workers = workers
         origin = {} if init_from is None else init_from.origin

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from msgs_spec.tasks import TASKS
+from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.learning import config as config_module
 from policy_node.training.learning.config import (
     RECIPES,
@@ -20,6 +21,7 @@ from policy_node.training.learning.config import (
 )
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.threads import split_threads
+from support import ROOT
 
 
 def test_the_paper_recipe_is_appendix_b() -> None:
@@ -50,6 +52,29 @@ def test_every_field_is_explained() -> None:
     source = Path(config_module.__file__).read_text()
     for field in dataclasses.fields(TrainConfig):
         assert re.search(rf'    {field.name}: .*\n    """[^"]+\."""\n', source), field.name
+
+
+def switches() -> dict[str, str]:
+    """Rows of the tables of switches in docs/training.md, by field."""
+    page = (ROOT / 'docs' / 'training.md').read_text()
+    rows = re.findall(r'^\| (`.*) \|$', page.partition('## Switches')[2].split('\n## ')[0], re.M)
+    return {field: row for row in rows for field in re.findall(r'(\w+)=', row.split(' | ')[0])}
+
+
+def test_switches_on_the_page_are_fields_with_values_they_take() -> None:
+    for row in switches().values():
+        for words in re.findall('`(.*?)`', row.split(' | ')[0]):
+            assert all(parse_assignment(word) for word in words.split()), words
+
+
+def test_what_a_study_switches_is_on_the_page_with_a_request() -> None:
+    rows = switches()
+    # Settings of any run, which some arms have as well.
+    ordinary = {'strategy', 'goals', 'target_update_interval'}
+    arms = [arm for study in STUDIES.values() for arm in study.arms]
+    for field in {name for arm in arms for name in arm.changes} - ordinary:
+        request = rows[field].split(' | ')[-1]
+        assert re.match('[1-9]', request), field
 
 
 @pytest.mark.parametrize(
