@@ -6,11 +6,12 @@ from msgs_spec.loading import guard_loading
 guard_loading()
 
 from fetch_hand_sim.gym_envs.registration import (  # noqa: E402
+    make,
     make_vec,
     register_environments,
     register_gymnasium_robotics,
 )
 
-__all__ = ['make_vec', 'register_gymnasium_robotics']
+__all__ = ['make', 'make_vec', 'register_gymnasium_robotics']
 
 register_environments()

@@ -109,7 +109,8 @@ SIM_NODE = (
         'control_hz',
         'double',
         DEFAULT_CONTROL_HZ,
-        'Ticks per simulated second, 500/n for n = 1 ... 40.',
+        'Ticks per simulated second, 500/n for n = 1 ... 40; episodes are as long in seconds and '
+        'the Fetch gripper as fast at each.',
         lower=12.5,
         upper=500.0,
         check=substeps_per_tick,

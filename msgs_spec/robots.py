@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-# Metres a gripper action of 1 moves the mocap target per tick (Plappert et al. 2018, section 1.1;
-# Gymnasium-Robotics `fetch_env.py`).
+# Metres a gripper action of 1 puts the mocap target ahead of the gripper at 25 Hz (Plappert et al.
+# 2018, section 1.1; Gymnasium-Robotics `fetch_env.py`).
 GRIPPER_STEP = 0.05
 # What the names of joints begin with in the MJCF, and on the network unless another is asked for.
 JOINT_PREFIX = 'robot0:'

@@ -25,8 +25,12 @@ DEFAULT_CONTROL_HZ = 25.0
 # What `GoalMetric` of the simulation says of them.
 RewardType = Literal['sparse', 'dense']
 SuccessRule = Literal['gymnasium', 'paper']
+# What an action frequency other than 25 Hz leaves as it is: the seconds of an episode and the speed
+# of a gripper, or the ticks of an episode and the step of a gripper, as robots had it up to 1.0.
+Timing = Literal['seconds', 'ticks']
 REWARD_TYPES: tuple[str, ...] = get_args(RewardType)
 SUCCESS_RULES: tuple[str, ...] = get_args(SuccessRule)
+TIMINGS: tuple[str, ...] = get_args(Timing)
 
 
 class GoalKind(Enum):
@@ -89,7 +93,7 @@ class TaskSpec:
         robot: The robot that does it.
         goal: What its goals are.
         observation: Parts of the observation vector, in order.
-        episode_ticks: Steps per episode.
+        episode_ticks: Steps per episode; those of `TASKS` at 25 Hz.
         object_name: `object0` (Fetch), `object` (hand), or None where there is none.
         distance_threshold: Success within this distance, metres.
         rotation_threshold: Success within this rotation, radians; None where there is no rotation.
@@ -132,6 +136,12 @@ class TaskSpec:
     def has_object(self) -> bool:
         """Whether there is an object beside the robot."""
         return self.object_name is not None
+
+    def with_joint_prefix(self, prefix: str) -> TaskSpec:
+        """Returns the task of a robot whose joints' names begin with another prefix."""
+        if prefix == JOINT_PREFIX:
+            return self
+        return replace(self, robot=self.robot.with_joint_prefix(prefix))
 
 
 _GRIPPER_STATE = VectorPart('gripper_state', 2, 'm, right and left finger')
@@ -239,23 +249,28 @@ TASKS: dict[str, TaskSpec] = {
 }
 
 
-def task_spec(name: str, joint_prefix: str = JOINT_PREFIX) -> TaskSpec:
+def task_spec(
+    name: str, joint_prefix: str = JOINT_PREFIX, control_hz: float = DEFAULT_CONTROL_HZ
+) -> TaskSpec:
     """Returns the task called `name`.
 
     Args:
         name: One of `TASKS`.
         joint_prefix: What the names of its joints begin with on the network.
+        control_hz: Action frequency, Hz. At another than 25 Hz an episode has as many steps as fill
+            the same time, rounded.
 
     Raises:
-        ValueError: If there is none; the message lists all of them.
+        ValueError: If there is none, the message lists all of them; or the rate is not allowed.
     """
     try:
         task = TASKS[name]
     except (KeyError, TypeError):
         raise ValueError(f'unknown task {name!r}; allowed: {", ".join(TASKS)}') from None
-    if joint_prefix == JOINT_PREFIX:
-        return task
-    return replace(task, robot=task.robot.with_joint_prefix(joint_prefix))
+    if control_hz != DEFAULT_CONTROL_HZ:
+        substeps = task.episode_ticks * substeps_per_tick(DEFAULT_CONTROL_HZ)
+        task = replace(task, episode_ticks=round(substeps / substeps_per_tick(control_hz)))
+    return task.with_joint_prefix(joint_prefix)
 
 
 def substeps_per_tick(control_hz: float, timestep: float = PHYSICS_TIMESTEP) -> int:

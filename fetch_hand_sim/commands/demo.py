@@ -235,9 +235,9 @@ def _show(progress: Progress, bar: TaskID, watcher: Watcher) -> None:
     if status is None or status.phase == 'waiting':
         return
     note = f'tick {watcher.ticks}, seed {status.seed}'
-    progress.update(
-        bar, description=f'episode {status.episode}', completed=watcher.ticks, note=note
-    )
+    ticks = task_spec(status.task, control_hz=status.control_hz).episode_ticks
+    description = f'episode {status.episode}'
+    progress.update(bar, description=description, completed=watcher.ticks, total=ticks, note=note)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from functools import cache
 from importlib import metadata
 
 from msgs_spec.robots import JOINT_PREFIX
-from msgs_spec.tasks import PHYSICS_TIMESTEP, TaskSpec
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, PHYSICS_TIMESTEP, TaskSpec
 
 # What the messages of an episode mean. 1, which wrote no number: a robot ignored frame and stamp of
 # a goal, and the orientations of `fingertip_poses` were identity.
@@ -33,6 +33,7 @@ def episode_metadata(
     reward_type: str,
     success_rule: str,
     control_hz: float,
+    timing: str = 'seconds',
     joint_prefix: str = JOINT_PREFIX,
     model_sha256: str,
     source_revision: str | None = None,
@@ -50,6 +51,8 @@ def episode_metadata(
         reward_type: 'sparse' or 'dense'.
         success_rule: 'gymnasium' or 'paper'.
         control_hz: Ticks per simulated second.
+        timing: What stays at another rate than 25 Hz; recorded where it is another and `seconds`,
+            because robots up to 1.0, which recorded nothing, kept `ticks`.
         joint_prefix: What the names of joints begin with; recorded where it is not the usual one.
         model_sha256: Fingerprint of the compiled model, see `model_sha256`.
         source_revision: Revision of this project, if known.
@@ -59,6 +62,7 @@ def episode_metadata(
         started: Wall-clock time of the start, ISO 8601. The one value that differs between equal
             runs; leave it out for files that are equal byte by byte.
     """
+    in_seconds = timing == 'seconds' and control_hz != DEFAULT_CONTROL_HZ
     known = {
         'interface_version': str(INTERFACE_VERSION),
         'task': task.name,
@@ -67,6 +71,7 @@ def episode_metadata(
         'reward_type': reward_type,
         'success_rule': success_rule,
         'control_hz': repr(float(control_hz)),
+        'timing': timing if in_seconds else None,
         'physics_timestep_s': repr(PHYSICS_TIMESTEP),
         'episode_ticks': str(task.episode_ticks),
         'robot': task.robot.name,

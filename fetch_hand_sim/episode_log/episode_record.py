@@ -12,7 +12,14 @@ from typing import TypeVar
 
 from msgs_spec.parameters import LARGEST_PERTURBATION
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
-from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, TaskSpec, substeps_per_tick, task_spec
+from msgs_spec.tasks import (
+    REWARD_TYPES,
+    SUCCESS_RULES,
+    TIMINGS,
+    TaskSpec,
+    substeps_per_tick,
+    task_spec,
+)
 
 Strings = Mapping[str, str]
 Number = TypeVar('Number', int, float)
@@ -36,6 +43,7 @@ class EpisodeRecord:
         joint_prefix: What the names of joints begin with.
         interface_version: What its messages mean, see `INTERFACE_VERSION`.
         perturb_limit: Largest force of a push, N; 0 where none was taken.
+        timing: What stayed where the rate is not 25 Hz.
     """
 
     task: TaskSpec
@@ -47,6 +55,7 @@ class EpisodeRecord:
     joint_prefix: str
     interface_version: int
     perturb_limit: float = 0.0
+    timing: str = 'seconds'
 
     @classmethod
     def parse(cls, metadata: Strings) -> EpisodeRecord:
@@ -65,6 +74,7 @@ class EpisodeRecord:
             joint_prefix=_joint_prefix(metadata),
             interface_version=_integer(metadata, 'interface_version', default='1'),
             perturb_limit=_perturb_limit(metadata),
+            timing=_word({'timing': 'ticks', **metadata}, 'timing', TIMINGS),
         )
 
 

@@ -26,7 +26,7 @@ from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import decode
 from msgs_spec.command_line import printable
 from msgs_spec.schemas import deserialize
-from msgs_spec.tasks import RewardType, SuccessRule
+from msgs_spec.tasks import RewardType, SuccessRule, Timing
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import TopicSpec
 
@@ -126,7 +126,8 @@ class EpisodeChecker:
         )
 
     def _simulation_of(self, record: EpisodeRecord) -> Simulation:
-        key = (record.task.name, record.reward_type, record.success_rule, record.control_hz)
+        rules = (record.reward_type, record.success_rule, record.timing)
+        key = (record.task.name, record.control_hz, *rules)
         if self._simulation is None or key != self._key:
             self._simulation = Simulation(
                 record.task.name,
@@ -134,6 +135,7 @@ class EpisodeChecker:
                 reward_type=cast(RewardType, record.reward_type),
                 success_rule=cast(SuccessRule, record.success_rule),
                 control_hz=record.control_hz,
+                timing=cast(Timing, record.timing),
             )
             self._key = key
             self._model_sha256 = model_sha256(self._simulation.model)
@@ -147,6 +149,7 @@ class EpisodeChecker:
             reward_type=runner.simulation.metric.reward_type,
             success_rule=runner.simulation.metric.success_rule,
             control_hz=runner.simulation.control_hz,
+            timing=runner.simulation.timing,
             model_sha256=self._model_sha256,
             source_revision=source_revision(),
         )

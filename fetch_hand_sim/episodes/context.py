@@ -11,7 +11,6 @@ from pathlib import Path
 from fetch_hand_sim.episode_log import Attachment, episode_metadata
 from fetch_hand_sim.episode_log.model import compiled_attachment, mjcf_attachment, model_sha256
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.tasks import task_spec
 from msgs_spec.tick import EpisodeStatus
 
 
@@ -49,12 +48,13 @@ class RecordingContext:
     def metadata(self, status: EpisodeStatus) -> dict[str, str]:
         """Returns the metadata record `episode` for an episode with this first status."""
         return episode_metadata(
-            task_spec(status.task, status.joint_prefix),
+            self._simulation.spec.with_joint_prefix(status.joint_prefix),
             episode=status.episode,
             seed=status.seed,
             reward_type=status.reward_type,
             success_rule=status.success_rule,
             control_hz=status.control_hz,
+            timing=self._simulation.timing,
             joint_prefix=status.joint_prefix,
             model_sha256=self._model_sha256,
             source_revision=self._source_revision,

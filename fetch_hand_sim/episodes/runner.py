@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from fetch_hand_sim.episodes.robot_episode import RobotEpisode, sense
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.robots import JOINT_PREFIX
-from msgs_spec.tasks import task_spec
 from msgs_spec.tick import EpisodeStatus, Tick
 
 Array = NDArray[np.float64]
@@ -54,7 +53,7 @@ class EpisodeRunner:
         if simulation.num_envs != 1:
             raise ValueError(f'one robot is run at a time, not {simulation.num_envs}')
         self.simulation = simulation
-        self.spec = task_spec(simulation.spec.name, joint_prefix)
+        self.spec = simulation.spec.with_joint_prefix(joint_prefix)
         self._joint_prefix = joint_prefix
         self._first_seed = first_seed
         self._episodes = episodes

@@ -31,7 +31,8 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
         success_rule: `gymnasium` (released code) or `paper` (its text).
-        control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
+        control_hz: Actions per simulated second: 500/n for n = 1 ... 40. With another than 25 use
+            `fetch_hand_sim.make`: Gymnasium would end episodes after the steps of 25 Hz.
         render_mode: One of `metadata['render_modes']` or None.
         width: Pixels of a picture.
         height: Pixels of a picture.

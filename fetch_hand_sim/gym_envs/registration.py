@@ -10,7 +10,7 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 
 from fetch_hand_sim.gym_envs.goal_env import import_goal_env
-from msgs_spec.tasks import TASKS
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS, task_spec
 
 NAMESPACE = 'fetch_hand_sim'
 VERSION = 0
@@ -35,6 +35,31 @@ def register_environments() -> None:
         )
 
 
+def make(name: str, **arguments: Any) -> gymnasium.Env[Any, Any]:
+    """`gymnasium.make` with episodes as long in seconds at every rate.
+
+    Gymnasium itself limits steps by what is registered, the number at 25 Hz: with `control_hz` it
+    needs `max_episode_steps` too.
+
+    Args:
+        name: The id.
+        **arguments: As `gymnasium.make` and `FetchHandEnv` have them.
+
+    Raises:
+        ValueError: If an argument is not allowed.
+    """
+    return gymnasium.make(name, **_with_length(name, arguments))
+
+
+def _with_length(name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Arguments with as many steps per episode as fill its time, unless they say how many."""
+    task = gymnasium.spec(name.rpartition(':')[2]).kwargs.get('task')
+    rate = arguments.get('control_hz', DEFAULT_CONTROL_HZ)
+    if task is None or rate == DEFAULT_CONTROL_HZ or 'max_episode_steps' in arguments:
+        return arguments
+    return {'max_episode_steps': task_spec(task, control_hz=rate).episode_ticks, **arguments}
+
+
 def make_vec(
     name: str,
     num_envs: int = 1,
@@ -42,6 +67,8 @@ def make_vec(
     **arguments: Any,
 ) -> VectorEnv[Any, Any, Any]:
     """`gymnasium.make_vec` of a batch, with wrappers, which Gymnasium itself refuses for batches.
+
+    Episodes are as long in seconds at every rate, as those of `make`.
 
     Args:
         name: The id.
@@ -56,7 +83,10 @@ def make_vec(
     """
     chosen = [_wrapper_of_batches(wrapper) for wrapper in wrappers]
     env = gymnasium.make_vec(
-        name, num_envs=num_envs, vectorization_mode='vector_entry_point', **arguments
+        name,
+        num_envs=num_envs,
+        vectorization_mode='vector_entry_point',
+        **_with_length(name, arguments),
     )
     for wrapper in chosen:
         env = wrapper(env)

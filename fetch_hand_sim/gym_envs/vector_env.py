@@ -42,7 +42,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         num_threads: Threads that step them; 0 for all processors.
         reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
         success_rule: `gymnasium` (released code) or `paper` (its text).
-        control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
+        control_hz: Actions per simulated second: 500/n for n = 1 ... 40. With another than 25 use
+            `fetch_hand_sim.make_vec`: Gymnasium would end episodes after the steps of 25 Hz.
         autoreset_mode: When an ended episode is followed by the next.
         render_mode: `rgb_array`, `depth_array` or None.
         width: Pixels of a picture.

@@ -23,7 +23,14 @@ from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.actions import command_from_action
 from msgs_spec.observations import Readings
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind, RewardType, SuccessRule
+from msgs_spec.tasks import (
+    DEFAULT_CONTROL_HZ,
+    TIMINGS,
+    GoalKind,
+    RewardType,
+    SuccessRule,
+    Timing,
+)
 
 Array = NDArray[np.float64]
 Observation = dict[str, Array]
@@ -71,11 +78,14 @@ class Simulation:
         control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
         keeps_data: Whether each copy keeps an `MjData` of its own, which `read_data` then
             gives as MuJoCo left it.
+        timing: What another rate than 25 Hz leaves as it is: `seconds` of an episode and the speed
+            of the Fetch gripper, or `ticks` and its step, as up to 1.0 and as the reference does.
 
     Attributes:
-        spec: The task as data.
+        spec: The task as data, `episode_ticks` at this rate.
         num_envs: Number of copies N.
         control_hz: Actions per simulated second.
+        timing: As given.
         metric: What rewards and success are; it may be replaced between steps.
         goals: (N, goal size) the desired goals, live: what is written counts from the next step.
         divergences: How often MuJoCo has lost a simulation.
@@ -93,9 +103,12 @@ class Simulation:
         success_rule: SuccessRule = 'gymnasium',
         control_hz: float = DEFAULT_CONTROL_HZ,
         keeps_data: bool = False,
+        timing: Timing = 'seconds',
     ) -> None:
         if num_envs < 1:
             raise ValueError(f'num_envs must be at least 1, not {num_envs}')
+        if timing not in TIMINGS:
+            raise ValueError(f'timing {timing!r}; allowed: {", ".join(TIMINGS)}')
         if num_threads < 0:
             raise ValueError(f'num_threads must be 0 (all processors) or more, not {num_threads}')
         self._task = make_task(
@@ -104,6 +117,7 @@ class Simulation:
             num_threads=num_threads,
             control_hz=control_hz,
             keeps_data=keeps_data,
+            timing=timing,
         )
         self._num_threads = num_threads
         self._keeps_data = keeps_data
@@ -111,6 +125,7 @@ class Simulation:
         self.spec = self._task.spec
         self.num_envs = num_envs
         self.control_hz = control_hz
+        self.timing = timing
         self.metric = self._task.goal_metric(success_rule, reward_type)
         self.divergences = 0
         self._warnings = np.zeros(num_envs, dtype=np.int64)
@@ -304,6 +319,7 @@ class Simulation:
                 'num_threads': self._num_threads,
                 'control_hz': self.control_hz,
                 'keeps_data': self._keeps_data,
+                'timing': self.timing,
             },
             'model': self.model if self._model_may_change else None,
             'metric': self.metric,

@@ -74,7 +74,7 @@ class LiveRobot:
             self._show_goal(request.values)
 
     def _on_status(self, status: EpisodeStatus) -> None:
-        spec = task_spec(status.task, status.joint_prefix)
+        spec = task_spec(status.task, status.joint_prefix, status.control_hz)
         if self._picture is None or self._picture.task != spec.name:
             self._picture, self._curves = Picture(spec.name), None
         if self._curves is None or self._rule != status.success_rule:

@@ -86,7 +86,7 @@ class RobotWatch:
     def spec(self) -> TaskSpec | None:
         """The robot's task; None until there is one."""
         status = self._status
-        return task_spec(status.task, status.joint_prefix) if status else None
+        return task_spec(status.task, status.joint_prefix, status.control_hz) if status else None
 
     @property
     def joint_prefix(self) -> str:
@@ -106,10 +106,11 @@ class RobotWatch:
     def _take_status(self, message: Any) -> None:
         try:
             status = EpisodeStatus.from_values(decode_status(message))
+            spec = task_spec(status.task, status.joint_prefix, status.control_hz)
         except ValueError:
             return
         if self._status is None or self._status.task != status.task:
-            self._follow(task_spec(status.task, status.joint_prefix))
+            self._follow(spec)
         self._status = status
         self._on_status(status)
         if status.phase == 'reset':

@@ -153,7 +153,8 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
         return None
     from policy_node.training.learning.logged_episodes import read_experience
 
-    episodes, skipped = read_experience(directory, task_spec(config.task), config.control_hz)
+    task = task_spec(config.task, control_hz=config.control_hz)
+    episodes, skipped = read_experience(directory, task, config.control_hz)
     transitions = len(episodes) * episodes.ticks
     if transitions > config.replay_transitions:
         raise ValueError(

@@ -6,11 +6,14 @@ import signal
 import time
 from pathlib import Path
 
+import pytest
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
+from fetch_hand_sim.episode_log import read_summary
+from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.simulation import Simulation
@@ -22,6 +25,7 @@ from msgs_spec.topics import topics
 from policy_node.node.commander import Commander
 from policy_node.node.responder import Responder
 from policy_node.policies.loading import load_policy
+from support.fresh_actor import fresh_actor
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,
@@ -97,6 +101,22 @@ def test_bytes_are_equal_between_runs_in_real_time_and_without_ros(
             break
     assert paced == first[0]
     end(policy)
+
+
+def test_an_episode_at_250_hz_takes_ten_times_the_ticks(
+    start_process: Start, tmp_path: Path
+) -> None:
+    fresh_actor(tmp_path / 'fast.safetensors', 'FetchReach', control_hz=250.0)
+    policy = start_process(*POLICY_NODE, *ros_args(policy=str(tmp_path / 'fast.safetensors')))
+    (episode,) = logged_run(
+        start_process, tmp_path / 'log', mode='lockstep', episodes=1, control_hz=250.0
+    )
+    end(policy)
+    assert len(episode['/joint_states']) == 501
+    assert len(episode['/applied_command']) == len(episode['/commands']) == 500
+    (path,) = (tmp_path / 'log').iterdir()
+    assert read_summary(path).duration_s == pytest.approx(2.0, abs=1e-6)
+    assert EpisodeChecker().check(path).difference is None
 
 
 def test_resets_leave_a_policy_no_tick_behind(start_process: Start, tmp_path: Path) -> None:

@@ -36,10 +36,10 @@ class FetchReachOrientedTask(FetchTask):
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
         """Moves and turns the mocap body to which the gripper is welded."""
-        turn = TURN_STEP * commands[:, 3:].astype(np.float64)
+        turn = TURN_STEP * self.lead_scale * commands[:, 3:].astype(np.float64)
         angle = np.linalg.norm(turn, axis=1, keepdims=True)
         # sin(angle / 2) / angle, also at zero.
         share = np.sinc(angle / (2.0 * np.pi)) / 2.0
         rotation = np.concatenate([np.cos(angle / 2.0), share * turn], axis=1)
         target = quaternion_multiply(rotation, self.gripper_rotation)
-        self.move_gripper(GRIPPER_STEP * commands[:, :3], target)
+        self.move_gripper(GRIPPER_STEP * self.lead_scale * commands[:, :3], target)

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from fetch_hand_sim.simulation.gripper_speed import lead_scale
 from fetch_hand_sim.simulation.model_tuning import (
     FETCH_NEVER_TOUCHING,
     exclude_body_pairs,
@@ -125,6 +126,8 @@ class FetchTask(Task):
         gripper_start: (3,) where the gripper is at a reset, m, world.
         object_height: Where the object's centre is then, m; only with an object.
         gripper_rotation: (N, 4) how the gripper is turned now, wxyz, live and read-only.
+        lead_scale: What steps of the gripper, metres or radians, are multiplied by so that it is as
+            fast at this rate as at 25 Hz; 1 there.
     """
 
     def __init__(
@@ -137,6 +140,9 @@ class FetchTask(Task):
         skip_unread_stages(model)
         self._settle(model, spec)
         super().__init__(spec, model, batch)
+        self.lead_scale = 1.0
+        if batch.timing == 'seconds':
+            self.lead_scale = lead_scale(1.0 / self.tick_duration)
         sites = {'end_effector': 'robot0:grip'}
         if spec.has_object:
             sites['object'] = 'object0'
@@ -210,11 +216,11 @@ class FetchTask(Task):
         return np.asarray(goal)
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
-        """Moves the mocap target by 0.05 m per unit and sets the finger actuators.
+        """Moves the mocap target by 0.05 m per unit (at 25 Hz) and sets the finger actuators.
 
         The offset is scaled in the floating type of the command, as the reference does.
         """
-        offset = commands[:, :3] * commands.dtype.type(GRIPPER_STEP)
+        offset = commands[:, :3] * commands.dtype.type(GRIPPER_STEP * self.lead_scale)
         if self.model.nu:
             fingers = 0.0 if self.config.block_gripper else commands[:, 3:]
             self._ctrl[:] = self._finger_controls(fingers)

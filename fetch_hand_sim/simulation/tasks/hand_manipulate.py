@@ -40,7 +40,7 @@ _OBJECT_JOINT = 'object:joint'
 _OBJECT_SITE = 'object:center'
 # An object whose centre is lower than this after settling has fallen off the palm, metres.
 PALM_HEIGHT = 0.04
-_SETTLING_TICKS = 10
+_SETTLING_TICKS, _SETTLING_SUBSTEPS = 10, 200
 _POSITION_SCATTER = 0.005
 # Box around the object in which `Full` goals lie, metres.
 TARGET_RANGE = np.array([(-0.04, 0.04), (-0.06, 0.02), (0.0, 0.06)])
@@ -104,6 +104,9 @@ class HandManipulateTask(HandTask):
         self._resting_command = resting_command(spec.robot)
         self.parallel_quaternions = euler_to_quaternion(_parallel_rotations())
         self.batch.state[:] = self.start_state
+        self._settling = _SETTLING_SUBSTEPS
+        if batch.timing == 'ticks':
+            self._settling = _SETTLING_TICKS * self.substeps
 
     @property
     def asset(self) -> str:
@@ -123,7 +126,7 @@ class HandManipulateTask(HandTask):
             self._start_again(left)
             self._object_qpos[left] = [self._sample_start(generator_of[i]) for i in left.tolist()]
             self._ctrl[left] = self._resting_command
-            self.batch.step(left, nstep=_SETTLING_TICKS * self.substeps)
+            self.batch.step(left, nstep=self._settling)
             self.batch.forward(left)
             height = self._site_xpos[left, self._object_site, 2]
             left = left[~(height > PALM_HEIGHT)]

@@ -9,7 +9,7 @@ from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, 
 from fetch_hand_sim.simulation.tasks.hand_reach import REACH_ASSET, HandReachTask
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task
 from msgs_spec.foreign_tasks import foreign_simulation
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec, substeps_per_tick, task_spec
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec, Timing, substeps_per_tick, task_spec
 
 
 def make_task(
@@ -19,6 +19,7 @@ def make_task(
     num_threads: int = 0,
     control_hz: float = DEFAULT_CONTROL_HZ,
     keeps_data: bool = False,
+    timing: Timing = 'seconds',
 ) -> Task:
     """Compiles a task's model and starts its simulations.
 
@@ -28,13 +29,14 @@ def make_task(
         num_threads: Threads that step them; 0 for all processors.
         control_hz: Actions per simulated second.
         keeps_data: Whether each simulation keeps an `MjData` of its own.
+        timing: What stays at another rate than 25 Hz.
 
     Raises:
         ValueError: If the task is unknown, the rate is not a whole number of substeps, or the
             package of a task that is none of the thirteen has no simulation of it.
     """
-    spec = task_spec(name)
-    batch = BatchConfig(num_envs, num_threads, substeps_per_tick(control_hz), keeps_data)
+    spec = task_spec(name, control_hz=control_hz if timing == 'seconds' else DEFAULT_CONTROL_HZ)
+    batch = BatchConfig(num_envs, num_threads, substeps_per_tick(control_hz), keeps_data, timing)
     task: Task = _family(spec)(spec, batch)
     return task
 

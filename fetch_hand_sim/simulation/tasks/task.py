@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.models import prepare_engine
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
-from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec
+from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec, Timing
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.intp]
@@ -31,12 +31,14 @@ class BatchConfig:
         substeps: Physics steps per action.
         keeps_data: Whether each simulation keeps an `MjData` of its own, so that all that MuJoCo
             computes can be read, at the cost of its memory.
+        timing: What stays at another rate than 25 Hz.
     """
 
     num_envs: int = 1
     num_threads: int = 0
     substeps: int = 20
     keeps_data: bool = False
+    timing: Timing = 'seconds'
 
     @property
     def threads(self) -> int:

@@ -128,7 +128,18 @@ def test_other_rates_rewards_and_rules_check_too(tmp_path):
         reward_type='dense',
         success_rule='paper',
     )
-    assert EpisodeChecker().check(paths[0]).difference is None
+    result = EpisodeChecker().check(paths[0])
+    assert result.difference is None and not result.changed
+    metadata = read_summary(paths[0]).metadata
+    assert (metadata['timing'], metadata['episode_ticks'], result.ticks) == ('seconds', '250', 251)
+
+
+def test_episodes_of_robots_that_kept_ticks_check_as_they_were(tmp_path):
+    (path,) = generate(tmp_path, 'FetchReach', episodes=1, control_hz=125.0, timing='ticks')
+    metadata = read_summary(path).metadata
+    assert 'timing' not in metadata and metadata['episode_ticks'] == '50'
+    result = EpisodeChecker().check(path)
+    assert (result.difference, result.changed, result.ticks) == (None, [], 51)
 
 
 def flip(target, at_tick, byte):

@@ -28,6 +28,23 @@ def test_what_is_written_is_read_back():
     assert (record.reward_type, record.success_rule) == ('dense', 'paper')
     assert (record.control_hz, record.joint_prefix) == (500 / 3, 'robot0:')
     assert record.interface_version == 2
+    assert record.timing == 'seconds'
+
+
+def test_a_record_without_timing_kept_ticks():
+    old = metadata()
+    del old['timing']
+    assert EpisodeRecord.parse(old).timing == 'ticks'
+    at_25_hz = episode_metadata(
+        TASKS['FetchPush'],
+        episode=3,
+        seed=0,
+        reward_type='dense',
+        success_rule='paper',
+        control_hz=25.0,
+        model_sha256='0',
+    )
+    assert 'timing' not in at_25_hz, 'files at 25 Hz are as they were'
 
 
 @pytest.mark.parametrize(
@@ -60,7 +77,12 @@ def test_rates_are_rates(text):
 
 
 def test_words_are_words():
-    for name, text in (('reward_type', 'Dense'), ('success_rule', ''), ('task', '[]')):
+    for name, text in (
+        ('reward_type', 'Dense'),
+        ('success_rule', ''),
+        ('task', '[]'),
+        ('timing', 'minutes'),
+    ):
         with pytest.raises(ValueError, match='allowed'):
             EpisodeRecord.parse(metadata(**{name: text}))
     with pytest.raises(ValueError, match='joint_prefix of 1000 characters'):

@@ -81,7 +81,7 @@ def test_a_batch_of_64_with_dense_reward_equals_the_reference(task, twin_seeds, 
 @pytest.mark.parametrize('task', ['HandReach', 'HandManipulateEggFull'])
 def test_half_the_action_frequency_equals_the_reference(task, play_reference):
     reference = play_reference(task, 1, control_hz=12.5)
-    simulation = Simulation(task, control_hz=12.5)
+    simulation = Simulation(task, control_hz=12.5, timing='ticks')
     assert simulation.tick_duration == pytest.approx(0.08)
     assert_equal(play(simulation, [0]), reference)
 
