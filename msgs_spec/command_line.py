@@ -105,6 +105,11 @@ def complain(name: str, text: object) -> None:
     print(f'{name}: {printable(" ".join(str(text).split()))}', file=sys.stderr, flush=True)
 
 
+def say(text: object) -> None:
+    """Prints on stdout what may hold a name of somebody else's, escaped as `complain` does."""
+    print(printable(str(text)), flush=True)
+
+
 def run_command(name: str, run: Callable[[], int]) -> int:
     """Runs the body of a command and returns the exit code of the process.
 

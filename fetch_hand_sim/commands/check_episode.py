@@ -21,9 +21,9 @@ from msgs_spec.command_line import (
     EXIT_USAGE,
     CommandParser,
     complain,
-    printable,
     progress,
     run_command,
+    say,
 )
 
 _NAME = 'check_episode'
@@ -83,7 +83,7 @@ def _check(episodes: Sequence[Path], results: list[CheckResult], is_quiet: bool)
                 results.append(result)
                 code = max(code, EXIT_SUCCESS if result.difference is None else EXIT_FAILURE)
                 if not is_quiet:
-                    print(printable(str(result)), flush=True)
+                    say(result)
             advance(1)
     return code
 

@@ -31,6 +31,7 @@ from msgs_spec.command_line import (
     CommandParser,
     FormerOption,
     complain,
+    printable,
     require_extra,
     run_command,
     whole_number,
@@ -213,7 +214,7 @@ class Demo:
                 continue
             self._rows.append(row)
             (console or self._console).print(
-                str(row), markup=False, highlight=False, soft_wrap=True
+                printable(str(row)), markup=False, highlight=False, soft_wrap=True
             )
 
     def _print_summary(self, seconds: float) -> None:
@@ -224,7 +225,7 @@ class Demo:
         self._console.print(
             f'{self._spec.name}: {successes} of {count} episodes succeeded, mean return '
             f'{mean:.2f}, {steps} steps, {seconds:.1f} s with start-up. Episodes are in '
-            f'{self._directory}/',
+            f'{printable(str(self._directory))}/',
             highlight=False,
             soft_wrap=True,
         )

@@ -25,10 +25,10 @@ from msgs_spec.command_line import (
     CommandParser,
     UsageError,
     complain,
-    printable,
     progress,
     require_extra,
     run_command,
+    say,
 )
 
 _NAME = 'export_episodes'
@@ -74,7 +74,7 @@ def _run(options: argparse.Namespace) -> int:
         by_task.setdefault(episode.spec.name, []).append(episode)
     for task, group in by_task.items():
         done = f'{len(group)} episodes of {task}: {_export(options, group)}'
-        print(printable(done), flush=True)
+        say(done)
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
 
 

@@ -25,9 +25,9 @@ from msgs_spec.command_line import (
     CommandParser,
     UsageError,
     complain,
-    printable,
     progress,
     run_command,
+    say,
 )
 
 _NAME = 'recover_episodes'
@@ -53,12 +53,12 @@ def _run(options: argparse.Namespace) -> int:
     failures = 0
     with progress('unfinished episodes', len(leftovers)) as advance:
         for leftover in leftovers:
-            _say(str(leftover))
+            say(str(leftover))
             if not options.dry_run:
                 failures += not _recover(leftover.path)
             advance(1)
     if not leftovers:
-        _say(f'{options.directory}: no unfinished episode')
+        say(f'{options.directory}: no unfinished episode')
     return EXIT_FAILURE if failures else EXIT_SUCCESS
 
 
@@ -67,22 +67,18 @@ def _recover(leftover: Path) -> bool:
     try:
         path = recover_episode(leftover)
         if path is None:
-            _say(f'cleared away {leftover}: it was killed before its first messages were written')
+            say(f'cleared away {leftover}: it was killed before its first messages were written')
             return True
         episode = read_summary(path)
     except (EpisodeLogError, EpisodeReadError) as error:
         complain(_NAME, error)
         return False
     state = 'complete' if episode.is_complete else 'marked as interrupted'
-    _say(
+    say(
         f'recovered {episode.path.parent}: {episode.message_count} messages, '
         f'{episode.duration_s:.2f} s, {state}'
     )
     return True
-
-
-def _say(text: str) -> None:
-    print(printable(text), flush=True)
 
 
 if __name__ == '__main__':

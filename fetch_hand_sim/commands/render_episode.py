@@ -21,6 +21,7 @@ from msgs_spec.command_line import (
     UsageError,
     progress,
     run_command,
+    say,
 )
 
 _NAME = 'render_episode'
@@ -74,7 +75,7 @@ def _run(options: argparse.Namespace) -> int:
         raise UsageError(str(error)) from None
     except RuntimeError as error:
         raise CommandError(str(error)) from None
-    print(f'{options.out}: {options.out.stat().st_size / 1024:.0f} KiB')
+    say(f'{options.out}: {options.out.stat().st_size / 1024:.0f} KiB')
     return EXIT_SUCCESS
 
 

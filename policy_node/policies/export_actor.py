@@ -14,6 +14,7 @@ from msgs_spec.command_line import (
     UsageError,
     require_extra,
     run_command,
+    say,
 )
 from policy_node.policies.shipped import actor_path
 
@@ -42,7 +43,7 @@ def _run(options: argparse.Namespace) -> int:
         raise UsageError(str(error)) from None
     except OSError as error:
         raise CommandError(str(error)) from None
-    print(f'{options.target}: actions within {difference:.1e} of the checkpoint')
+    say(f'{options.target}: actions within {difference:.1e} of the checkpoint')
     return EXIT_SUCCESS
 
 

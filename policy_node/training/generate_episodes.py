@@ -26,6 +26,7 @@ from msgs_spec.command_line import (
     UsageError,
     progress,
     run_command,
+    say,
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
@@ -102,7 +103,7 @@ def _run(options: argparse.Namespace) -> int:
     finally:
         wall, cpu = time.perf_counter() - began, time.process_time() - cpu_began
         simulated = steps * simulation.tick_duration
-        print(
+        say(
             f'{count} episodes of {simulation.spec.name} in {options.output}: '
             f'{successes} successes, {steps} steps, {wall:.1f} s, {simulated / wall:.0f} x real '
             f'time, {simulated / cpu:.0f} x per core'

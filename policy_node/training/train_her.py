@@ -13,8 +13,11 @@ from msgs_spec.command_line import (
     EXIT_SUCCESS,
     CommandParser,
     UsageError,
+    complain,
+    printable,
     require_extra,
     run_command,
+    say,
 )
 from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.learning.config import (
@@ -115,7 +118,8 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     options = parse_arguments(arguments)
-    command = shlex.join([_NAME, *(sys.argv[1:] if arguments is None else arguments)])
+    words = [_NAME, *(sys.argv[1:] if arguments is None else arguments)]
+    command = printable(shlex.join(words))
     return run_command(_NAME, lambda: _run(options, command))
 
 
@@ -136,7 +140,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     counters = ending.counters
     best = f'{counters.best_success:.3f}' if counters.best_success >= 0 else 'not evaluated'
     if is_first_worker():
-        print(
+        say(
             f'{ending.reason}: {counters.env_steps:,} steps, {counters.updates:,} updates, '
             f'{counters.seconds:.0f} s, best success {best}; output in {output}'
         )
@@ -162,7 +166,7 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
             f'allow more with --set replay_transitions={transitions}'
         )
     left_out = f'; {len(skipped)} left out, first: {skipped[0]}' if skipped else ''
-    print(f'{len(episodes)} episodes from {directory}{left_out}', file=sys.stderr)
+    complain(_NAME, f'{len(episodes)} episodes from {directory}{left_out}')
     return episodes
 
 

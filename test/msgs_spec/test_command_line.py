@@ -17,6 +17,7 @@ from msgs_spec.command_line import (
     progress,
     require_extra,
     run_command,
+    say,
     start_command,
     whole_number,
 )
@@ -45,6 +46,11 @@ def fail(error: BaseException) -> int:
 def test_an_error_is_one_line_without_control_characters(error, code, capsys):
     assert run_command('tool', lambda: fail(error)) == code
     assert capsys.readouterr().err == 'tool: no luck \\x1b[31m\n'
+
+
+def test_what_is_said_of_strange_names_can_be_printed_anywhere(capsys):
+    say('runs/\udcff\x1b[31m done')
+    assert capsys.readouterr().out == 'runs/\\udcff\\x1b[31m done\n'
 
 
 def test_the_code_of_a_command_is_its_own():

@@ -109,24 +109,38 @@ def test_launch_file_starts_what_setup_py_installs():
     assert all(arg.get('description') for arg in LAUNCH.findall('arg'))
 
 
-def test_what_is_only_looked_at_runs_on_and_is_not_logged():
-    """The arguments that view.launch.xml gives to demo.launch.xml, by its defaults."""
+def given_by_view(**arguments: str) -> dict[str, str]:
+    """The arguments that view.launch.xml gives to demo.launch.xml."""
     root = ElementTree.parse(ROOT / 'launch' / 'view.launch.xml').getroot()
-    defaults = {arg.get('name'): arg.get('default') for arg in root.findall('arg')}
-    given = {
-        arg.get('name'): re.sub(r'\$\(var (\w+)\)', lambda m: defaults[m[1]], arg.get('value'))
+    values = {arg.get('name'): arg.get('default') for arg in root.findall('arg')} | arguments
+    return {
+        arg.get('name'): re.sub(r'\$\(var (\w+)\)', lambda m: values[m[1]], arg.get('value'))
         for arg in root.find('include').findall('arg')
     }
-    values = parameters_of('sim_node', **given)
+
+
+def test_what_is_only_looked_at_runs_on_and_is_not_logged():
+    values = parameters_of('sim_node', **given_by_view())
     assert (values['task'], values['episodes'], values['episode_dir']) == (
         'HandManipulateBlockRotateZ',
         0,
         '',
     )
     assert values['wait_for_commands'] is True
-    assert parameters_of('policy_node', **given)['task'] == 'HandManipulateBlockRotateZ'
-    logged = parameters_of('sim_node', **given | {'episode_dir': 'there'})
+    # Which is whatever the robot does.
+    assert parameters_of('policy_node', **given_by_view())['task'] == ''
+    logged = parameters_of('sim_node', **given_by_view(episode_dir='there'))
     assert logged['episode_dir'] == 'there'
+
+
+def test_a_params_file_of_what_is_looked_at_changes_what_it_names_alone(tmp_path):
+    path = tmp_path / 'my.yaml'
+    path.write_text(yaml.safe_dump({'/**/sim_node': {'ros__parameters': {'task': 'FetchPush'}}}))
+    values = parameters_of('sim_node', **given_by_view(params_file=str(path)))
+    assert (values['task'], values['episodes'], values['episode_dir']) == ('FetchPush', 0, '')
+    values = parameters_of('sim_node', **given_by_view(params_file=str(path), task='HandReach'))
+    assert values['task'] == 'HandReach'
+    assert parameters_of('policy_node', **given_by_view(task='HandReach'))['task'] == 'HandReach'
 
 
 @pytest.mark.parametrize('node', SPECS)

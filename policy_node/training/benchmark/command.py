@@ -33,6 +33,7 @@ from msgs_spec.command_line import (
     CommandParser,
     UsageError,
     complain,
+    printable,
     require_extra,
     run_command,
     whole_number,
@@ -174,7 +175,8 @@ def _report_folder(options: argparse.Namespace) -> Path:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     options = parse_arguments(arguments)
-    command = shlex.join([_NAME, *(sys.argv[1:] if arguments is None else arguments)])
+    words = [_NAME, *(sys.argv[1:] if arguments is None else arguments)]
+    command = printable(shlex.join(words))
     return run_command(_NAME, lambda: _run(options, command))
 
 
@@ -183,8 +185,11 @@ def _run(options: argparse.Namespace, command: str) -> int:
         require_extra('cluster')
     try:
         jobs = jobs_from_arguments(options)
+        _output(options).mkdir(parents=True, exist_ok=True)
     except (ValueError, TypeError) as error:
         raise UsageError(str(error)) from None
+    except OSError as error:
+        raise UsageError(f'{_output(options)} cannot hold runs: {error.strerror}') from None
     try:
         whole = _run_where_asked(options, jobs, command)
     finally:

@@ -120,10 +120,14 @@ def lock_run(folder: Path) -> Iterator[None]:
         RunTakenError: If another process works on it.
     """
     try:
+        str(folder).encode()
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / LOCK_FILE).open('w')
     except OSError as error:
         raise UsageError(f'{folder} cannot hold a run: {error.strerror}') from None
+    except UnicodeEncodeError:
+        why = 'TensorBoard takes names in UTF-8 alone'
+        raise UsageError(f'{folder} cannot hold a run: {why}') from None
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -247,6 +247,16 @@ def test_bad_usage_is_one_line_and_exit_status_2(
     assert not (tmp_path / 'runs').exists()
 
 
+def test_an_output_that_cannot_be_a_folder_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / 'file').write_text('')
+    assert main(small(tmp_path / 'file')) == 2
+    assert capsys.readouterr().err == (
+        f'benchmark: {tmp_path / "file"} cannot hold runs: File exists\n'
+    )
+
+
 def test_an_unknown_arm_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['--arms', 'td3']) == 2
     assert 'ddpg_sparse' in capsys.readouterr().err
