@@ -155,6 +155,10 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
     """
     if directory is None:
         return None
+    if config.longest_hold > 1:
+        raise ValueError(
+            'longest_hold above 1 excludes --from-episodes: their actions have no length'
+        )
     from policy_node.training.learning.logged_episodes import read_experience
 
     task = task_spec(config.task, control_hz=config.control_hz)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from policy_node.training.benchmark.final import read_final
 from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
-from policy_node.training.benchmark.results import Curve
+from policy_node.training.benchmark.results import Curve, read_curve
 from policy_node.training.learning.run_folder import COMMAND_FILE
 from policy_node.training.learning.run_log import read_progress
 
@@ -27,6 +29,17 @@ def area_under(curve: Curve, total_steps: int) -> float:
     return float(np.trapezoid(success, steps) / total_steps)
 
 
+def ticks_of_40_ms(job: Job) -> float:
+    """Ticks of a run in 40 ms: steps are counted in these, so that rates can be compared."""
+    return job.config.control_hz / DEFAULT_CONTROL_HZ
+
+
+def curve_of(job: Job) -> Curve:
+    """Evaluations of a run, steps in units of 40 ms."""
+    curve = read_curve(job.folder / PROGRESS_FILE)
+    return replace(curve, env_steps=curve.env_steps / ticks_of_40_ms(job))
+
+
 def measure_run(job: Job, curve: Curve) -> dict[str, Any]:
     """One row of `runs.csv`.
 
@@ -35,10 +48,11 @@ def measure_run(job: Job, curve: Curve) -> dict[str, Any]:
 
     Args:
         job: A finished job.
-        curve: Its evaluations.
+        curve: Its evaluations, steps in units of 40 ms.
     """
     final, last = read_final(job.folder), read_progress(job.folder / PROGRESS_FILE)[-1]
     reached = curve.steps_to(GOOD_SUCCESS)
+    total = round(job.config.total_steps / ticks_of_40_ms(job))
     samples = last['updates'] * job.config.batch_size
     processor_seconds = last['processor_seconds']
     return {
@@ -46,7 +60,8 @@ def measure_run(job: Job, curve: Curve) -> dict[str, Any]:
         'arm': job.arm.name,
         'seed': job.config.seed,
         'env_steps': int(last['env_steps']),
-        'area': round(area_under(curve, job.config.total_steps), 4),
+        'simulated_seconds': round(last['env_steps'] / job.config.control_hz, 2),
+        'area': round(area_under(curve, total), 4),
         f'steps_to_{GOOD_SUCCESS}': int(reached) if np.isfinite(reached) else '',
         'final_success': final['success'],
         'final_episodes': final['episodes'],

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from policy_node.training.benchmark.jobs import Arm, Job
 from policy_node.training.learning.recipes import recipe_config
 
@@ -86,20 +87,6 @@ _SPARSE_HAND_REACH = {
     'action_l2': 0.1,
     'gamma': 0.95,
 }
-# Every cycle's episodes about ten times; its own noise is the policy.
-_ON_POLICY = {
-    'algorithm': 'ppo',
-    'random_epsilon': 0.0,
-    'noise_std': 0.3,
-    'action_l2': 0.0,
-    'moved_share': 0.0,
-    'final_exploration': 1.0,
-    'learning_rate': 3e-4,
-    'trace': 0.95,
-    'num_envs': 64,
-    'batch_size': 1024,
-    'updates_per_cycle': 40,
-}
 
 
 def _arms(field: str, **labels: str) -> tuple[Arm, ...]:
@@ -141,6 +128,39 @@ def _returns() -> tuple[Arm, ...]:
         for correction in ('none', 'lambda', 'cut')
     ]
     return (Arm('one', 'one step', {'n_step': 1}), *longer)
+
+
+def _rates() -> tuple[Arm, ...]:
+    """As it is at 250, 125 and 25 Hz, and at 250 Hz what may help."""
+    helps: dict[str, tuple[str, dict[str, Any]]] = {
+        'discount': ('discount per 40 ms', {'discount': 'time'}),
+        'noise': ('noise held for 40 ms', {'noise_seconds': 0.04}),
+        'both': ('both', {'discount': 'time', 'noise_seconds': 0.04}),
+        'steps': ('returns of 10 steps', {'n_step': 10}),
+        'three': (
+            'all three',
+            {'discount': 'time', 'noise_seconds': 0.04, 'n_step': 10},
+        ),
+        'parameters': ('noise on weights', {'parameter_noise': True}),
+        'skip': ('learned frame skip, up to 80 ms', {'longest_hold': 20}),
+        'skip_discount': (
+            'learned frame skip, discount per 40 ms',
+            {'longest_hold': 20, 'discount': 'time'},
+        ),
+        'advantage': (
+            'advantages (DAU), discount per 40 ms, noise held',
+            {'advantage': True, 'discount': 'time', 'noise_seconds': 0.04},
+        ),
+    }
+    plain = [
+        Arm(f'plain{rate}', f'{rate} Hz, as it is', {'control_hz': float(rate)})
+        for rate in (250, 125, 25)
+    ]
+    arms = [
+        Arm(name, f'250 Hz, {label}', {'control_hz': 250.0, **changes})
+        for name, (label, changes) in helps.items()
+    ]
+    return (*plain, *arms)
 
 
 def _ensembles() -> tuple[Arm, ...]:
@@ -224,29 +244,6 @@ STUDIES: dict[str, Study] = {
             _returns(),
         ),
         Study(
-            'onpolicy',
-            7,
-            'Can an on-policy method use goals in hindsight?',
-            {
-                'FetchReach': {
-                    **_REACH,
-                    **_ON_POLICY,
-                    'total_steps': 96_000,
-                    'evaluate_every': 9_600,
-                },
-                'FetchPush': {**_PUSH, **_ON_POLICY, 'total_steps': 1_000_000},
-            },
-            (
-                Arm('none', 'no hindsight', {'strategy': 'none'}),
-                Arm('taken', 'goals in hindsight, as if acted for', {'strategy': 'future'}),
-                Arm(
-                    'weighed',
-                    'goals in hindsight, weighed per decision',
-                    {'strategy': 'future', 'importance': 'decision'},
-                ),
-            ),
-        ),
-        Study(
             'ensembles',
             8,
             'Do several critics help, for the time that they cost?',
@@ -257,8 +254,31 @@ STUDIES: dict[str, Study] = {
             },
             _ensembles(),
         ),
+        Study(
+            'rates',
+            9,
+            'What keeps learning alive where actions are very frequent?',
+            {
+                'FetchReach': {**_REACH, 'evaluation_episodes': 16},
+                'FetchPush': _PUSH,
+            },
+            _rates(),
+        ),
     )
 }
+
+# Fields that count steps. Where arms differ in the rate they mean 40 ms, so that budgets are the
+# same in simulated time.
+STEP_COUNTS = ('total_steps', 'evaluate_every')
+
+
+def _at_rate(values: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a configuration with step counts at its rate."""
+    ticks = values.get('control_hz', DEFAULT_CONTROL_HZ) / DEFAULT_CONTROL_HZ
+    return {
+        name: round(value * ticks) if name in STEP_COUNTS else value
+        for name, value in values.items()
+    }
 
 
 def research_jobs(
@@ -291,7 +311,8 @@ def research_jobs(
         shared = {**_SHARED, **study.settings[task], **overrides}
         for seed in seeds:
             for arm in arms:
-                config = recipe_config(task, 'best', **{**shared, **arm.changes, 'seed': seed})
+                values = _at_rate({**shared, **arm.changes, 'seed': seed})
+                config = recipe_config(task, 'best', **values)
                 folder = output / task / arm.name / f'seed{seed}'
                 jobs.append(Job(arm, config, folder, final_episodes=episodes))
     return jobs

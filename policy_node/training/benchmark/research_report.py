@@ -10,15 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from policy_node.policies.checkpoint import read_info
-from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
-from policy_node.training.benchmark.measures import GOOD_SUCCESS, are_apart, measure_run, sum_up
-from policy_node.training.benchmark.research import Study
+from policy_node.training.benchmark.jobs import Job
+from policy_node.training.benchmark.measures import (
+    GOOD_SUCCESS,
+    are_apart,
+    curve_of,
+    measure_run,
+    sum_up,
+)
+from policy_node.training.benchmark.research import STEP_COUNTS, Study
 from policy_node.training.benchmark.results import (
     Curve,
     aggregate,
     draw,
     machine,
-    read_curve,
     write_curves,
 )
 from policy_node.training.learning.run_folder import LATEST_FILE
@@ -41,7 +46,7 @@ def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -
         command: Command line, for the record.
     """
     output.mkdir(parents=True, exist_ok=True)
-    found = [read_curve(job.folder / PROGRESS_FILE) for job in jobs]
+    found = [curve_of(job) for job in jobs]
     runs = [measure_run(job, curve) for job, curve in zip(jobs, found, strict=True)]
     groups: dict[str, dict[str, list[dict[str, Any]]]] = {}
     curves: dict[str, dict[str, list[Curve]]] = {}
@@ -128,6 +133,8 @@ def _about(study: Study, jobs: Sequence[Job], command: str) -> dict[str, Any]:
 def _shared_settings(study: Study, jobs: Sequence[Job]) -> dict[str, dict[str, Any]]:
     """By task, the fields of `TrainConfig` that all arms share."""
     own = {'seed', *(name for arm in study.arms for name in arm.changes)}
+    if 'control_hz' in own:
+        own |= set(STEP_COUNTS)
     configs = {job.config.task: dataclasses.asdict(job.config) for job in jobs}
     return {
         task: {name: value for name, value in config.items() if name not in own}

@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.policy import Policy
+from policy_node.training.learning.exploration import ActionNoise, ParameterNoise, actor_of
+from policy_node.training.learning.frame_skip import Holder
 from policy_node.training.learning.replay import Episodes
 
 
@@ -24,6 +26,10 @@ class Collector:
         noise_std: Standard deviation of the Gaussian noise on actions.
         random_epsilon: Probability of a uniformly random action instead.
         noise_spread: The first simulation has 1 - spread times both, the last 1 + spread.
+        noise_ticks: For how many ticks noise and random actions hold.
+        parameter_noise: Whether weights are moved, and by them actions by `noise_std`, instead of
+            actions themselves.
+        longest_hold: Most ticks for which actions may hold; above 1 they say how long.
 
     Attributes:
         exploration: Share of `noise_std` and `random_epsilon` that is in force.
@@ -36,13 +42,21 @@ class Collector:
         noise_std: float,
         random_epsilon: float,
         noise_spread: float = 0.0,
+        *,
+        noise_ticks: int = 1,
+        parameter_noise: bool = False,
+        longest_hold: int = 1,
     ) -> None:
         self.simulation = simulation
-        self.noise_std = noise_std
-        self.random_epsilon = random_epsilon
         self.exploration = 1.0
-        self._shares = 1.0 + noise_spread * np.linspace(-1.0, 1.0, simulation.num_envs)
-        self._generator = np.random.default_rng(seeds[0])
+        generator = np.random.default_rng(seeds[0])
+        self._holder = Holder(longest_hold) if longest_hold > 1 else None
+        self._shape = (simulation.num_envs, simulation.spec.robot.action_size + (longest_hold > 1))
+        std = 0.0 if parameter_noise else noise_std
+        self._noise = ActionNoise(
+            generator, self._shape, std, random_epsilon, noise_spread, noise_ticks
+        )
+        self._parameters = ParameterNoise(generator, noise_std) if parameter_noise else None
         self._seeds: list[int] | None = seeds
 
     def collect(self, policy: Policy, random: bool = False) -> tuple[Episodes, float]:
@@ -65,32 +79,47 @@ class Collector:
             observation=np.empty((count, ticks + 1, spec.observation_size), np.float32),
             achieved_goal=np.empty((count, ticks + 1, spec.goal.size), np.float32),
             desired_goal=observation['desired_goal'].astype(np.float32),
-            action=np.empty((count, ticks, spec.robot.action_size), np.float32),
+            action=np.empty((count, ticks, self._shape[1]), np.float32),
         )
         whole = np.ones(count, dtype=np.bool_)
         success = np.zeros(count, dtype=np.bool_)
+        acting = self._acting(policy)
         for tick in range(ticks):
             episodes.observation[:, tick] = observation['observation']
             episodes.achieved_goal[:, tick] = observation['achieved_goal']
-            episodes.action[:, tick] = self._explore(policy, observation, random)
-            result = simulation.step(episodes.action[:, tick])
+            action = self._explore(acting, observation, random, tick)
+            if self._holder is not None:
+                action = self._holder.take(action, ticks - tick)
+            episodes.action[:, tick] = action
+            result = simulation.step(action[:, : spec.robot.action_size])
             observation, success = result.observation, result.success
             whole &= ~result.diverged
         episodes.observation[:, ticks] = observation['observation']
         episodes.achieved_goal[:, ticks] = observation['achieved_goal']
+        if not random:
+            self._adapt(policy, acting, episodes)
         return episodes.select(whole), float(success[whole].mean()) if whole.any() else 0.0
 
+    def _acting(self, policy: Policy) -> Policy:
+        """What acts through the episodes: the policy, or copies of it with other weights."""
+        self._noise.share = self.exploration
+        if self._parameters is None:
+            return policy
+        self._parameters.share = self.exploration
+        return self._parameters.perturb(actor_of(policy))
+
+    def _adapt(self, policy: Policy, acting: Policy, episodes: Episodes) -> None:
+        if self._parameters is not None:
+            ticks = episodes.ticks
+            states = {
+                'observation': episodes.observation[:, :-1].reshape(len(episodes) * ticks, -1),
+                'desired_goal': np.repeat(episodes.desired_goal, ticks, axis=0),
+            }
+            self._parameters.adapt(policy, acting, states)
+
     def _explore(
-        self, policy: Policy, observation: Mapping[str, ArrayLike], random: bool
+        self, policy: Policy, observation: Mapping[str, ArrayLike], random: bool, tick: int
     ) -> NDArray[np.float32]:
-        shape = (self.simulation.num_envs, self.simulation.spec.robot.action_size)
-        uniform = self._generator.uniform(-1.0, 1.0, shape).astype(np.float32)
         if random:
-            return uniform
-        action, _ = policy.predict(observation, deterministic=True)
-        share = self.exploration * self._shares
-        noise = self._generator.standard_normal(shape, dtype=np.float32)
-        noisy = action + (self.noise_std * share[:, None]).astype(np.float32) * noise
-        noisy = np.clip(noisy, -1.0, 1.0)
-        replaced = self._generator.random(shape[0]) < share * self.random_epsilon
-        return np.where(replaced[:, None], uniform, noisy)
+            return self._noise.random(tick)
+        return self._noise.around(policy.predict(observation, deterministic=True)[0], tick)

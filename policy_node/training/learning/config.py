@@ -39,10 +39,8 @@ class TrainConfig:
     """Recipe the values come from, for the record."""
     seed: int = 0
     """Seed of weights, exploration, relabelling and resets."""
-    algorithm: str = 'ddpg'
-    """`ddpg`, or `ppo` (on policy: each cycle's episodes once, also under goals in hindsight)."""
     control_hz: float = DEFAULT_CONTROL_HZ
-    """Action frequency, Hz."""
+    """Action frequency, Hz. Steps, also those of this configuration, are ticks at this rate."""
     reward_type: str = 'sparse'
     """`sparse` (-1 until success, then 0) or `dense` (negative distance)."""
     success_rule: str = 'gymnasium'
@@ -66,9 +64,8 @@ class TrainConfig:
     """Which of 8 future goals is taken: `uniform` (any), `bellman` (the value that errs most) or
     `uncertain` (that critics differ in most)."""
     importance: str = 'none'
-    """Weights of transitions: `none`; `density` (in the critic's loss) takes back that a goal in
-    hindsight depends on where the transition led; `decision` (of `ppo`) that the actions of a
-    replayed episode are those for another goal."""
+    """Weights of transitions in the critic's loss: `none`, or `density`, which takes back that a
+    goal chosen in hindsight depends on where the transition led."""
     moved_share: float = 0.0
     """Share of a batch drawn by `episode_weights`; 0 draws uniformly."""
     episode_weights: str = 'moved'
@@ -87,7 +84,7 @@ class TrainConfig:
     """Of longer returns, whose actions are not the actor's: `none`, `lambda` (their mean is the
     lambda-return) or `cut` (they end before an action far from the actor's)."""
     trace: float = 0.7
-    """With `lambda`, the probability of going on after each step; of `ppo` the same lambda."""
+    """With `lambda`, the probability of going on after each step."""
     cut_distance: float = 0.3
     """With `cut`, the farthest action from the actor's, root mean square."""
 
@@ -137,6 +134,11 @@ class TrainConfig:
     saved as best. 0 evaluates the actor itself."""
     gamma: float = 0.98
     """Discount; targets are clipped to [-1/(1-gamma), 0]."""
+    discount: str = 'tick'
+    """What `gamma` discounts: one `tick`, or `time`: 40 ms, whatever a tick is. A tick's reward is
+    then that for its share of 40 ms, so that values are as large at every rate."""
+    advantage: bool = False
+    """Critics learn values of states and advantages per 40 ms (DAU) instead of action values."""
     action_l2: float = 1.0
     """Weight of the mean squared action in the actor loss."""
     polyak: float = 0.95
@@ -161,6 +163,13 @@ class TrainConfig:
     """Standard deviation of the Gaussian noise on other actions."""
     noise_spread: float = 0.0
     """Exploration differs between simulations: from 1 - spread to 1 + spread times both."""
+    noise_seconds: float = 0.0
+    """How long noise and random actions hold once they are drawn; 0 is one tick."""
+    parameter_noise: bool = False
+    """Instead of Gaussian noise on actions, noise on weights that moves actions by `noise_std`."""
+    longest_hold: int = 1
+    """Most ticks for which the actor lets an action hold while it collects; above 1 it learns how
+    long. The actor that is evaluated and saved decides at every tick."""
     final_exploration: float = 1.0
     """Share of `random_epsilon` and `noise_std` left at `total_steps`; both fall linearly in
     the last third of the run. 1 keeps them constant."""
@@ -201,8 +210,24 @@ class TrainConfig:
     @property
     def has_plain_networks(self) -> bool:
         """Whether other runs have networks of the same kind, so that they can start from these."""
-        kind = self.algorithm, self.critics, self.norm, self.condition
-        return kind == ('ddpg', 1, 'none', 'none')
+        plain = (1, 'none', 'none', 1, False)
+        own = (self.critics, self.norm, self.condition, self.longest_hold, self.advantage)
+        return own == plain
+
+    @property
+    def tick_share(self) -> float:
+        """Duration of a tick in units of what `gamma` discounts."""
+        return DEFAULT_CONTROL_HZ / self.control_hz if self.discount == 'time' else 1.0
+
+    @property
+    def tick_gamma(self) -> float:
+        """Discount of a tick."""
+        return float(self.gamma**self.tick_share)
+
+    @property
+    def noise_ticks(self) -> int:
+        """For how many ticks noise holds."""
+        return max(round(self.noise_seconds * self.control_hz), 1)
 
     def _refuse_what_has_no_effect(self, spec: TaskSpec) -> None:
         if self.goals:
@@ -224,9 +249,9 @@ class TrainConfig:
         sources = self.goals or self.strategy
         replays_later = 'future' in sources or 'near' in sources
         conditioned, chosen = self.condition != 'none', self.goal_choice != 'uniform'
-        weighted, on_policy = self.importance != 'none', self.algorithm == 'ppo'
-        others = self._set_for_ddpg() if on_policy else []
+        weighted = self.importance != 'none'
         return [
+            *self._contradictions_of_rates(),
             (
                 self.correction != 'none' and self.n_step == 1,
                 f'correction {self.correction} needs n_step above 1',
@@ -263,29 +288,60 @@ class TrainConfig:
                 self.condition == 'threshold' and self.reward_type == 'dense',
                 'condition threshold needs reward_type sparse',
             ),
-            (weighted and self.n_step > 1, f'importance {self.importance} excludes n_step above 1'),
+            (weighted and self.n_step > 1, 'importance density excludes n_step above 1'),
             (
                 weighted and self.strategy == 'none' and not self.goals,
-                f'importance {self.importance} needs goals chosen in hindsight',
+                'importance density needs goals chosen in hindsight',
             ),
-            (
-                self.importance != 'none' and on_policy != (self.importance == 'decision'),
-                f'importance {self.importance} excludes algorithm {self.algorithm}',
-            ),
-            (on_policy and self.noise_std == 0.0, 'algorithm ppo needs noise_std above 0'),
-            (bool(others), f'algorithm ppo needs {", ".join(others)}'),
             (
                 bool(self.init_from) and not self.has_plain_networks,
-                'init_from excludes algorithm ppo, condition, norm and critics above 1',
+                'init_from excludes condition, norm, advantage, critics and longest_hold above 1',
             ),
         ]
 
-    def _set_for_ddpg(self) -> list[str]:
-        """What `ppo` would not look at, as it has to be: `name=value`."""
+    def _contradictions_of_rates(self) -> list[tuple[bool, str]]:
+        """The same of what is for other rates than 25 Hz."""
+        holds, several = self.longest_hold > 1, self.n_step > 1
+        chosen = self.goal_choice != 'uniform'
+        weighted = self.importance != 'none'
         return [
-            f'{name}={str(value).lower()}'
-            for name, value in ON_POLICY.items()
-            if getattr(self, name) != value
+            (
+                0.0 < self.noise_seconds * self.control_hz < 1.0 - 1e-6,
+                f'noise_seconds {self.noise_seconds:g} is less than a tick of '
+                f'{1.0 / self.control_hz:g} s',
+            ),
+            (
+                self.parameter_noise and self.noise_spread > 0.0,
+                'parameter_noise excludes noise_spread: its copies are alike',
+            ),
+            (
+                holds and (several or self.noise_seconds > 0.0 or self.parameter_noise),
+                'longest_hold above 1 excludes n_step above 1, noise_seconds and parameter_noise',
+            ),
+            (
+                holds and (self.condition == 'horizon' or weighted or chosen),
+                'longest_hold above 1 excludes condition horizon, importance and goal_choice',
+            ),
+            (
+                holds and self.gamble,
+                'longest_hold above 1 excludes gamble',
+            ),
+            (
+                self.advantage and self.discount != 'time',
+                'advantage needs discount time: it is per 40 ms',
+            ),
+            (
+                self.advantage and (self.critics > 1 or self.norm == 'batch'),
+                'advantage excludes critics above 1 and norm batch',
+            ),
+            (
+                self.advantage and (several or holds),
+                'advantage is of one tick: it excludes n_step and longest_hold above 1',
+            ),
+            (
+                self.advantage and (weighted or chosen),
+                'advantage excludes importance and goal_choice',
+            ),
         ]
 
 
@@ -300,38 +356,21 @@ def require_idle_gripper(task: str) -> None:
         raise ValueError(f'gamble: {task} uses its gripper; allowed: {allowed}')
 
 
-ON_POLICY: dict[str, Any] = {
-    'overlap': False,
-    'random_epsilon': 0.0,
-    'noise_spread': 0.0,
-    'final_exploration': 1.0,
-    'random_steps': 0,
-    'moved_share': 0.0,
-    'ticks_after_drop': -1,
-    'goal_choice': 'uniform',
-    'condition': 'none',
-    'n_step': 1,
-    'critics': 1,
-    'norm': 'none',
-    'target': 'polyak',
-}
-"""Fields that `ppo` has no choice of: it learns from what its own noise did, and from values of
-states."""
 CHOICES = {
     'recipe': RECIPES,
-    'algorithm': ('ddpg', 'ppo'),
     'reward_type': REWARD_TYPES,
     'success_rule': SUCCESS_RULES,
     'strategy': ('final', 'future', 'episode', 'random', 'futureactual', 'none'),
     'goal_features': GOAL_FEATURES,
     'episode_weights': ('moved', 'energy'),
-    'importance': ('none', 'density', 'decision'),
+    'importance': ('none', 'density'),
     'goal_choice': ('uniform', *GOAL_CHOICES),
     'condition': ('none', 'threshold', 'horizon'),
     'correction': CORRECTIONS,
     'target': ('polyak', 'none'),
     'norm': ('none', 'layer', 'batch'),
     'aggregate': ('mean', 'min', 'truncated'),
+    'discount': ('tick', 'time'),
     'precision': ('auto', 'float32', 'bfloat16'),
     'device': ('auto', 'cpu', 'cuda'),
 }
@@ -349,6 +388,8 @@ RANGES = (
     ('cut_distance', 0, 2),
     ('critics', 1, 100),
     ('noise_spread', 0, 1),
+    ('noise_seconds', 0, 10),
+    ('longest_hold', 1, 1000),
     ('critic_first', 0, _INFINITY),
     ('total_steps', 1, _INFINITY),
     ('time_limit', 0, _INFINITY),

@@ -72,7 +72,8 @@ def network_shape(config: TrainConfig) -> NetworkShape:
     return NetworkShape(
         observation_size=spec.observation_size,
         goal_size=spec.goal.size,
-        action_size=spec.robot.action_size,
+        # How long the action holds is one more.
+        action_size=spec.robot.action_size + (config.longest_hold > 1),
         hidden_sizes=config.hidden_sizes,
         layer_norm=config.layer_norm,
         goal_features=goal_features(config.goal_features, spec),
@@ -117,8 +118,7 @@ def _of_run(folder: Path) -> InitialNetworks:
 def _require_plain(config: TrainConfig, name: str) -> None:
     """Refuses networks of a run that no other run has the like of."""
     if not config.has_plain_networks:
-        names = ('algorithm', 'critics', 'norm', 'condition')
-        found = ', '.join(f'{field} {getattr(config, field)}' for field in names)
+        found = f'critics {config.critics}, norm {config.norm}, condition {config.condition}'
         raise ValueError(f'{name} cannot be started from: {found}')
 
 

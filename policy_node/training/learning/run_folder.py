@@ -12,6 +12,7 @@ from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.frame_skip import plain_actor
 from policy_node.training.learning.learner import Learner
 from policy_node.training.learning.normalizer import RunningStatistics
 from policy_node.training.learning.training_state import Counters, save_state
@@ -76,7 +77,7 @@ class RunFolder:
             goal_features=config.goal_features,
             init_from=self.init_from,
         )
-        checkpoint.save(self.path / name, actor, info)
+        checkpoint.save(self.path / name, plain_actor(actor, config), info)
 
     def replay_file(self, rank: int) -> Path:
         """Where a worker keeps its newest episodes."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from policy_node.training.learning.conditions import Condition, make_condition
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.frame_skip import HeldSteps
 from policy_node.training.learning.goal_choice import CANDIDATES, GOAL_CHOICES, Judge, best_of
 from policy_node.training.learning.hindsight import RewardFunction, draw_sources, flat, goals_of
 from policy_node.training.learning.multi_step import StepCounter, discounted_rewards
@@ -30,13 +31,15 @@ class TransitionSampler:
         steps: How many steps returns have; None is one.
         condition: What values are conditioned on; None is nothing.
         goal_choice: Which future goal is taken, `uniform` or a key of `GOAL_CHOICES`.
+        reward_scale: What rewards are multiplied by.
     """
 
     compute_reward: RewardFunction
     gamma: float
-    steps: StepCounter | None = None
+    steps: StepCounter | HeldSteps | None = None
     condition: Condition | None = None
     goal_choice: str = 'uniform'
+    reward_scale: float = 1.0
 
     def sample(
         self,
@@ -93,7 +96,7 @@ class TransitionSampler:
             next_observation=observation.take(state + 1, axis=0),
             goal=goal,
             action=flat(episodes.action).take(row * episodes.ticks + tick, axis=0),
-            reward=np.asarray(reward, dtype=np.float32),
+            reward=np.asarray(reward * self.reward_scale, dtype=np.float32),
             discount=np.full(len(row), self.gamma, np.float32),
         )
 
@@ -115,12 +118,13 @@ class TransitionSampler:
                 return np.asarray(self.compute_reward(*goals))
             return condition.reward(*goals, drawn[chosen])
 
+        reward = discounted_rewards(starts, steps, reward_after, self.gamma) * self.reward_scale
         batch = Transitions(
             observation=episodes.observation[row, tick],
             next_observation=episodes.observation[row, tick + steps],
             goal=goal,
             action=episodes.action[row, tick],
-            reward=discounted_rewards(starts, steps, reward_after, self.gamma).astype(np.float32),
+            reward=reward.astype(np.float32),
             discount=(self.gamma**steps).astype(np.float32),
         )
         if condition is None or drawn is None:
@@ -160,12 +164,21 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
         metric: Distances and thresholds of the task, and its reward.
     """
     metric = scale_thresholds(metric, config.reward_distance, config.reward_rotation)
-    counter = None
+    counter: StepCounter | HeldSteps | None = None
+    if config.longest_hold > 1:
+        counter = HeldSteps(config.longest_hold)
     if config.n_step > 1:
         limits = config.correction, config.trace, config.cut_distance
         counter = StepCounter(config.n_step, *limits)
     condition = make_condition(config.condition, metric)
-    return TransitionSampler(metric.reward, config.gamma, counter, condition, config.goal_choice)
+    return TransitionSampler(
+        metric.reward,
+        config.tick_gamma,
+        counter,
+        condition,
+        config.goal_choice,
+        config.tick_share,
+    )
 
 
 def scale_thresholds(metric: GoalMetric, distance: float, rotation: float) -> GoalMetric:

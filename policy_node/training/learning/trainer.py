@@ -18,11 +18,16 @@ from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
 from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.devices import choose_device
 from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.initial_networks import CRITIC_FIRST, InitialNetworks
+from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.initial_networks import (
+    CRITIC_FIRST,
+    InitialNetworks,
+    network_shape,
+)
 from policy_node.training.learning.learner import Losses
-from policy_node.training.learning.learners import make_learner
 from policy_node.training.learning.progress_row import Speed, progress_row
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.replay_file import load_replay
@@ -112,16 +117,19 @@ class Trainer:
             config.noise_std,
             config.random_epsilon,
             config.noise_spread,
+            noise_ticks=config.noise_ticks,
+            parameter_noise=config.parameter_noise,
+            longest_hold=config.longest_hold,
         )
         return np.random.default_rng(sampler_seed)
 
     def _build_learner(self) -> None:
         config, spec = self.config, self.spec
+        self.learner = DDPG(network_shape(config), config, self.device, self.workers)
         sampler = make_sampler(config, self.simulation.metric)
         generator = self._seed(env_steps=0)
-        self.learner, self.experience = make_learner(
-            config, spec, self.device, self.workers, sampler, generator
-        )
+        self.experience = Experience(config, spec, self.workers, sampler, generator)
+        self.experience.judge = self.learner
 
     def stop(self, reason: str) -> None:
         """Asks the run to end after the current cycle, with a checkpoint."""

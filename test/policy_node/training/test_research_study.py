@@ -12,7 +12,7 @@ import torch
 
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.measures import are_apart, area_under, sum_up
-from policy_node.training.benchmark.research import STUDIES, Study
+from policy_node.training.benchmark.research import STEP_COUNTS, STUDIES, Study
 from policy_node.training.benchmark.research_report import BEGIN, END
 from policy_node.training.benchmark.results import Curve
 from policy_node.training.learning.config import TrainConfig
@@ -31,6 +31,10 @@ def test_arms_of_a_study_share_all_but_what_is_theirs(study: Study, tmp_path: Pa
         jobs = jobs_from_arguments(parse_arguments(options))
         assert len(jobs) == study.seeds * len(study.arms)
         own = {name for arm in study.arms for name in arm.changes} | {'seed'}
+        if 'control_hz' in own:
+            own |= set(STEP_COUNTS)
+            seconds = {job.config.total_steps / job.config.control_hz for job in jobs}
+            assert len(seconds) == 1, 'budgets are the same in simulated time'
         shared = [name for name in TrainConfig.__slots__ if name not in own]
         first = jobs[0].config
         assert all(

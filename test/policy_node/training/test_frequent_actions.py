@@ -1,0 +1,250 @@
+"""What is there for very frequent actions, on problems with a known answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node.policies.actor import Actor
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.collector import Collector
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.ddpg import DDPG
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.exploration import ParameterNoise
+from policy_node.training.learning.frame_skip import (
+    HeldSteps,
+    Holder,
+    length_of,
+    plain_actor,
+    ticks_of,
+)
+from policy_node.training.learning.initial_networks import network_shape
+from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.learning.replay import Episodes
+from policy_node.training.learning.sampling import TransitionSampler, make_sampler
+from policy_node.training.learning.transitions import Starts, Transitions
+
+torch.set_num_threads(1)
+
+TICKS = 500
+
+
+def config_at(control_hz: float, **changes: object) -> TrainConfig:
+    """FetchReach in small: updates that move fast, targets that follow at once."""
+    quick = {'precision': 'float32', 'target_update_interval': 1, 'polyak': 0.5}
+    quick |= {'action_l2': 0.0, 'learning_rate': 3e-3}
+    return recipe_config('FetchReach', 'best', control_hz=control_hz, **{**quick, **changes})
+
+
+def learner_of(config: TrainConfig) -> DDPG:
+    torch.manual_seed(0)
+    return DDPG(NetworkShape(2, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
+
+
+def batch_of(config: TrainConfig, action: np.ndarray, reward: np.ndarray) -> Transitions:
+    """Transitions of one state that never changes."""
+    count = len(action)
+    state, goal = np.ones((count, 2), np.float32), np.ones((count, 1), np.float32)
+    return Transitions(
+        observation=state,
+        next_observation=state,
+        goal=goal,
+        action=action.astype(np.float32),
+        reward=(reward * config.tick_share).astype(np.float32),
+        discount=np.full(count, config.tick_gamma, np.float32),
+    )
+
+
+@pytest.mark.parametrize(
+    ('discount', 'answer'), [('tick', -1 / 0.5), ('time', -0.1 / (1 - 0.5**0.1))]
+)
+def test_values_discount_ticks_or_time(discount: str, answer: float) -> None:
+    """A state that is left never, and rewarded with -1 per tick or per 40 ms."""
+    config = config_at(250.0, gamma=0.5, discount=discount)
+    assert config.tick_gamma**10 == pytest.approx(0.5 if discount == 'time' else 0.5**10)
+    learner, generator = learner_of(config), np.random.default_rng(0)
+    for _ in range(400):
+        learner.update(batch_of(config, generator.uniform(-1, 1, (64, 1)), np.full(64, -1.0)))
+    loss = learner.update(batch_of(config, np.zeros((64, 1)), np.full(64, -1.0)))
+    assert float(loss.value) == pytest.approx(answer, abs=0.03)
+
+
+def test_at_25_hz_time_is_ticks() -> None:
+    ticks, time = (config_at(25.0, discount=kind) for kind in ('tick', 'time'))
+    assert (ticks.tick_gamma, ticks.tick_share) == (time.tick_gamma, time.tick_share) == (0.98, 1.0)
+
+
+def test_rewards_of_a_batch_are_those_of_a_tick_of_time() -> None:
+    metric = Simulation('FetchReach', num_threads=1).metric
+    episodes = Episodes(
+        observation=np.zeros((1, 21, 10), np.float32),
+        achieved_goal=np.zeros((1, 21, 3), np.float32),
+        desired_goal=np.ones((1, 3), np.float32),
+        action=np.zeros((1, 20, 4), np.float32),
+    )
+    for n_step in (1, 10):
+        config = config_at(250.0, discount='time', n_step=n_step)
+        sampler = make_sampler(config, metric)
+        row = np.zeros(50, np.int64)
+        batch = sampler.sample(episodes, row, {'real': 1.0}, np.random.default_rng(0))
+        steps = np.round(np.log(batch.discount.astype(float)) / np.log(config.tick_gamma))
+        assert steps.max() == n_step
+        expected = -0.1 * (1 - config.tick_gamma**steps) / (1 - config.tick_gamma)
+        np.testing.assert_allclose(batch.reward, expected, rtol=1e-5)
+
+
+def collected(**options: object) -> Episodes:
+    """An episode in each of eight simulations at 250 Hz, around an actor that rests."""
+    simulation = Simulation('FetchReach', num_envs=8, num_threads=1, control_hz=250.0)
+    actor = Actor(NetworkShape(10, 3, 4, (8,))).eval()
+    torch.nn.init.zeros_(actor.network.output.weight)
+    return Collector(simulation, list(range(8)), 0.2, 0.0, **options).collect(actor)[0]
+
+
+def test_noise_that_holds_for_40_ms_moves_the_gripper_as_at_25_hz() -> None:
+    """Of n independent steps the sum is sqrt(n) of one: held for 10, sqrt(10) times as far."""
+    free, held = collected(), collected(noise_ticks=10)
+    assert held.action.shape == (8, TICKS, 4)
+    blocks = held.action.reshape(8, TICKS // 10, 10, 4)
+    assert (blocks == blocks[:, :, :1]).all()
+    assert (blocks[:, 1:, 0] != blocks[:, :-1, 0]).all()
+    assert (free.action[:, 1:] != free.action[:, :-1]).all()
+    spread = [float(e.action.sum(axis=1).std()) for e in (free, held)]
+    assert spread[1] / spread[0] == pytest.approx(np.sqrt(10.0), rel=0.35)
+
+
+def test_noise_on_weights_moves_actions_as_far_as_asked() -> None:
+    torch.manual_seed(0)
+    actor, generator = Actor(NetworkShape(10, 3, 4, (64, 64))).eval(), np.random.default_rng(0)
+    noise = ParameterNoise(generator, distance=0.2)
+    states = {name: generator.normal(size=(400, n)) for name, n in (('observation', 10),)}
+    states['desired_goal'] = generator.normal(size=(400, 3))
+    own, _ = actor.predict(states)
+    for _ in range(8):
+        perturbed = noise.perturb(actor)
+        noise.adapt(actor, perturbed, states)
+    moved = np.sqrt(np.square(noise.perturb(actor).predict(states)[0] - own).mean())
+    assert moved == pytest.approx(0.2, rel=0.3)
+    np.testing.assert_array_equal(perturbed.predict(states)[0], perturbed.predict(states)[0])
+    np.testing.assert_array_equal(actor.predict(states)[0], own)
+
+
+def test_episodes_under_noise_on_weights_are_consistent() -> None:
+    """Weights are drawn once for an episode: alike states give alike actions."""
+    episodes = collected(parameter_noise=True)
+    change = np.abs(np.diff(episodes.action, axis=1)).mean()
+    assert 0.0 < change < 0.1 * np.abs(episodes.action).mean()
+
+
+def test_lengths_mean_ticks_and_ticks_lengths() -> None:
+    ticks = np.arange(1, 11)
+    np.testing.assert_array_equal(ticks_of(length_of(ticks, 10), 10), ticks)
+    np.testing.assert_array_equal(ticks_of(np.array([-1.0, 0.01, 1.0]), 3), [1, 2, 3])
+
+
+def test_an_action_holds_for_its_length_but_not_beyond_the_episode() -> None:
+    holder = Holder(most=4)
+    wanted = np.array([[3, 1], [1, 9], [9, 2], [2, 9], [4, 9]])  # ticks; 9 is not looked at
+    numbers = np.arange(5.0)[:, None] * [1.0, 10.0]
+    held = [
+        holder.take(
+            np.stack([numbers[i], length_of(np.minimum(wanted[i], 4), 4)], axis=1).astype(
+                np.float32
+            ),
+            ticks_left=5 - i,
+        )
+        for i in range(5)
+    ]
+    # The first robot decides at 0 (for 3) and 3 (for 2), the second at 0, 1 (for 4).
+    np.testing.assert_array_equal(
+        np.stack(held)[:, :, 0], [[0, 0], [0, 10], [0, 10], [3, 10], [3, 10]]
+    )
+    left = ticks_of(np.stack(held)[:, :, 1], 4)
+    np.testing.assert_array_equal(left, [[3, 1], [2, 4], [1, 3], [2, 2], [1, 1]])
+
+
+def test_held_actions_are_learnt_from_with_as_many_steps() -> None:
+    """A walk to the right by one a tick; the goal is at 6: rewards and ends are known."""
+    ticks = 8
+    place = np.arange(ticks + 1, dtype=np.float32)
+    left = np.array([3, 2, 1, 4, 3, 2, 1, 1])
+    action = np.stack([np.ones(ticks, np.float32), length_of(left, 4)], axis=1)
+    episodes = Episodes(
+        observation=place[None, :, None],
+        achieved_goal=place[None, :, None],
+        desired_goal=np.full((1, 1), 6.0, np.float32),
+        action=action[None],
+    )
+    sampler = TransitionSampler(
+        lambda a, g: -(a != g).any(axis=-1).astype(float), 0.5, HeldSteps(4)
+    )
+    row = np.zeros(200, np.int64)
+    batch = sampler.sample(episodes, row, {'real': 1.0}, np.random.default_rng(0))
+    tick = batch.observation[:, 0].astype(int)
+    steps = left[tick]
+    np.testing.assert_array_equal(batch.next_observation[:, 0], tick + steps)
+    np.testing.assert_allclose(batch.discount, 0.5**steps)
+    for index in range(200):
+        reached = [float(tick[index] + step + 1 != 6) for step in range(steps[index])]
+        expected = -sum(0.5**step * missed for step, missed in enumerate(reached))
+        assert batch.reward[index] == pytest.approx(expected)
+    starts = Starts(episodes, row[:1], np.array([5]), valid_ticks=np.array([6]))
+    assert HeldSteps(4).count(starts, row[:1], np.random.default_rng(0), None) == [1]
+
+
+def test_an_actor_with_lengths_is_saved_as_one_that_decides_at_every_tick() -> None:
+    config = config_at(250.0, longest_hold=10)
+    learner = DDPG(network_shape(config), config, torch.device('cpu'), Workers())
+    collecting, plain = learner.acting_actor(), learner.evaluation_actor()
+    state = {'observation': np.ones((3, 10)), 'desired_goal': np.ones((3, 3))}
+    assert collecting.predict(state)[0].shape == (3, 5)
+    np.testing.assert_allclose(
+        plain.predict(state)[0], collecting.predict(state)[0][:, :4], atol=1e-6
+    )
+    assert plain_actor(plain, config) is plain
+
+
+@pytest.mark.parametrize('control_hz', [25.0, 250.0])
+def test_advantages_are_as_large_at_every_rate(control_hz: float) -> None:
+    """Two arms: actions above 0 are rewarded with 0, others with -1 per 40 ms."""
+    config = config_at(control_hz, gamma=0.5, discount='time', advantage=True)
+    learner, generator = learner_of(config), np.random.default_rng(0)
+    for _ in range(600):
+        action = generator.choice([-0.9, 0.9], (128, 1))
+        learner.update(batch_of(config, action, np.where(action[:, 0] > 0, 0.0, -1.0)))
+    features = torch.ones(1, 3)
+    best, worst = (
+        learner.critic.advantage(features, torch.full((1, 1), value)).item()
+        for value in (0.9, -0.9)
+    )
+    assert best - worst == pytest.approx(1.0, abs=0.15)
+    assert learner.critic.value(features).item() == pytest.approx(0.0, abs=0.1)
+    assert learner.actor(features).item() > 0.8
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'noise_seconds': 0.01}, 'noise_seconds 0.01 is less than a tick of 0.04 s'),
+        ({'parameter_noise': True, 'noise_spread': 0.5}, 'parameter_noise excludes noise_spread'),
+        ({'longest_hold': 5, 'n_step': 3}, 'longest_hold above 1 excludes n_step'),
+        ({'longest_hold': 5, 'noise_seconds': 0.04}, 'longest_hold above 1 excludes n_step'),
+        ({'longest_hold': 5, 'condition': 'horizon'}, 'excludes condition horizon'),
+        ({'longest_hold': 5, 'gamble': True}, 'excludes gamble'),
+        ({'longest_hold': 5, 'init_from': 'FetchReach'}, 'init_from excludes'),
+        ({'advantage': True}, 'advantage needs discount time'),
+        ({'advantage': True, 'discount': 'time', 'critics': 2}, 'excludes critics above 1'),
+        ({'advantage': True, 'discount': 'time', 'n_step': 3}, 'advantage is of one tick'),
+        ({'advantage': True, 'discount': 'time', 'goal_choice': 'bellman'}, 'goal_choice'),
+        ({'discount': 'second'}, "discount 'second'; allowed: tick, time"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(
+    changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message) as raised:
+        recipe_config('FetchReach', 'best', **changes)
+    assert '\n' not in str(raised.value)
