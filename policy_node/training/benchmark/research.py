@@ -87,6 +87,20 @@ _SPARSE_HAND_REACH = {
     'action_l2': 0.1,
     'gamma': 0.95,
 }
+# Every cycle's episodes about ten times; its own noise is the policy.
+_ON_POLICY = {
+    'algorithm': 'ppo',
+    'random_epsilon': 0.0,
+    'noise_std': 0.3,
+    'action_l2': 0.0,
+    'moved_share': 0.0,
+    'final_exploration': 1.0,
+    'learning_rate': 3e-4,
+    'trace': 0.95,
+    'num_envs': 64,
+    'batch_size': 1024,
+    'updates_per_cycle': 40,
+}
 
 
 def _arms(field: str, **labels: str) -> tuple[Arm, ...]:
@@ -242,6 +256,29 @@ STUDIES: dict[str, Study] = {
             'Do returns of several steps help data that is far from the policy?',
             {'FetchReach': _REACH, 'FetchPush': _PUSH, 'FetchSlide': _SLIDE},
             _returns(),
+        ),
+        Study(
+            'onpolicy',
+            7,
+            'Can an on-policy method use goals in hindsight?',
+            {
+                'FetchReach': {
+                    **_REACH,
+                    **_ON_POLICY,
+                    'total_steps': 96_000,
+                    'evaluate_every': 9_600,
+                },
+                'FetchPush': {**_PUSH, **_ON_POLICY, 'total_steps': 1_000_000},
+            },
+            (
+                Arm('none', 'no hindsight', {'strategy': 'none'}),
+                Arm('taken', 'goals in hindsight, as if acted for', {'strategy': 'future'}),
+                Arm(
+                    'weighed',
+                    'goals in hindsight, weighed per decision',
+                    {'strategy': 'future', 'importance': 'decision'},
+                ),
+            ),
         ),
         Study(
             'ensembles',

@@ -39,6 +39,8 @@ class TrainConfig:
     """Recipe the values come from, for the record."""
     seed: int = 0
     """Seed of weights, exploration, relabelling and resets."""
+    algorithm: str = 'ddpg'
+    """`ddpg`, or `ppo` (on policy: each cycle's episodes once, also under goals in hindsight)."""
     control_hz: float = DEFAULT_CONTROL_HZ
     """Action frequency, Hz. Steps, also those of this configuration, are ticks at this rate."""
     reward_type: str = 'sparse'
@@ -64,8 +66,9 @@ class TrainConfig:
     """Which of 8 future goals is taken: `uniform` (any), `bellman` (the value that errs most) or
     `uncertain` (that critics differ in most)."""
     importance: str = 'none'
-    """Weights of transitions in the critic's loss: `none`, or `density`, which takes back that a
-    goal chosen in hindsight depends on where the transition led."""
+    """Weights of transitions: `none`; `density` (in the critic's loss) takes back that a goal in
+    hindsight depends on where the transition led; `decision` (of `ppo`) that the actions of a
+    replayed episode are those for another goal."""
     moved_share: float = 0.0
     """Share of a batch drawn by `episode_weights`; 0 draws uniformly."""
     episode_weights: str = 'moved'
@@ -84,7 +87,7 @@ class TrainConfig:
     """Of longer returns, whose actions are not the actor's: `none`, `lambda` (their mean is the
     lambda-return) or `cut` (they end before an action far from the actor's)."""
     trace: float = 0.7
-    """With `lambda`, the probability of going on after each step."""
+    """With `lambda`, the probability of going on after each step; of `ppo` the same lambda."""
     cut_distance: float = 0.3
     """With `cut`, the farthest action from the actor's, root mean square."""
 
@@ -210,9 +213,9 @@ class TrainConfig:
     @property
     def has_plain_networks(self) -> bool:
         """Whether other runs have networks of the same kind, so that they can start from these."""
-        plain = (1, 'none', 'none', 1, False)
-        own = (self.critics, self.norm, self.condition, self.longest_hold, self.advantage)
-        return own == plain
+        plain = ('ddpg', 1, 'none', 'none', 1, False)
+        kind = self.algorithm, self.critics, self.norm, self.condition
+        return (*kind, self.longest_hold, self.advantage) == plain
 
     @property
     def tick_share(self) -> float:
@@ -249,7 +252,8 @@ class TrainConfig:
         sources = self.goals or self.strategy
         replays_later = 'future' in sources or 'near' in sources
         conditioned, chosen = self.condition != 'none', self.goal_choice != 'uniform'
-        weighted = self.importance != 'none'
+        weighted, on_policy = self.importance != 'none', self.algorithm == 'ppo'
+        others = self._set_for_ddpg() if on_policy else []
         return [
             *self._contradictions_of_rates(),
             (
@@ -288,15 +292,30 @@ class TrainConfig:
                 self.condition == 'threshold' and self.reward_type == 'dense',
                 'condition threshold needs reward_type sparse',
             ),
-            (weighted and self.n_step > 1, 'importance density excludes n_step above 1'),
+            (weighted and self.n_step > 1, f'importance {self.importance} excludes n_step above 1'),
             (
                 weighted and self.strategy == 'none' and not self.goals,
-                'importance density needs goals chosen in hindsight',
+                f'importance {self.importance} needs goals chosen in hindsight',
             ),
             (
-                bool(self.init_from) and not self.has_plain_networks,
-                'init_from excludes condition, norm, advantage, critics and longest_hold above 1',
+                self.importance != 'none' and on_policy != (self.importance == 'decision'),
+                f'importance {self.importance} excludes algorithm {self.algorithm}',
             ),
+            (on_policy and self.noise_std == 0.0, 'algorithm ppo needs noise_std above 0'),
+            (bool(others), f'algorithm ppo needs {", ".join(others)}'),
+            (
+                bool(self.init_from) and not self.has_plain_networks,
+                'init_from excludes algorithm ppo, condition, norm, advantage, critics and '
+                'longest_hold above 1',
+            ),
+        ]
+
+    def _set_for_ddpg(self) -> list[str]:
+        """What `ppo` would not look at, as it has to be: `name=value`."""
+        return [
+            f'{name}={str(value).lower()}'
+            for name, value in ON_POLICY.items()
+            if getattr(self, name) != value
         ]
 
     def _contradictions_of_rates(self) -> list[tuple[bool, str]]:
@@ -356,14 +375,37 @@ def require_idle_gripper(task: str) -> None:
         raise ValueError(f'gamble: {task} uses its gripper; allowed: {allowed}')
 
 
+ON_POLICY: dict[str, Any] = {
+    'overlap': False,
+    'random_epsilon': 0.0,
+    'noise_spread': 0.0,
+    'final_exploration': 1.0,
+    'random_steps': 0,
+    'moved_share': 0.0,
+    'ticks_after_drop': -1,
+    'goal_choice': 'uniform',
+    'condition': 'none',
+    'n_step': 1,
+    'discount': 'tick',
+    'advantage': False,
+    'noise_seconds': 0.0,
+    'parameter_noise': False,
+    'longest_hold': 1,
+    'critics': 1,
+    'norm': 'none',
+    'target': 'polyak',
+}
+"""Fields that `ppo` has no choice of: it learns from what its own noise did, and from values of
+states."""
 CHOICES = {
     'recipe': RECIPES,
+    'algorithm': ('ddpg', 'ppo'),
     'reward_type': REWARD_TYPES,
     'success_rule': SUCCESS_RULES,
     'strategy': ('final', 'future', 'episode', 'random', 'futureactual', 'none'),
     'goal_features': GOAL_FEATURES,
     'episode_weights': ('moved', 'energy'),
-    'importance': ('none', 'density'),
+    'importance': ('none', 'density', 'decision'),
     'goal_choice': ('uniform', *GOAL_CHOICES),
     'condition': ('none', 'threshold', 'horizon'),
     'correction': CORRECTIONS,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +12,7 @@ from torch import Tensor, nn
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.actor_critic import ActorCritic
 from policy_node.training.learning.advantage import AdvantageCritic
 from policy_node.training.learning.conditions import ACTING_INPUT, fold
 from policy_node.training.learning.config import TrainConfig
@@ -43,7 +43,7 @@ class _Known:
     discount: Tensor
 
 
-class DDPG:
+class DDPG(ActorCritic):
     """Actor, critic, their targets, and one update.
 
     Args:
@@ -51,38 +51,24 @@ class DDPG:
         config: The configuration.
         device: Where they live.
         workers: With whom gradients are averaged.
-
-    Attributes:
-        updates: Updates so far.
-        critic_first: The actor learns after this many of them.
     """
 
     def __init__(
         self, shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
     ) -> None:
-        self.config = config
-        self.device = device
-        self._workers = workers
         conditioned = config.condition != 'none'
         inputs = shape.feature_size + conditioned
-        self.actor = Actor(shape)
+        actor = Actor(shape)
         if conditioned:
-            self.actor.network = MLP(inputs, shape.action_size, shape)
-        self.actor.to(device)
+            actor.network = MLP(inputs, shape.action_size, shape)
         inputs += shape.action_size
-        self.critic = self._make_critic(inputs, shape).to(device)
+        critic = self._make_critic(config, inputs, shape)
         # A batch normalisation learns its statistics where values are learnt, nowhere else.
-        self.critic.eval()
-        self._actor_parameters = list(self.actor.network.parameters())
-        self._critic_parameters = list(self.critic.parameters())
-        workers.broadcast([*self._actor_parameters, *self._critic_parameters])
+        super().__init__(actor, critic.eval(), config, device, workers)
         self.target_actor, self.target_critic = self.actor.network, self.critic
         if config.target == 'polyak':
             self.target_actor = copy.deepcopy(self.actor.network)
             self.target_critic = copy.deepcopy(self.critic)
-        self.average_actor = copy.deepcopy(self.actor.network)
-        self.actor_optimizer = self._adam(self._actor_parameters)
-        self.critic_optimizer = self._adam(self._critic_parameters)
         self._ratio: DensityRatio | None = None
         if config.importance == 'density':
             sizes = shape.feature_size, shape.goal_size, shape.action_size
@@ -90,19 +76,13 @@ class DDPG:
             self._achieved_start = task_spec(config.task).achieved_goal_start
         self._action_size = shape.action_size - (config.longest_hold > 1)
         self._bfloat16 = uses_bfloat16(config.precision, device)
-        self.critic_first = config.critic_first
-        self.updates = 0
 
-    def _make_critic(self, inputs: int, shape: NetworkShape) -> nn.Module:
-        config = self.config
+    @staticmethod
+    def _make_critic(config: TrainConfig, inputs: int, shape: NetworkShape) -> nn.Module:
         if config.advantage:
-            return AdvantageCritic(
-                inputs - shape.action_size, shape, config.norm, config.tick_share
-            )
+            features = inputs - shape.action_size
+            return AdvantageCritic(features, shape, config.norm, config.tick_share)
         return make_critic(inputs, shape, config.norm, config.critics)
-
-    def _adam(self, parameters: list[nn.Parameter]) -> torch.optim.Adam:
-        return torch.optim.Adam(parameters, lr=self.config.learning_rate, fused=True)
 
     def update(self, batch: Transitions) -> Losses:
         """Improves critic and actor on a batch and, when due, moves the targets."""
@@ -135,13 +115,13 @@ class DDPG:
     def _known(self, batch: Transitions) -> _Known:
         """What the networks see of a batch."""
         observation, next_observation, goal, action, reward, discount = (
-            self._tensor(getattr(batch, name)) for name in _ALWAYS
+            self.tensor(getattr(batch, name)) for name in _ALWAYS
         )
         features = self.actor.features(observation, goal)
         next_features = self.actor.features(next_observation, goal)
         if batch.condition is not None:
-            features = torch.cat([features, self._tensor(batch.condition)], dim=-1)
-            next_condition = self._tensor(batch.next_condition)
+            features = torch.cat([features, self.tensor(batch.condition)], dim=-1)
+            next_condition = self.tensor(batch.next_condition)
             next_features = torch.cat([next_features, next_condition], dim=-1)
         seen = observation, next_observation, goal, features, next_features
         return _Known(*seen, action, reward, discount)
@@ -151,7 +131,7 @@ class DDPG:
             error = self._errors(known)
             square = error.square() if weight is None else weight * error.square()
             loss = square.mean()
-        self._step(self.critic_optimizer, loss, self._critic_parameters)
+        self.step(self.critic_optimizer, loss, self.critic_parameters)
         return loss
 
     def _errors(self, known: _Known) -> Tensor:
@@ -224,17 +204,8 @@ class DDPG:
             moved = action[..., : self._action_size].float()
             loss = -value + self.config.action_l2 * moved.square().mean()
         if self.updates >= self.critic_first:
-            self._step(self.actor_optimizer, loss, self._actor_parameters)
+            self.step(self.actor_optimizer, loss, self.actor_parameters)
         return loss, value
-
-    def _step(
-        self, optimizer: torch.optim.Adam, loss: Tensor, parameters: Sequence[nn.Parameter]
-    ) -> None:
-        gradients = torch.autograd.grad(loss, parameters)
-        self._workers.average_gradients(gradients)
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient
-        optimizer.step()
 
     @torch.no_grad()
     def _move_targets(self) -> None:
@@ -242,37 +213,25 @@ class DDPG:
             return
         weight = 1.0 - self.config.polyak
         old: list[Tensor] = [*self.target_actor.parameters(), *self.target_critic.parameters()]
-        new: list[Tensor] = [*self._actor_parameters, *self._critic_parameters]
+        new: list[Tensor] = [*self.actor_parameters, *self.critic_parameters]
         torch._foreach_lerp_(old, new, weight)
 
-    @torch.no_grad()
-    def average(self) -> None:
-        """Moves the averaged actor towards the actor; the trainer calls it once per cycle."""
-        weight = 1.0 - self.config.actor_average
-        averaged: list[Tensor] = list(self.average_actor.parameters())
-        torch._foreach_lerp_(averaged, [*self._actor_parameters], weight)
-
-    def acting_actor(self) -> Actor:
-        """A copy, on the CPU, of the actor that collects."""
-        return self._plain(self.actor.network)
-
     def evaluation_actor(self) -> Actor:
-        """A copy, on the CPU, of the actor to evaluate: averaged weights, current normalisers."""
-        return plain_actor(self._plain(self.average_actor), self.config)
+        """As `ActorCritic`; it decides at every tick."""
+        return plain_actor(super().evaluation_actor(), self.config)
 
-    def _plain(self, network: MLP) -> Actor:
+    def plain(self, network: MLP) -> Actor:
         """A copy of the actor with this network, at the condition under which it acts."""
-        actor = copy.deepcopy(self.actor)
         if self.config.condition == 'none':
-            actor.network.load_state_dict(network.state_dict())
-        else:
-            actor.network = fold(network, actor.shape, ACTING_INPUT[self.config.condition])
+            return super().plain(network)
+        actor = copy.deepcopy(self.actor)
+        actor.network = fold(network, actor.shape, ACTING_INPUT[self.config.condition])
         return actor.cpu().eval()
 
     @torch.no_grad()
     def act(self, observation: Array, goal: Array) -> Array:
         """Actions (batch, action_size) of the actor, without noise."""
-        inputs = self._tensor(observation), self._tensor(goal)
+        inputs = self.tensor(observation), self.tensor(goal)
         features = self.actor.features(*inputs)
         if self.config.condition != 'none':
             acting = features.new_full((len(features), 1), ACTING_INPUT[self.config.condition])
@@ -296,34 +255,16 @@ class DDPG:
 
     def modules(self) -> dict[str, nn.Module]:
         """What a training state holds, by name."""
-        modules: dict[str, nn.Module] = {
-            'actor': self.actor,
-            'critic': self.critic,
-            'target_actor': self.target_actor,
-            'target_critic': self.target_critic,
-            'average_actor': self.average_actor,
-        }
+        targets = {'target_actor': self.target_actor, 'target_critic': self.target_critic}
+        modules = {**super().modules(), **targets}
         return modules if self._ratio is None else {**modules, 'ratio': self._ratio}
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:
         """The optimisers, by name."""
-        optimizers = {
-            'actor_optimizer': self.actor_optimizer,
-            'critic_optimizer': self.critic_optimizer,
-        }
+        optimizers = super().optimizers()
         if self._ratio is not None:
             optimizers['ratio_optimizer'] = self._ratio.optimizer
         return optimizers
 
-    def set_progress(self, progress: float) -> None:
-        """Sets the learning rate for a run of which the share `progress` is over."""
-        config, share = self.config, min(max(progress, 0.0), 1.0)
-        rate = config.learning_rate * (1.0 - share * (1.0 - config.final_learning_rate))
-        for optimizer in (self.actor_optimizer, self.critic_optimizer):
-            optimizer.param_groups[0]['lr'] = rate
-
     def _precision(self) -> contextlib.AbstractContextManager[None]:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16)
-
-    def _tensor(self, values: object) -> Tensor:
-        return torch.as_tensor(values).to(self.device, non_blocking=True)

@@ -29,6 +29,7 @@ class Experience:
         generator: Source of all randomness.
 
     Attributes:
+        config: The configuration.
         judge: Who chooses goals and cuts returns, where the configuration asks for it.
         replay: The episodes held.
         statistics: Running statistics of observations and goals, by name.
@@ -44,7 +45,7 @@ class Experience:
         sampler: TransitionSampler,
         generator: np.random.Generator,
     ) -> None:
-        self._config = config
+        self.config = config
         self._workers = workers
         self._sampler = sampler
         self.judge: Judge | None = None
@@ -91,7 +92,7 @@ class Experience:
 
     def batch(self, env_steps: int) -> Transitions:
         """Draws the transitions of one update, after `env_steps` environment steps."""
-        row = self.replay.draw(self.batch_size, self._config.moved_share, self.generator)
+        row = self.replay.draw(self.batch_size, self.config.moved_share, self.generator)
         valid = self.replay.valid_ticks
         return self._sample(self.replay.episodes, row, env_steps, valid, self.judge)
 
@@ -103,11 +104,12 @@ class Experience:
         valid_ticks: NDArray[np.int64] | None,
         judge: Judge | None,
     ) -> Transitions:
-        mixture = self._mixture(env_steps)
+        mixture = self.mixture(env_steps)
         return self._sampler.sample(episodes, row, mixture, self.generator, valid_ticks, judge)
 
-    def _mixture(self, env_steps: int) -> dict[str, float]:
-        config = self._config
+    def mixture(self, env_steps: int) -> dict[str, float]:
+        """Probability of each goal source after `env_steps` environment steps."""
+        config = self.config
         if config.goals:
             return parse_mixture(config.goals)
         early = env_steps < config.future_only_steps

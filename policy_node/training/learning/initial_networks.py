@@ -118,7 +118,8 @@ def _of_run(folder: Path) -> InitialNetworks:
 def _require_plain(config: TrainConfig, name: str) -> None:
     """Refuses networks of a run that no other run has the like of."""
     if not config.has_plain_networks:
-        found = f'critics {config.critics}, norm {config.norm}, condition {config.condition}'
+        names = ('algorithm', 'critics', 'norm', 'condition')
+        found = ', '.join(f'{field} {getattr(config, field)}' for field in names)
         raise ValueError(f'{name} cannot be started from: {found}')
 
 

@@ -18,16 +18,11 @@ from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
 from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.devices import choose_device
 from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.experience import Experience
-from policy_node.training.learning.initial_networks import (
-    CRITIC_FIRST,
-    InitialNetworks,
-    network_shape,
-)
+from policy_node.training.learning.initial_networks import CRITIC_FIRST, InitialNetworks
 from policy_node.training.learning.learner import Losses
+from policy_node.training.learning.learners import make_learner
 from policy_node.training.learning.progress_row import Speed, progress_row
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.replay_file import load_replay
@@ -125,11 +120,11 @@ class Trainer:
 
     def _build_learner(self) -> None:
         config, spec = self.config, self.spec
-        self.learner = DDPG(network_shape(config), config, self.device, self.workers)
         sampler = make_sampler(config, self.simulation.metric)
         generator = self._seed(env_steps=0)
-        self.experience = Experience(config, spec, self.workers, sampler, generator)
-        self.experience.judge = self.learner
+        self.learner, self.experience = make_learner(
+            config, spec, self.device, self.workers, sampler, generator
+        )
 
     def stop(self, reason: str) -> None:
         """Asks the run to end after the current cycle, with a checkpoint."""

@@ -1,0 +1,44 @@
+"""Which learner a configuration asks for, and the experience that it learns from."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from msgs_spec.tasks import TaskSpec
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.ddpg import DDPG
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.initial_networks import network_shape
+from policy_node.training.learning.learner import Learner
+from policy_node.training.learning.on_policy import OnPolicyExperience
+from policy_node.training.learning.ppo import PPO
+from policy_node.training.learning.sampling import TransitionSampler
+
+
+def make_learner(
+    config: TrainConfig,
+    spec: TaskSpec,
+    device: torch.device,
+    workers: Workers,
+    sampler: TransitionSampler,
+    generator: np.random.Generator,
+) -> tuple[Learner, Experience]:
+    """Returns a learner and its experience.
+
+    Args:
+        config: The configuration.
+        spec: The task.
+        device: Where networks live.
+        workers: This worker among all.
+        sampler: Makes transitions.
+        generator: Source of relabelling and drawing.
+    """
+    if config.algorithm == 'ppo':
+        ppo = PPO(network_shape(config), config, device, workers)
+        return ppo, OnPolicyExperience(config, spec, workers, sampler, generator, ppo)
+    ddpg = DDPG(network_shape(config), config, device, workers)
+    experience = Experience(config, spec, workers, sampler, generator)
+    experience.judge = ddpg
+    return ddpg, experience

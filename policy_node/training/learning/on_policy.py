@@ -1,0 +1,61 @@
+"""Experience of a learner that learns from what its present actor did, and from nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from msgs_spec.tasks import TaskSpec
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.rollouts import (
+    Critique,
+    RolloutMaker,
+    Rollouts,
+    goals_in_hindsight,
+)
+from policy_node.training.learning.sampling import TransitionSampler
+from policy_node.training.learning.transitions import Transitions
+
+
+class OnPolicyExperience(Experience):
+    """Whole episodes of the newest cycle, with their own goals and `hindsight_k` others each.
+
+    Args:
+        config: The configuration; `trace` is the lambda of the advantages.
+        spec: The task.
+        workers: This worker among all.
+        sampler: Knows the rewards; makes transitions for the normalisers.
+        generator: Source of all randomness.
+        critique: Of the actor as it is.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        spec: TaskSpec,
+        workers: Workers,
+        sampler: TransitionSampler,
+        generator: np.random.Generator,
+        critique: Critique,
+    ) -> None:
+        super().__init__(config, spec, workers, sampler, generator)
+        limits = config.gamma, config.trace, config.importance == 'decision'
+        self._maker = RolloutMaker(critique, sampler.compute_reward, *limits)
+        self._newest = workers.share(config.num_envs)
+        self._rollouts: Rollouts | None = None
+        self._made_after = -1
+
+    def batch(self, env_steps: int) -> Transitions:
+        """Draws from the rollouts of the newest cycle; the first call after it makes them."""
+        if self._rollouts is None or env_steps != self._made_after:
+            self._rollouts, self._made_after = self._roll_out(env_steps), env_steps
+        return self._rollouts.draw(self.batch_size, self.config.gamma, self.generator)
+
+    def _roll_out(self, env_steps: int) -> Rollouts:
+        episodes = self.replay.newest(self._newest)
+        mixture = self.mixture(env_steps)
+        mixture.pop('real', None)
+        copies = self.config.hindsight_k if mixture else 0
+        goals = [goals_in_hindsight(episodes, mixture, self.generator) for _ in range(copies)]
+        return self._maker.make(episodes, goals)

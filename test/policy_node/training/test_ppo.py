@@ -1,0 +1,210 @@
+"""PPO and goals in hindsight: densities, advantages, weights, and a problem with a known answer."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.ppo import CLIP, PPO, log_probability
+from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.learning.replay import Episodes
+from policy_node.training.learning.rollouts import (
+    RolloutMaker,
+    advantages,
+    decision_weights,
+    goals_in_hindsight,
+)
+from policy_node.training.learning.trainer import Trainer
+from policy_node.training.learning.transitions import Transitions
+
+torch.set_num_threads(1)
+
+ON_POLICY = {'algorithm': 'ppo', 'overlap': False, 'random_epsilon': 0.0, 'noise_std': 0.3}
+SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
+SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'evaluate_every': 400}
+
+
+def configured(**changes: object) -> TrainConfig:
+    return recipe_config('FetchReach', 'best', **{**ON_POLICY, **changes})
+
+
+@pytest.mark.parametrize('mean', [-1.0, -0.3, 0.9])
+def test_densities_are_those_of_noisy_actions_that_were_clipped(mean: float) -> None:
+    def density(action: float) -> float:
+        point = torch.tensor([action], dtype=torch.float64)
+        return math.exp(float(log_probability(torch.tensor([mean]).double(), 0.4, point)))
+
+    generator = np.random.default_rng(0)
+    drawn = (mean + 0.4 * generator.standard_normal(200_000)).clip(-1.0, 1.0)
+    assert density(-1.0) == pytest.approx((drawn == -1.0).mean(), abs=0.005)
+    assert density(1.0) == pytest.approx((drawn == 1.0).mean(), abs=0.005)
+    inner = np.linspace(-1.0, 1.0, 401)[1:-1]
+    between = np.mean([density(float(action)) for action in inner]) * 2.0
+    assert density(-1.0) + between + density(1.0) == pytest.approx(1.0, abs=0.01)
+
+
+def test_densities_of_several_parts_multiply_and_have_gradients_beyond_the_limits() -> None:
+    mean = torch.tensor([[0.2, 5.0]], requires_grad=True)
+    action = torch.tensor([[0.5, -1.0]])
+    both = log_probability(mean, 0.3, action)
+    parts = [log_probability(mean[:, i : i + 1], 0.3, action[:, i : i + 1]) for i in range(2)]
+    torch.testing.assert_close(both, parts[0] + parts[1])
+    (gradient,) = torch.autograd.grad(both.sum(), mean)
+    assert torch.isfinite(both).all() and torch.isfinite(gradient).all()
+    assert gradient[0, 0] > 0 > gradient[0, 1]
+
+
+def test_advantages_are_discounted_sums_of_errors() -> None:
+    generator = np.random.default_rng(0)
+    reward, value = generator.normal(size=(3, 6)), generator.normal(size=(3, 7))
+    found = advantages(reward, value, gamma=0.9, trace=0.7)
+    for tick in range(6):
+        expected = sum(
+            0.63 ** (later - tick)
+            * (reward[:, later] + 0.9 * value[:, later + 1] - value[:, later])
+            for later in range(tick, 6)
+        )
+        np.testing.assert_allclose(found[:, tick], expected)
+    to_the_end = advantages(reward, value, gamma=0.9, trace=1.0)[:, 0] + value[:, 0]
+    returns = sum(0.9**t * reward[:, t] for t in range(6)) + 0.9**6 * value[:, 6]
+    np.testing.assert_allclose(to_the_end, returns)
+
+
+def test_weights_make_actions_for_one_goal_those_for_another() -> None:
+    """Two steps of Gaussian actions around 0, weighed as if they were around 0.5."""
+    actions = np.random.default_rng(0).standard_normal((400_000, 2))
+    log_ratio = 0.5 * np.square(actions) - 0.5 * np.square(actions - 0.5)
+    weight = decision_weights(log_ratio)
+    np.testing.assert_allclose(weight.mean(axis=0), 1.0)
+    assert (weight[:, 0] * actions[:, 0]).mean() == pytest.approx(0.5, abs=0.01)
+    assert (weight[:, 1] * actions[:, 1]).mean() == pytest.approx(0.5, abs=0.02)
+    assert (weight[:, 1] * actions[:, 0]).mean() == pytest.approx(0.5, abs=0.02), 'the past counts'
+    assert (weight[:, 0] * actions[:, 1]).mean() == pytest.approx(0.0, abs=0.02), 'no later action'
+
+
+def reached(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    return -1.0 * (np.abs(achieved - goal)[..., 0] > 0.1)
+
+
+def learn(cycles: int, **changes: object) -> tuple[PPO, RolloutMaker]:
+    """One step, whose action is what is achieved; goals lie anywhere from -.8 to .8."""
+    torch.manual_seed(0)
+    generator = np.random.default_rng(0)
+    config = configured(learning_rate=3e-3, action_l2=0.0, gamma=0.5, **changes)
+    learner = PPO(NetworkShape(1, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
+    corrects = config.importance == 'decision'
+    maker = RolloutMaker(learner, reached, config.gamma, 0.95, corrects)
+    for _ in range(cycles):
+        count = 256
+        goal = generator.uniform(-0.8, 0.8, (count, 1)).astype(np.float32)
+        observation = np.zeros((count, 2, 1), np.float32)
+        mean, _ = learner.acting_actor().predict(
+            {'observation': observation[:, 0], 'desired_goal': goal}
+        )
+        action = (mean + 0.3 * generator.standard_normal((count, 1))).clip(-1, 1)
+        achieved = np.stack([np.zeros_like(action), action], axis=1)
+        episodes = Episodes(observation, achieved, goal, action[:, None].astype(np.float32))
+        copies = 0 if config.strategy == 'none' else 4
+        goals = [goals_in_hindsight(episodes, {'random': 1.0}, generator) for _ in range(copies)]
+        rollouts = maker.make(episodes, goals)
+        for _ in range(20):
+            learner.update(rollouts.draw(256, config.gamma, generator))
+        learner.average()
+    return learner, maker
+
+
+@pytest.mark.parametrize(
+    'changes', [{'strategy': 'none'}, {'importance': 'decision'}], ids=['none', 'weighed']
+)
+def test_ppo_learns_to_do_what_the_goal_says(changes: dict[str, object]) -> None:
+    learner, _ = learn(60, **changes)
+    goal = np.linspace(-0.7, 0.7, 15, dtype=np.float32)[:, None]
+    actor = learner.evaluation_actor()
+    action, _ = actor.predict({'observation': np.zeros_like(goal), 'desired_goal': goal})
+    assert np.abs(action - goal).mean() < 0.1
+
+
+def test_rollouts_hold_every_episode_once_for_each_goal() -> None:
+    learner, maker = learn(1, strategy='none')
+    action = np.array([[[0.5]], [[-0.5]]], np.float32)
+    achieved = np.concatenate([np.zeros_like(action), action], axis=1)
+    own = np.array([[0.5], [0.5]], np.float32)
+    other = np.array([[0.0], [-0.5]], np.float32)
+    episodes = Episodes(np.zeros((2, 2, 1), np.float32), achieved, own, action)
+    rollouts = maker.make(episodes, [other])
+    assert rollouts.episodes.desired_goal[:, 0].tolist() == [0.5, 0.5, 0.0, -0.5]
+    assert rollouts.reward[:, 0].tolist() == [0, -1, -1, 0]
+    assert rollouts.advantage.mean() == pytest.approx(0, abs=1e-6)
+    assert rollouts.advantage.std() == pytest.approx(1, abs=1e-5)
+    last = learner.values(np.zeros((4, 1), np.float32), rollouts.episodes.desired_goal)
+    np.testing.assert_allclose(rollouts.value_target[:, 0], rollouts.reward[:, 0] + 0.5 * last)
+    logs = learner.log_probabilities(
+        np.zeros((4, 1), np.float32), rollouts.episodes.desired_goal, rollouts.episodes.action[:, 0]
+    )
+    np.testing.assert_allclose(rollouts.log_probability[:, 0], logs, rtol=1e-5)
+    batch = rollouts.draw(50, 0.5, np.random.default_rng(0))
+    place = np.where(batch.goal[:, 0] == 0.5, batch.action[:, 0] < 0, 2 + (batch.goal[:, 0] < 0))
+    np.testing.assert_array_equal(batch.reward, rollouts.reward[place.astype(int), 0])
+
+
+def test_an_update_moves_probabilities_no_further_than_it_may() -> None:
+    learner, maker = learn(1, strategy='none')
+    action = np.full((64, 1, 1), 0.4, np.float32)
+    achieved = np.concatenate([np.zeros_like(action), action], axis=1)
+    goal = np.linspace(-0.8, 0.8, 64, dtype=np.float32)[:, None]
+    episodes = Episodes(np.zeros((64, 2, 1), np.float32), achieved, goal, action)
+    rollouts = maker.make(episodes, [])
+    generator = np.random.default_rng(0)
+    for _ in range(300):
+        learner.update(rollouts.draw(256, 0.5, generator))
+    logs = learner.log_probabilities(episodes.observation[:, 0], goal, action[:, 0])
+    ratio = np.exp(logs - rollouts.log_probability[:, 0])
+    good = rollouts.advantage[:, 0] > 0
+    assert ratio[good].mean() > 1.0 > ratio[~good].mean()
+    assert np.median(np.abs(ratio - 1.0)) < 3 * CLIP
+
+
+def test_ppo_refuses_transitions_that_nobody_rolled_out() -> None:
+    learner, _ = learn(1, strategy='none')
+    one = np.zeros((1, 1), np.float32)
+    with pytest.raises(TypeError, match='PPO learns from RolloutTransitions, not Transitions'):
+        learner.update(Transitions(one, one, one, one, one[0], one[0]))
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'overlap': True}, 'algorithm ppo needs overlap=false'),
+        (
+            {'random_epsilon': 0.2, 'n_step': 3},
+            'algorithm ppo needs random_epsilon=0.0, n_step=1',
+        ),
+        ({'importance': 'density'}, 'importance density excludes algorithm ppo'),
+        ({'algorithm': 'ddpg', 'importance': 'decision'}, 'decision excludes algorithm ddpg'),
+        ({'init_from': 'FetchReach'}, 'init_from excludes algorithm ppo'),
+        ({'importance': 'decision', 'strategy': 'none'}, 'decision needs goals chosen'),
+        ({'noise_std': 0.0}, 'algorithm ppo needs noise_std above 0'),
+    ],
+)
+def test_what_ppo_would_not_look_at_is_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        configured(**changes)
+
+
+@pytest.mark.parametrize('importance', ['none', 'decision'])
+def test_a_run_of_ppo_goes_on_where_it_stopped(importance: str, tmp_path: Path) -> None:
+    config = configured(importance=importance, total_steps=800, **SMALL)
+    Trainer(config, tmp_path, Workers()).train()
+    config = configured(importance=importance, total_steps=1_600, **SMALL)
+    trainer = Trainer(config, tmp_path, Workers())
+    trainer.resume(tmp_path / 'training_state.safetensors')
+    assert trainer.counters.updates == 2 * 4
+    assert trainer.train() == '1,600 environment steps done'
+    assert trainer.counters.updates == 4 * 4 and (tmp_path / 'best.safetensors').is_file()
