@@ -23,8 +23,8 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
-from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES
-from policy_node.policies.policy import Policy
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES
+from policy_node.policies.policy import LoadedPolicy, Policy
 from policy_node.training.evaluation.episodes import (
     FIRST_SEED,
     EpisodeOutcomes,
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     loaded = load_chosen_policy(options)
     try:
-        simulation = _simulation(options, loaded.task)
+        simulation = _simulation(options, loaded)
     except ValueError as error:
         raise UsageError(str(error)) from None
     outcomes, code = _evaluate(options, simulation, loaded.policy)
@@ -126,13 +126,14 @@ def _evaluate(
             return finished[-1], EXIT_INTERRUPTED
 
 
-def _simulation(options: argparse.Namespace, task: str) -> Simulation:
+def _simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:
     return Simulation(
-        task,
+        loaded.task,
         num_envs=min(options.num_envs, options.episodes),
         num_threads=options.threads,
         reward_type=options.reward_type,
         success_rule=options.success_rule,
+        control_hz=loaded.control_hz or DEFAULT_CONTROL_HZ,
     )
 
 

@@ -22,7 +22,7 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
-from msgs_spec.tasks import task_spec
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
 from policy_node.training.policy_options import add_policy_options, load_chosen_policy
@@ -82,6 +82,8 @@ def _run(options: argparse.Namespace) -> int:
         raise UsageError('asserts are on; start it with python -O')
     loaded = load_chosen_policy(options)
     spec = task_spec(loaded.task)
+    if loaded.control_hz not in (None, DEFAULT_CONTROL_HZ):
+        raise UsageError(f'{loaded.description} was trained at {loaded.control_hz:g} Hz, not at 25')
     seeds = range(options.first_seed, options.first_seed + options.episodes)
     if spec.reference_id is None:
         raise UsageError(f'{spec.name} is no task of Gymnasium-Robotics')

@@ -21,6 +21,7 @@ from policy_node.training.evaluation.episodes import (
     summarize,
     wilson_interval,
 )
+from support.fresh_actor import fresh_actor
 
 torch.set_num_threads(1)
 
@@ -175,6 +176,15 @@ def test_command_line_writes_table_json_and_csv(tmp_path: Path, capsys: object) 
     returns = [float(row['episode_return']) for row in rows]
     assert report['mean_return'] == pytest.approx(np.mean(returns))
     assert 'gymnasium rule' in capsys.readouterr().out  # type: ignore[attr-defined]
+
+
+def test_an_actor_is_evaluated_at_the_rate_it_was_trained_at(tmp_path: Path) -> None:
+    fresh_actor(tmp_path / 'fast.safetensors', 'FetchReach', control_hz=250.0)
+    policy, json_file = str(tmp_path / 'fast.safetensors'), tmp_path / 'report.json'
+    arguments = ['--policy', policy, '--episodes', '1', '--threads', '1', '--json', str(json_file)]
+    assert main(arguments) == 0
+    # It was never trained: 0 at the goal and -1 elsewhere, 500 times instead of 50.
+    assert -500.0 <= json.loads(json_file.read_text())['mean_return'] < -50.0
 
 
 def test_former_names_work_and_say_what_they_are_called_now(

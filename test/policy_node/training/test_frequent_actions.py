@@ -239,6 +239,7 @@ def test_advantages_are_as_large_at_every_rate(control_hz: float) -> None:
         ({'advantage': True, 'discount': 'time', 'critics': 2}, 'excludes critics above 1'),
         ({'advantage': True, 'discount': 'time', 'n_step': 3}, 'advantage is of one tick'),
         ({'advantage': True, 'discount': 'time', 'goal_choice': 'bellman'}, 'goal_choice'),
+        ({'algorithm': 'ppo', 'noise_seconds': 0.04}, 'ppo needs .*noise_seconds=0.0'),
         ({'discount': 'second'}, "discount 'second'; allowed: tick, time"),
     ],
 )
