@@ -76,6 +76,9 @@ class TrainConfig:
     the object)."""
     ticks_after_drop: int = -1
     """Ticks after an object fell off the palm that are still learnt from; -1 is all."""
+    drop_is_lost: bool = False
+    """With `ticks_after_drop`, what follows the last of them counts -1 for ever. Without it nothing
+    teaches that a drop is final."""
 
     condition: str = 'none'
     """One input more of actor and critic: `none`, `threshold` (log-uniform, .5 ... 8 times that of
@@ -244,6 +247,8 @@ class TrainConfig:
             require_idle_gripper(self.task)
         if self.ticks_after_drop >= 0 and spec.goal is not GoalKind.POSE:
             raise ValueError(f'ticks_after_drop: {self.task} has no palm to drop an object from')
+        if self.drop_is_lost and (self.ticks_after_drop < 0 or self.reward_type != 'sparse'):
+            raise ValueError('drop_is_lost needs ticks_after_drop of 0 or more and sparse rewards')
         if self.reward_rotation != 1.0 and spec.rotation_threshold is None:
             raise ValueError(f'reward_rotation: goals of {self.task} have no rotation')
 

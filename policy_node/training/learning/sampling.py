@@ -32,6 +32,7 @@ class TransitionSampler:
         condition: What values are conditioned on; None is nothing.
         goal_choice: Which future goal is taken, `uniform` or a key of `GOAL_CHOICES`.
         reward_scale: What rewards are multiplied by.
+        drop_is_lost: Whether -1 for ever follows the last valid tick of an episode that is longer.
     """
 
     compute_reward: RewardFunction
@@ -40,6 +41,7 @@ class TransitionSampler:
     condition: Condition | None = None
     goal_choice: str = 'uniform'
     reward_scale: float = 1.0
+    drop_is_lost: bool = False
 
     def sample(
         self,
@@ -76,13 +78,24 @@ class TransitionSampler:
                 goal[rows] = self._choose(
                     starts.select(rows), names[rows], goal[rows], generator, judge
                 )
-        if self.steps is None and self.condition is None:
-            return self._single(starts, goal)
         steps = np.ones_like(row)
-        if self.steps is not None:
-            act = None if judge is None else judge.act
-            steps = self.steps.count(starts, goal, generator, act)
-        return self._several(starts, steps, goal, generator)
+        if self.steps is None and self.condition is None:
+            batch = self._single(starts, goal)
+        else:
+            if self.steps is not None:
+                act = None if judge is None else judge.act
+                steps = self.steps.count(starts, goal, generator, act)
+            batch = self._several(starts, steps, goal, generator)
+        return self._with_losses(starts, steps, batch) if self.drop_is_lost else batch
+
+    def _with_losses(
+        self, starts: Starts, steps: NDArray[np.int64], batch: Transitions
+    ) -> Transitions:
+        """Transitions into the last valid state: what follows is known and bootstraps nothing."""
+        lost = (starts.tick + steps == starts.last) & (starts.last < starts.episodes.ticks)
+        lowest = -self.reward_scale / (1.0 - self.gamma)
+        reward = batch.reward + lost * batch.discount * np.float32(lowest)
+        return replace(batch, reward=reward.astype(np.float32), discount=batch.discount * ~lost)
 
     def _single(self, starts: Starts, goal: Array) -> Transitions:
         """Transitions of one step, unconditioned: what nearly every run draws, and fast."""
@@ -178,6 +191,7 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
         condition,
         config.goal_choice,
         config.tick_share,
+        config.drop_is_lost,
     )
 
 

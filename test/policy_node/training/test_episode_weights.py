@@ -13,6 +13,7 @@ from policy_node.training.learning.episode_weights import (
     ticks_until_dropped,
 )
 from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.multi_step import StepCounter
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import EpisodeReplay, Episodes
 from policy_node.training.learning.sampling import TransitionSampler
@@ -103,6 +104,18 @@ def test_weights_decide_their_share_of_a_draw() -> None:
     assert drawn == pytest.approx([1 / 8, 1 / 4, 1 / 2, 1 / 8], abs=0.012)
 
 
+def pen_episodes(achieved: np.ndarray) -> Episodes:
+    """Episodes of these poses, seen as they are; the first value observed is the tick."""
+    count = len(achieved)
+    observation = np.zeros((count, PEN.episode_ticks + 1, PEN.observation_size))
+    observation[..., 0] = np.arange(PEN.episode_ticks + 1)
+    observation[..., -7:] = achieved
+    return Episodes(
+        *(values.astype(np.float32) for values in (observation, achieved, achieved[:, 0])),
+        np.zeros((count, PEN.episode_ticks, 20), np.float32),
+    )
+
+
 def test_a_batch_follows_the_configuration() -> None:
     """Energy alone draws the one episode that was lifted, and only until its drop."""
     changes = {'moved_share': 1.0, 'episode_weights': 'energy', 'ticks_after_drop': 1}
@@ -115,12 +128,7 @@ def test_a_batch_follows_the_configuration() -> None:
     achieved = poses(heights)
     achieved[..., 0] = np.arange(3)[:, None]
     achieved[..., 1] = np.arange(PEN.episode_ticks + 1)
-    observation = np.zeros((3, PEN.episode_ticks + 1, PEN.observation_size))
-    observation[..., -7:] = achieved
-    episodes = Episodes(
-        *(values.astype(np.float32) for values in (observation, achieved, achieved[:, 0])),
-        np.zeros((3, PEN.episode_ticks, 20), np.float32),
-    )
+    episodes = pen_episodes(achieved)
     reward = lambda achieved, desired: -np.ones(len(achieved))  # noqa: E731
     sampler = TransitionSampler(reward, config.gamma)
     experience = Experience(config, PEN, Workers(), sampler, np.random.default_rng(0))
@@ -131,3 +139,32 @@ def test_a_batch_follows_the_configuration() -> None:
     assert (batch.goal == batch.next_observation[:, -7:]).all()
     weights = episode_weights('moved', PEN, 25.0)(episodes)
     assert weights.tolist() == [1.0, 1.0, 1.0], 'metres along y count as moved'
+
+
+@pytest.mark.parametrize('n_step', [1, 3])
+def test_a_drop_that_is_lost_is_worth_minus_one_for_ever(n_step: int) -> None:
+    """Episode 0 drops its pen at tick 20, episode 1 never; rewards are -1 but at tick 5."""
+    changes = {'ticks_after_drop': 1, 'drop_is_lost': True, 'gamma': 0.9, 'n_step': n_step}
+    config = recipe_config('HandManipulatePenRotate', 'best', **changes)
+    heights = np.full((2, PEN.episode_ticks + 1), 0.2)
+    heights[0, 20:] = 0.0
+    episodes = pen_episodes(poses(heights))
+    steps = StepCounter(n_step) if n_step > 1 else None
+    reward = lambda achieved, desired: -np.ones(len(achieved))  # noqa: E731
+    sampler = TransitionSampler(reward, 0.9, steps, drop_is_lost=config.drop_is_lost)
+    valid = ticks_until_dropped(PEN, config.ticks_after_drop)(episodes)
+    row = np.repeat([0, 1], 4000)
+    generator = np.random.default_rng(0)
+    batch = sampler.sample(episodes, row, {'real': 1.0}, generator, valid)
+    ends = batch.discount == 0
+    assert ends[:4000].any() and not ends[4000:].any()
+    left = 21 - batch.observation[:, 0]
+    assert (ends == ((row == 0) & (left <= n_step))).all()
+    np.testing.assert_allclose(batch.reward[ends], -10.0, rtol=1e-5)
+    assert batch.reward[~ends].min() > -3.0
+
+
+@pytest.mark.parametrize('changes', [{}, {'ticks_after_drop': 2, 'reward_type': 'dense'}])
+def test_a_loss_needs_a_drop_and_sparse_rewards(changes: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match='drop_is_lost needs ticks_after_drop of 0 or more'):
+        recipe_config('HandManipulatePenRotate', 'best', drop_is_lost=True, **changes)
