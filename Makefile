@@ -14,10 +14,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.complete
 
 # The environment holds a ROS of its own: a sourced one, or one that a parent process loaded, must
-# not leak in.
-unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# not leak in. Bytecode that is not kept would be made again by some hundred processes.
+unexport PYTHONDONTWRITEBYTECODE PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo docs tables pictures test test-browser lint format twin bench-sim bench-view bench-camera bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
+.PHONY: help env demo docs tables pictures test test-nodes test-others test-browser lint format twin bench-sim bench-view bench-camera bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -59,8 +59,20 @@ else
 	@$(BIN)/python -m fetch_hand_sim demo --task $(TASK) --episodes $(EPISODES)
 endif
 
+# Those that start nodes mostly wait, and what they wait for is timed; so the others give way.
+NODE_TESTS := test/nodes test/fetch_hand_sim/replay_node \
+	test/fetch_hand_sim/episode_log/test_episode_endings.py \
+	test/fetch_hand_sim/episodes/test_episode_recorder.py
+
 test: lint
-	$(BIN)/python -m pytest
+	@echo 'the tests, in two halves at once; each half is shown when it is done'
+	@$(MAKE) --no-print-directory -j2 --output-sync=target test-nodes test-others
+
+test-nodes: env
+	$(BIN)/python -m pytest $(NODE_TESTS)
+
+test-others: env
+	nice -n 19 $(BIN)/python -m pytest $(addprefix --ignore=,$(NODE_TESTS))
 
 lint: env
 	$(BIN)/python -m ruff check $(PYTHON_FILES)

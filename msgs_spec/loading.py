@@ -48,7 +48,7 @@ def _command() -> str:
         return next(words, '').rpartition('.')[2]
     folder, name = os.path.split(program)
     # All lie in one folder; a script of somebody else's may well be called `view`.
-    is_ours = name in EXECUTABLES and os.path.exists(os.path.join(folder, _PACKAGES[0]))
+    is_ours = name in EXECUTABLES and os.path.isfile(os.path.join(folder, _PACKAGES[0]))
     return name if is_ours else ''
 
 

@@ -270,6 +270,8 @@ def test_a_missing_ray_is_named(
     assert "pip install 'fetch_hand_sim[cluster]'" in capsys.readouterr().err
 
 
+# A cluster of its own: by far the longest of what trains.
+@pytest.mark.release
 def test_ray_runs_the_jobs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ray = pytest.importorskip('ray')
     try:
