@@ -72,11 +72,15 @@ def parse_offered_qos(text: str) -> OfferedQos:
 
 
 def _require_plain(text: str) -> None:
-    """Refuses aliases and deep nesting before anything is built of them."""
+    """Refuses aliases, tags and deep nesting before anything is built of them."""
     depth = 0
     for event in yaml.parse(text, Loader=_Loader):
         if isinstance(event, yaml.AliasEvent):
             raise ValueError('quality of service with an alias')
+        tag = getattr(event, 'tag', None)
+        if tag is not None:
+            # Some make other errors than those of YAML where a value does not fit them.
+            raise ValueError(f'quality of service with the tag {tag}')
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > _DEEPEST:

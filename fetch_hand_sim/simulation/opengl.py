@@ -31,14 +31,26 @@ def prepare_opengl() -> str:
     """
     asked = os.environ.get('MUJOCO_GL', '').strip().lower()
     if asked:
+        # Again: MuJoCo has looked at it when it was imported, which may have been before.
+        _use(asked)
         return asked
     if sys.platform != 'linux' or os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'):
         return 'glfw'
     for backend, library in _LIBRARIES.items():
         if _is_installed(library):
-            gl_context.GLContext = import_module(f'mujoco.{backend}').GLContext
+            _use(backend)
             return backend
     raise RuntimeError(ADVICE)
+
+
+def _use(backend: str) -> None:
+    if backend not in (*_LIBRARIES, 'glfw'):
+        return
+    try:
+        gl_context.GLContext = import_module(f'mujoco.{backend}').GLContext
+    except Exception as error:
+        # PyOpenGL raises AttributeError, among others, where a library is missing.
+        raise RuntimeError(f'{ADVICE} ({error})') from error
 
 
 def _is_installed(library: str) -> bool:

@@ -169,7 +169,11 @@ QUALITIES = {
     'long': ('- {}\n' * 2000, 'bytes; allowed: 4096'),
     'no list': ('history: keep_last', 'no list of profiles'),
     'no yaml': ('- {', 'no YAML'),
-    'python': ('- !!python/object/apply:os.system [echo owned]', 'no YAML'),
+    'no YAML at its end': ('- {}\n- {', 'no YAML'),
+    'python': ('- !!python/object/apply:os.system [echo owned]', 'with the tag'),
+    'no truth': ('- a: !!bool x', 'with the tag'),
+    'no time': ('- a: !!timestamp x', 'with the tag'),
+    'no month': ('- a: 2001-99-99', 'month'),
 }
 
 

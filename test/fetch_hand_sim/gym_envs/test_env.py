@@ -227,6 +227,17 @@ def test_rendering_gives_a_picture_or_says_what_it_needs(
     assert result.stdout.strip() in (picture, reason[:80].strip()), result.stderr
 
 
+def test_opengl_can_be_chosen_after_mujoco_was_imported(monkeypatch):
+    monkeypatch.delenv('MUJOCO_GL', raising=False)
+    choice, code = 'import os\nos.environ["MUJOCO_GL"] = "egl"\n', 'import mujoco\n'
+    show = RENDER.format(task='FetchReach', arguments='render_mode="rgb_array"', spread=10)
+    before, after = (
+        subprocess.run([sys.executable, '-c', start + show], capture_output=True, text=True).stdout
+        for start in (choice + code, code + choice)
+    )
+    assert before == after != ''
+
+
 def test_without_opengl_rendering_says_what_it_needs(monkeypatch):
     monkeypatch.delenv('DISPLAY', raising=False)
     monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
