@@ -142,6 +142,7 @@ def test_published_numbers_name_tasks_arms_kind_and_source() -> None:
         assert number.success and number.source
 
 
+@pytest.mark.release
 def test_a_benchmark_runs_reports_and_is_not_run_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -170,6 +171,7 @@ def test_a_benchmark_runs_reports_and_is_not_run_again(
     assert [path.read_bytes() for path in logs] == before
 
 
+@pytest.mark.release
 def test_ctrl_c_keeps_what_there_is_and_the_same_command_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -80,6 +80,7 @@ def test_arms_are_apart_where_quartiles_do_not_touch() -> None:
     assert not are_apart(low, near, 'area') and not are_apart(low, high, 'final_success')
 
 
+@pytest.mark.release
 def test_a_study_runs_measures_and_gives_the_same_bits_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

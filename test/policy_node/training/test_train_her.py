@@ -56,7 +56,8 @@ def same(first: Path, second: Path) -> bool:
 
 def small_config(**changes: object) -> TrainConfig:
     options = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'simulation_threads': 1}
-    return recipe_config('FetchReach', 'best', torch_threads=1, **{**options, **changes})
+    options |= {'torch_threads': 1, 'evaluation_episodes': 8}
+    return recipe_config('FetchReach', 'best', **{**options, **changes})
 
 
 @pytest.mark.release
@@ -100,6 +101,7 @@ def test_fetch_reach_is_learnt_from_nothing(tmp_path: Path) -> None:
     assert shipped.read_bytes() == before
 
 
+@pytest.mark.release
 @pytest.mark.parametrize('overlap', ['true', 'false'])
 def test_the_same_seed_gives_the_same_weights_bit_for_bit(tmp_path: Path, overlap: str) -> None:
     for name, seed in (('a', '5'), ('b', '5'), ('c', '6')):
@@ -111,6 +113,7 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(tmp_path: Path, overla
     assert not same(tmp_path / 'a' / latest, tmp_path / 'c' / latest)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     'arm',
     [
