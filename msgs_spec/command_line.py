@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
@@ -108,6 +109,17 @@ def complain(name: str, text: object) -> None:
 def say(text: object) -> None:
     """Prints on stdout what may hold a name of somebody else's, escaped as `complain` does."""
     print(printable(str(text)), flush=True)
+
+
+def given_command(name: str, arguments: Sequence[str] | None) -> str:
+    """Returns the command line that was given, in one line, for the record.
+
+    Args:
+        name: The command.
+        arguments: Of its `main`; None is those of the process.
+    """
+    words = [name, *(sys.argv[1:] if arguments is None else arguments)]
+    return printable(shlex.join(words))
 
 
 def run_command(name: str, run: Callable[[], int]) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from msgs_spec.command_line import (
     CommandParser,
     UsageError,
     complain,
-    printable,
+    given_command,
     require_extra,
     run_command,
     say,
@@ -118,8 +117,7 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     options = parse_arguments(arguments)
-    words = [_NAME, *(sys.argv[1:] if arguments is None else arguments)]
-    command = printable(shlex.join(words))
+    command = given_command(_NAME, arguments)
     return run_command(_NAME, lambda: _run(options, command))
 
 

@@ -34,13 +34,19 @@ from msgs_spec.rotations import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
-from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec
+from msgs_spec.tasks import (
+    DEFAULT_CONTROL_HZ,
+    RewardType,
+    SuccessRule,
+    TaskSpec,
+    substeps_per_tick,
+)
 
 _OBJECT_JOINT = 'object:joint'
 _OBJECT_SITE = 'object:center'
 # An object whose centre is lower than this after settling has fallen off the palm, metres.
 PALM_HEIGHT = 0.04
-_SETTLING_TICKS, _SETTLING_SUBSTEPS = 10, 200
+_SETTLING_TICKS = 10
 _POSITION_SCATTER = 0.005
 # Box around the object in which `Full` goals lie, metres.
 TARGET_RANGE = np.array([(-0.04, 0.04), (-0.06, 0.02), (0.0, 0.06)])
@@ -104,9 +110,8 @@ class HandManipulateTask(HandTask):
         self._resting_command = resting_command(spec.robot)
         self.parallel_quaternions = euler_to_quaternion(_parallel_rotations())
         self.batch.state[:] = self.start_state
-        self._settling = _SETTLING_SUBSTEPS
-        if batch.timing == 'ticks':
-            self._settling = _SETTLING_TICKS * self.substeps
+        per_tick = substeps_per_tick(DEFAULT_CONTROL_HZ)
+        self._settling = _SETTLING_TICKS * (self.substeps if batch.timing == 'ticks' else per_tick)
 
     @property
     def asset(self) -> str:

@@ -20,8 +20,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import shlex
-import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -33,7 +31,7 @@ from msgs_spec.command_line import (
     CommandParser,
     UsageError,
     complain,
-    printable,
+    given_command,
     require_extra,
     run_command,
     whole_number,
@@ -175,8 +173,7 @@ def _report_folder(options: argparse.Namespace) -> Path:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     options = parse_arguments(arguments)
-    words = [_NAME, *(sys.argv[1:] if arguments is None else arguments)]
-    command = printable(shlex.join(words))
+    command = given_command(_NAME, arguments)
     return run_command(_NAME, lambda: _run(options, command))
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from policy_node.training.benchmark.final import read_final
 from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
+from policy_node.training.benchmark.research import ticks_of_40_ms
 from policy_node.training.benchmark.results import Curve, read_curve
 from policy_node.training.learning.run_folder import COMMAND_FILE
 from policy_node.training.learning.run_log import read_progress
@@ -29,15 +29,10 @@ def area_under(curve: Curve, total_steps: int) -> float:
     return float(np.trapezoid(success, steps) / total_steps)
 
 
-def ticks_of_40_ms(job: Job) -> float:
-    """Ticks of a run in 40 ms: steps are counted in these, so that rates can be compared."""
-    return job.config.control_hz / DEFAULT_CONTROL_HZ
-
-
 def curve_of(job: Job) -> Curve:
     """Evaluations of a run, steps in units of 40 ms."""
     curve = read_curve(job.folder / PROGRESS_FILE)
-    return replace(curve, env_steps=curve.env_steps / ticks_of_40_ms(job))
+    return replace(curve, env_steps=curve.env_steps / ticks_of_40_ms(job.config.control_hz))
 
 
 def measure_run(job: Job, curve: Curve) -> dict[str, Any]:
@@ -52,7 +47,7 @@ def measure_run(job: Job, curve: Curve) -> dict[str, Any]:
     """
     final, last = read_final(job.folder), read_progress(job.folder / PROGRESS_FILE)[-1]
     reached = curve.steps_to(GOOD_SUCCESS)
-    total = round(job.config.total_steps / ticks_of_40_ms(job))
+    total = round(job.config.total_steps / ticks_of_40_ms(job.config.control_hz))
     samples = last['updates'] * job.config.batch_size
     processor_seconds = last['processor_seconds']
     return {

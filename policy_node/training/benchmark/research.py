@@ -309,9 +309,14 @@ STUDIES: dict[str, Study] = {
 STEP_COUNTS = ('total_steps', 'evaluate_every')
 
 
+def ticks_of_40_ms(control_hz: float) -> float:
+    """Ticks in 40 ms: steps are counted in these, so that rates can be compared."""
+    return control_hz / DEFAULT_CONTROL_HZ
+
+
 def _at_rate(values: dict[str, Any]) -> dict[str, Any]:
     """Fields of a configuration with step counts at its rate."""
-    ticks = values.get('control_hz', DEFAULT_CONTROL_HZ) / DEFAULT_CONTROL_HZ
+    ticks = ticks_of_40_ms(values.get('control_hz', DEFAULT_CONTROL_HZ))
     return {
         name: round(value * ticks) if name in STEP_COUNTS else value
         for name, value in values.items()

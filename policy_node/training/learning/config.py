@@ -231,6 +231,11 @@ class TrainConfig:
         return float(self.gamma**self.tick_share)
 
     @property
+    def lowest_value(self) -> float:
+        """Value of a state from which every tick is rewarded with -1 for ever."""
+        return -self.tick_share / (1.0 - self.tick_gamma)
+
+    @property
     def noise_ticks(self) -> int:
         """For how many ticks noise holds."""
         return max(round(self.noise_seconds * self.control_hz), 1)
@@ -303,7 +308,7 @@ class TrainConfig:
                 f'importance {self.importance} needs goals chosen in hindsight',
             ),
             (
-                self.importance != 'none' and on_policy != (self.importance == 'decision'),
+                weighted and on_policy != (self.importance == 'decision'),
                 f'importance {self.importance} excludes algorithm {self.algorithm}',
             ),
             (on_policy and self.noise_std == 0.0, 'algorithm ppo needs noise_std above 0'),

@@ -108,9 +108,8 @@ class DDPG(ActorCritic):
         """
         config = self.config
         value = next_value if config.critics == 1 else AGGREGATES[config.aggregate](next_value)
-        lowest = -config.tick_share / (1.0 - config.tick_gamma)
         target: Tensor = reward + discount * value
-        return target.clamp(lowest, 0.0)
+        return target.clamp(config.lowest_value, 0.0)
 
     def _known(self, batch: Transitions) -> _Known:
         """What the networks see of a batch."""

@@ -32,7 +32,8 @@ class TransitionSampler:
         condition: What values are conditioned on; None is nothing.
         goal_choice: Which future goal is taken, `uniform` or a key of `GOAL_CHOICES`.
         reward_scale: What rewards are multiplied by.
-        drop_is_lost: Whether -1 for ever follows the last valid tick of an episode that is longer.
+        lost_value: What follows the last valid tick of an episode that is longer; None if that is
+            still to be learnt.
     """
 
     compute_reward: RewardFunction
@@ -41,7 +42,7 @@ class TransitionSampler:
     condition: Condition | None = None
     goal_choice: str = 'uniform'
     reward_scale: float = 1.0
-    drop_is_lost: bool = False
+    lost_value: float | None = None
 
     def sample(
         self,
@@ -86,16 +87,9 @@ class TransitionSampler:
                 act = None if judge is None else judge.act
                 steps = self.steps.count(starts, goal, generator, act)
             batch = self._several(starts, steps, goal, generator)
-        return self._with_losses(starts, steps, batch) if self.drop_is_lost else batch
-
-    def _with_losses(
-        self, starts: Starts, steps: NDArray[np.int64], batch: Transitions
-    ) -> Transitions:
-        """Transitions into the last valid state: what follows is known and bootstraps nothing."""
-        lost = (starts.tick + steps == starts.last) & (starts.last < starts.episodes.ticks)
-        lowest = -self.reward_scale / (1.0 - self.gamma)
-        reward = batch.reward + lost * batch.discount * np.float32(lowest)
-        return replace(batch, reward=reward.astype(np.float32), discount=batch.discount * ~lost)
+        if self.lost_value is None:
+            return batch
+        return _with_losses(starts, steps, batch, self.lost_value)
 
     def _single(self, starts: Starts, goal: Array) -> Transitions:
         """Transitions of one step, unconditioned: what nearly every run draws, and fast."""
@@ -191,8 +185,17 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
         condition,
         config.goal_choice,
         config.tick_share,
-        config.drop_is_lost,
+        config.lowest_value if config.drop_is_lost else None,
     )
+
+
+def _with_losses(
+    starts: Starts, steps: NDArray[np.int64], batch: Transitions, value: float
+) -> Transitions:
+    """Transitions into the last valid state: what follows is known and bootstraps nothing."""
+    lost = (starts.tick + steps == starts.last) & (starts.last < starts.episodes.ticks)
+    reward = batch.reward + lost * batch.discount * np.float32(value)
+    return replace(batch, reward=reward.astype(np.float32), discount=batch.discount * ~lost)
 
 
 def scale_thresholds(metric: GoalMetric, distance: float, rotation: float) -> GoalMetric:

@@ -151,7 +151,7 @@ def test_a_drop_that_is_lost_is_worth_minus_one_for_ever(n_step: int) -> None:
     episodes = pen_episodes(poses(heights))
     steps = StepCounter(n_step) if n_step > 1 else None
     reward = lambda achieved, desired: -np.ones(len(achieved))  # noqa: E731
-    sampler = TransitionSampler(reward, 0.9, steps, drop_is_lost=config.drop_is_lost)
+    sampler = TransitionSampler(reward, 0.9, steps, lost_value=config.lowest_value)
     valid = ticks_until_dropped(PEN, config.ticks_after_drop)(episodes)
     row = np.repeat([0, 1], 4000)
     generator = np.random.default_rng(0)

@@ -23,6 +23,7 @@ from policy_node.training.learning.rollouts import (
 )
 from policy_node.training.learning.trainer import Trainer
 from policy_node.training.learning.transitions import Transitions
+from support.refusals import assert_refused
 
 torch.set_num_threads(1)
 
@@ -194,8 +195,7 @@ def test_ppo_refuses_transitions_that_nobody_rolled_out() -> None:
     ],
 )
 def test_what_ppo_would_not_look_at_is_refused(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        configured(**changes)
+    assert_refused(message, **{**ON_POLICY, **changes})
 
 
 @pytest.mark.parametrize('importance', ['none', 'decision'])
