@@ -74,7 +74,8 @@ setup(
         ]
     ),
     package_data={
-        **{name: ['py.typed'] for name in ('msgs_spec', 'fetch_hand_sim')},
+        'msgs_spec': ['py.typed', '*.xml'],
+        'fetch_hand_sim': ['py.typed'],
         'policy_node': ['py.typed', 'actors/*'],
     },
     # Critics, to train on from a shipped actor: in the repository only.

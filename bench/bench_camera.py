@@ -25,12 +25,12 @@ from bench_view import start  # noqa: E402
 
 from msgs_spec.ros import (  # noqa: E402
     EventLoop,
-    keep_discovery_local,
     rclpy_profile,
     ros_message_class,
 )
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
+from msgs_spec.transport import keep_discovery_local  # noqa: E402
 from msgs_spec.view_topics import view_topic  # noqa: E402
 
 _TICKS_PER_SECOND = os.sysconf('SC_CLK_TCK')

@@ -35,7 +35,6 @@ from msgs_spec.codecs import decode_status  # noqa: E402
 from msgs_spec.observations import ObservationAssembler  # noqa: E402
 from msgs_spec.ros import (  # noqa: E402
     EventLoop,
-    keep_discovery_local,
     rclpy_profile,
     ros_message_class,
 )
@@ -47,6 +46,7 @@ from msgs_spec.topics import (  # noqa: E402
     topic,
     topics,
 )
+from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402
 
 SUBSTEPS = 20
 TIMEOUT = 60.0
@@ -208,6 +208,7 @@ def main() -> int:
     options = parser.parse_args()
     spec = task_spec(options.task)
     keep_discovery_local()
+    leave_out_shared_memory()
     if options.echo:
         echo(spec)
     rclpy.init()

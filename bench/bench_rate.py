@@ -27,12 +27,12 @@ import rclpy  # noqa: E402
 from msgs_spec.codecs import decode_status  # noqa: E402
 from msgs_spec.ros import (  # noqa: E402
     EventLoop,
-    keep_discovery_local,
     rclpy_profile,
     ros_message_class,
 )
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic  # noqa: E402
+from msgs_spec.transport import keep_discovery_local  # noqa: E402
 
 
 class Watcher:

@@ -25,9 +25,9 @@ from bench_rate import Watcher, report  # noqa: E402
 from websockets.exceptions import ConnectionClosed  # noqa: E402
 from websockets.sync.client import ClientConnection, connect  # noqa: E402
 
-from msgs_spec.ros import keep_discovery_local  # noqa: E402
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
+from msgs_spec.transport import keep_discovery_local  # noqa: E402
 
 VISITORS = 3
 # Seconds after which a process that was told to end is killed.
@@ -50,13 +50,13 @@ def start(stack: ExitStack, *words: str, stdout: int | None = None) -> subproces
     return process
 
 
-def open_view(stack: ExitStack) -> str:
-    """Starts a viewer; returns the address of its page."""
+def open_view(stack: ExitStack) -> tuple[subprocess.Popen[str], str]:
+    """Starts a viewer; returns its process and the address of its page."""
     process = start(stack, 'fetch_hand_sim.view', '--no-browser', stdout=subprocess.PIPE)
     assert process.stdout is not None
     for line in process.stdout:
         if found := re.search(r'http://([\w.:]+)/', line):
-            return found[1]
+            return process, found[1]
     raise SystemExit('bench_view: the viewer did not start')
 
 
@@ -104,11 +104,11 @@ def measure(
 
 
 def compare(watcher: Watcher, options: argparse.Namespace, factor: float) -> None:
-    """Measures without viewers, with one, with its visitors, and without again."""
+    """Measures without viewers, with one, its visitors, while it is stopped, and without again."""
     seconds = options.seconds
     without = measure(watcher, 'no viewer', seconds, factor)
     with ExitStack() as stack:
-        address = open_view(stack)
+        view, address = open_view(stack)
         measure(watcher, 'a viewer that nobody visits', seconds, factor, without)
         for number in range(VISITORS):
             visit(stack, address, number)
@@ -120,6 +120,9 @@ def compare(watcher: Watcher, options: argparse.Namespace, factor: float) -> Non
             stack.callback(browser.close)
             browser.open(f'http://{address}/')
             measure(watcher, 'and a Chromium that draws', seconds, factor, without)
+        view.send_signal(signal.SIGSTOP)
+        measure(watcher, 'a viewer that is stopped', seconds, factor, without)
+        view.send_signal(signal.SIGCONT)
     # How much the machine itself has changed meanwhile.
     measure(watcher, 'no viewer any more', seconds, factor, without)
 
@@ -137,11 +140,12 @@ def main() -> None:
         print(f'{options.task}, {mode}, {os.cpu_count()} CPUs', flush=True)
         with ExitStack() as stack:
             watcher = Watcher(topic(task_spec(options.task), 'joint_states'))
-            words = ['--ros-args', '-p', f'task:={options.task}', '-p', f'mode:={mode}']
+            # A line for every episode would bury the table.
+            quiet = ['--ros-args', '--log-level', 'warn']
+            words = [*quiet, '-p', f'task:={options.task}', '-p', f'mode:={mode}']
             start(stack, 'fetch_hand_sim.sim_node', *words)
             if mode == 'lockstep':
-                policy = ['--ros-args', '-p', 'policy:=resting']
-                start(stack, 'policy_node.node', *policy)
+                start(stack, 'policy_node.node', *quiet, '-p', 'policy:=resting')
             watcher.wait_for_ticks()
             compare(watcher, options, factor)
         rclpy.shutdown()

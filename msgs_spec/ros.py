@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -14,6 +13,7 @@ from msgs_spec.command_line import EXIT_SUCCESS, CommandError, complain, require
 from msgs_spec.command_line import UsageError as UsageError
 from msgs_spec.parameters import ParameterSpec, unknown_parameter, usage, validate
 from msgs_spec.topics import QosSpec
+from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory
 
 if TYPE_CHECKING:
     from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -240,6 +240,7 @@ def node_main(
     summary: str,
     load: Callable[[], Callable[[], RunnableNode]],
     args: list[str] | None = None,
+    shared_memory: bool = False,
 ) -> int:
     """Runs a node of `NODES` as a process, or prints its help; returns the exit code of `run_node`.
 
@@ -248,12 +249,13 @@ def node_main(
         summary: What it is, in a line.
         load: Imports the class of the node, which may take long.
         args: Command line; None for that of the process.
+        shared_memory: As in `run_node`.
     """
     given = sys.argv[1:] if args is None else args
     if '-h' in given or '--help' in given:
         print(usage(name, summary))
         return EXIT_SUCCESS
-    return run_node(name, lambda stop: _run(load, stop), args)
+    return run_node(name, lambda stop: _run(load, stop), args, shared_memory)
 
 
 def _run(load: Callable[[], Callable[[], RunnableNode]], stop: StopSignals) -> None:
@@ -267,13 +269,20 @@ def _run(load: Callable[[], Callable[[], RunnableNode]], stop: StopSignals) -> N
         node.destroy_node()
 
 
-def run_node(name: str, run: Callable[[StopSignals], None], args: list[str] | None = None) -> int:
+def run_node(
+    name: str,
+    run: Callable[[StopSignals], None],
+    args: list[str] | None = None,
+    shared_memory: bool = False,
+) -> int:
     """Initialises rclpy, runs a node and returns the process's exit code.
 
     Args:
         name: Name of the executable, for error lines.
         run: Runs until it is done or the signals say stop.
         args: Command line; None for that of the process.
+        shared_memory: Whether readers that die may hold the node up, which `transport.py` explains:
+            for nodes that send pictures and keep nobody waiting.
 
     Returns:
         0 for a normal end, also by signal; 2 for bad usage; 1 for a failure. Errors of both kinds
@@ -282,6 +291,8 @@ def run_node(name: str, run: Callable[[StopSignals], None], args: list[str] | No
     # First of all: what follows takes long enough for people to change their mind.
     stop = StopSignals()
     keep_discovery_local()
+    if not shared_memory:
+        leave_out_shared_memory()
     try:
         require_extra('ros')
     except UsageError as error:
@@ -303,11 +314,6 @@ def run_node(name: str, run: Callable[[StopSignals], None], args: list[str] | No
     finally:
         rclpy.try_shutdown()
     return EXIT_SUCCESS
-
-
-def keep_discovery_local() -> None:
-    """Keeps robots on this machine unless the user chose a discovery range."""
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 
 def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any) -> None:

@@ -37,10 +37,11 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
-from msgs_spec.ros import StopSignals, keep_discovery_local, rclpy_profile, ros_message_class
+from msgs_spec.ros import StopSignals, rclpy_profile, ros_message_class
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
+from msgs_spec.transport import keep_discovery_local
 
 _NAME = 'demo'
 _START_TIMEOUT = 60.0

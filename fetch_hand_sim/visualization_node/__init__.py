@@ -22,4 +22,4 @@ def main(args: list[str] | None = None) -> int:
 
         return VisualizationNode
 
-    return node_main(NODE_NAME, SUMMARY, load, args)
+    return node_main(NODE_NAME, SUMMARY, load, args, shared_memory=True)

@@ -163,6 +163,19 @@ def test_who_may_only_watch_changes_nothing(start_process: Start) -> None:
         assert not connection.node.get_publishers_info_by_topic('/set_goal')
 
 
+def test_the_robot_shares_no_memory_with_who_listens(start_process: Start) -> None:
+    """Through shared memory a listener that is stopped or killed holds the robot up."""
+    robot = start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    policy = start_process(*POLICY_NODE)
+    with client(REACH) as connection:
+        connection.subscribe('achieved_goal', 'applied_command')
+        connection.spin_until(lambda: connection.received['applied_command'], 'command')
+        for process in (robot, policy):
+            assert '/dev/shm/fastrtps' not in Path(f'/proc/{process.pid}/maps').read_text()
+        # The client has some, under the name that is looked for.
+        assert '/dev/shm/fastrtps' in Path('/proc/self/maps').read_text()
+
+
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP])
 def test_a_viewer_that_dies_or_hangs_is_not_noticed(start_process: Start, number: int) -> None:
     start_process(*SIM_NODE, *ros_args(task='FetchReach'))

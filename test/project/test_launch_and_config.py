@@ -1,8 +1,7 @@
-"""Launch file, parameter files and nodes agree; discovery stays on this machine unless asked."""
+"""Launch file, parameter files and nodes agree."""
 
 from __future__ import annotations
 
-import os
 import re
 import xml.etree.ElementTree as ElementTree
 
@@ -11,7 +10,7 @@ import rclpy
 import yaml
 
 from msgs_spec.parameters import POLICY_NODE, SIM_NODE, validate
-from msgs_spec.ros import declare_parameters, keep_discovery_local
+from msgs_spec.ros import declare_parameters
 from support import ROOT
 
 SPECS = {'sim_node': SIM_NODE, 'policy_node': POLICY_NODE}
@@ -171,12 +170,3 @@ def test_a_page_that_starts_a_robot_and_then_who_commands_it_lets_the_robot_wait
     )
     assert robots
     assert all('-p wait_for_commands:=true' in arguments for arguments in robots)
-
-
-@pytest.mark.parametrize(('before', 'after'), [(None, 'LOCALHOST'), ('SUBNET', 'SUBNET')])
-def test_discovery_stays_on_this_machine_unless_asked(monkeypatch, before, after):
-    monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
-    if before:
-        monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', before)
-    keep_discovery_local()
-    assert os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] == after
