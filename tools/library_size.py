@@ -41,7 +41,7 @@ ABILITIES = {
     ),
     'more ways to learn, and studies of them': (
         r'.*/benchmark/(final|measures|research\w*)\.py|.*/learning/(conditions|critics|density_ratio'
-        r'|devices|gamble|goal_choice|multi_step|sampling)\.py'
+        r'|devices|gamble|goal_choice|hierarchy|hindsight_actions|imagined|multi_step|sampling|subgoals)\.py'
     ),
     'studies in parallel, tables of actors': r'.*/(studies|workers|actors_table)\.py',
     'contract and wire': r'msgs_spec/',

@@ -157,6 +157,8 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
         raise ValueError(
             'longest_hold above 1 excludes --from-episodes: their actions have no length'
         )
+    if config.subgoal_every:
+        raise ValueError('subgoal_every excludes --from-episodes: nobody gave them subgoals')
     from policy_node.training.learning.logged_episodes import read_experience
 
     task = task_spec(config.task, control_hz=config.control_hz)

@@ -78,6 +78,7 @@ _PUSH = {'total_steps': 600_000, **_EVALUATED}
 _PICK = {'total_steps': 800_000, **_EVALUATED}
 _SLIDE = {'total_steps': 2_000_000, **_EVALUATED, 'evaluate_every': 64_000}
 _ROTATE = {'total_steps': 1_000_000, **_EVALUATED, 'evaluate_every': 64_000}
+_ROTATE_XYZ = {**_ROTATE, 'total_steps': 2_000_000}
 # Sparse, with settings that the dense recipe of the task does not have.
 _SPARSE_HAND_REACH = {
     'total_steps': 2_000_000,
@@ -229,6 +230,21 @@ STUDIES: dict[str, Study] = {
                 Arm('random', 'achieved goals of any episode', {'goals': 'random=.8'}),
                 Arm('mixed', 'half future, half actual', {'goals': 'future=.4,actual=.4'}),
                 Arm('none', 'no hindsight', {'strategy': 'none'}),
+            ),
+        ),
+        Study(
+            'hierarchy',
+            3,
+            'Do subgoals get the actor to its goals in fewer steps?',
+            {
+                'FetchPickAndPlace': _PICK,
+                'HandManipulateBlockRotateXYZ': _ROTATE_XYZ,
+                'FetchReach': _REACH,
+            },
+            (
+                Arm('flat', 'no subgoals', {'subgoal_every': 0}),
+                Arm('every10', 'a subgoal every 10 ticks', {'subgoal_every': 10}),
+                Arm('prior', 'imagined subgoals, weight .3', {'subgoal_prior': 0.3}),
             ),
         ),
         Study(

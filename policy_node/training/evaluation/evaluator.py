@@ -9,6 +9,7 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, wilson_interval
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.subgoals import GuidedPolicy, Proposer
 
 # Seeds of evaluation episodes start here; those of training runs stay far below.
 EVALUATION_SEED = 1_000_000_000
@@ -18,11 +19,15 @@ class Evaluator:
     """Evaluates on the same episodes each time, in simulations of its own.
 
     Training episodes therefore do not depend on whether there was an evaluation between them.
+
+    Attributes:
+        proposer: Who proposes subgoals, where somebody does.
     """
 
     def __init__(self, simulation: Simulation, config: TrainConfig) -> None:
         self._simulation = simulation
         self._config = config
+        self.proposer: Proposer | None = None
 
     def evaluate(self, actor: Actor, best_success: float) -> EpisodeOutcomes:
         """Runs the episodes, fewer once their success cannot reach `best_success` any more.
@@ -37,6 +42,15 @@ class Evaluator:
 
         episodes = self._config.evaluation_episodes
         return evaluate(self._simulation, actor, episodes, EVALUATION_SEED, hopeless)
+
+    def evaluate_guided(self, actor: Actor) -> EpisodeOutcomes | None:
+        """Runs the episodes with actor and high level as one; None without a high level."""
+        if self.proposer is None:
+            return None
+        config, simulation = self._config, self._simulation
+        ticks = simulation.spec.episode_ticks
+        both = GuidedPolicy(actor, self.proposer, config.subgoal_every, ticks)
+        return evaluate(simulation, both, config.evaluation_episodes, EVALUATION_SEED)
 
     def is_complete(self, outcomes: EpisodeOutcomes) -> bool:
         """Whether an evaluation ran all its episodes; only then it may decide what is best."""

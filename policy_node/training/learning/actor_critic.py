@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from policy_node.policies.actor import MLP, Actor
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.subgoals import Proposer
 
 
 class ActorCritic:
@@ -78,6 +79,11 @@ class ActorCritic:
     def acting_actor(self) -> Actor:
         """A copy, on the CPU, of the actor that collects."""
         return self.plain(self.actor.network)
+
+    def proposer(self, averaged: bool = False) -> Proposer | None:
+        """Who gives the actor subgoals while it collects: nobody."""
+        del averaged
+        return None
 
     def evaluation_actor(self) -> Actor:
         """A copy, on the CPU, of the actor to evaluate: averaged weights, current normalisers."""

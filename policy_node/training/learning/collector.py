@@ -12,6 +12,7 @@ from policy_node.policies.policy import Policy
 from policy_node.training.learning.exploration import ActionNoise, ParameterNoise, actor_of
 from policy_node.training.learning.frame_skip import Holder
 from policy_node.training.learning.replay import Episodes
+from policy_node.training.learning.subgoals import Guide, Proposer, subgoal_columns
 
 
 class Collector:
@@ -30,9 +31,11 @@ class Collector:
         parameter_noise: Whether weights are moved, and by them actions by `noise_std`, instead of
             actions themselves.
         longest_hold: Most ticks for which actions may hold; above 1 they say how long.
+        subgoal_every: Ticks for which a subgoal holds, which then follows the actions; 0 has none.
 
     Attributes:
         exploration: Share of `noise_std` and `random_epsilon` that is in force.
+        proposer: Who proposes subgoals; None lets the goal itself be pursued.
     """
 
     def __init__(
@@ -46,9 +49,11 @@ class Collector:
         noise_ticks: int = 1,
         parameter_noise: bool = False,
         longest_hold: int = 1,
+        subgoal_every: int = 0,
     ) -> None:
         self.simulation = simulation
         self.exploration = 1.0
+        self.proposer: Proposer | None = None
         generator = np.random.default_rng(seeds[0])
         self._holder = Holder(longest_hold) if longest_hold > 1 else None
         self._shape = (simulation.num_envs, simulation.spec.robot.action_size + (longest_hold > 1))
@@ -57,6 +62,10 @@ class Collector:
             generator, self._shape, std, random_epsilon, noise_spread, noise_ticks
         )
         self._parameters = ParameterNoise(generator, noise_std) if parameter_noise else None
+        self._guide: Guide | None = None
+        if subgoal_every:
+            self._guide = Guide(subgoal_every, generator, noise_std, random_epsilon)
+        self._columns = self._shape[1] + subgoal_columns(subgoal_every, simulation.spec.goal.size)
         self._seeds: list[int] | None = seeds
 
     def collect(self, policy: Policy, random: bool = False) -> tuple[Episodes, float]:
@@ -79,7 +88,7 @@ class Collector:
             observation=np.empty((count, ticks + 1, spec.observation_size), np.float32),
             achieved_goal=np.empty((count, ticks + 1, spec.goal.size), np.float32),
             desired_goal=observation['desired_goal'].astype(np.float32),
-            action=np.empty((count, ticks, self._shape[1]), np.float32),
+            action=np.empty((count, ticks, self._columns), np.float32),
         )
         whole = np.ones(count, dtype=np.bool_)
         success = np.zeros(count, dtype=np.bool_)
@@ -103,6 +112,8 @@ class Collector:
     def _acting(self, policy: Policy) -> Policy:
         """What acts through the episodes: the policy, or copies of it with other weights."""
         self._noise.share = self.exploration
+        if self._guide is not None:
+            self._guide.share = self.exploration
         if self._parameters is None:
             return policy
         self._parameters.share = self.exploration
@@ -120,6 +131,12 @@ class Collector:
     def _explore(
         self, policy: Policy, observation: Mapping[str, ArrayLike], random: bool, tick: int
     ) -> NDArray[np.float32]:
+        guide = self._guide
+        if guide is not None:
+            observation = guide.lead(observation, None if random else self.proposer, tick)
         if random:
-            return self._noise.random(tick)
-        return self._noise.around(policy.predict(observation, deterministic=True)[0], tick)
+            own = noisy = self._noise.random(tick)
+        else:
+            own = policy.predict(observation, deterministic=True)[0]
+            noisy = self._noise.around(own, tick)
+        return noisy if guide is None else guide.mark(noisy, own)

@@ -176,6 +176,12 @@ class TrainConfig:
     longest_hold: int = 1
     """Most ticks for which the actor lets an action hold while it collects; above 1 it learns how
     long. The actor that is evaluated and saved decides at every tick."""
+    subgoal_every: int = 0
+    """Ticks for which a subgoal holds that a second, high level proposes to the actor while it
+    collects; 0 has none. The actor that is evaluated and saved is given the goal itself."""
+    subgoal_prior: float = 0.0
+    """Weight of the distance between the actor's actions and those for an imagined subgoal, halfway
+    to the goal by value, in the actor loss; 0 imagines none."""
     final_exploration: float = 1.0
     """Share of `random_epsilon` and `noise_std` left at `total_steps`; both fall linearly in
     the last third of the run. 1 keeps them constant."""
@@ -216,9 +222,7 @@ class TrainConfig:
     @property
     def has_plain_networks(self) -> bool:
         """Whether other runs have networks of the same kind, so that they can start from these."""
-        plain = ('ddpg', 1, 'none', 'none', 1, False)
-        kind = self.algorithm, self.critics, self.norm, self.condition
-        return (*kind, self.longest_hold, self.advantage) == plain
+        return all(getattr(self, name) == value for name, value in PLAIN_NETWORKS.items())
 
     @property
     def tick_share(self) -> float:
@@ -234,6 +238,11 @@ class TrainConfig:
     def lowest_value(self) -> float:
         """Value of a state from which every tick is rewarded with -1 for ever."""
         return -self.tick_share / (1.0 - self.tick_gamma)
+
+    @property
+    def _episode_ticks(self) -> int:
+        """Steps of an episode."""
+        return task_spec(self.task, control_hz=self.control_hz).episode_ticks
 
     @property
     def noise_ticks(self) -> int:
@@ -266,6 +275,7 @@ class TrainConfig:
         others = self._set_for_ddpg() if on_policy else []
         return [
             *self._contradictions_of_rates(),
+            *self._contradictions_of_subgoals(),
             (
                 self.correction != 'none' and self.n_step == 1,
                 f'correction {self.correction} needs n_step above 1',
@@ -315,8 +325,8 @@ class TrainConfig:
             (bool(others), f'algorithm ppo needs {", ".join(others)}'),
             (
                 bool(self.init_from) and not self.has_plain_networks,
-                'init_from excludes algorithm ppo, condition, norm, advantage, critics and '
-                'longest_hold above 1',
+                'init_from excludes algorithm ppo, condition, norm, advantage, subgoal_every, '
+                'critics and longest_hold above 1',
             ),
         ]
 
@@ -373,6 +383,53 @@ class TrainConfig:
             ),
         ]
 
+    def _contradictions_of_subgoals(self) -> list[tuple[bool, str]]:
+        """The same of a high level."""
+        guided, every = self.subgoal_every > 0, self.subgoal_every
+        conditioned, chosen = self.condition != 'none', self.goal_choice != 'uniform'
+        return [
+            (
+                guided and every > self._episode_ticks,
+                f'subgoal_every {every} is longer than an episode',
+            ),
+            (
+                guided and (self.n_step > 1 or self.longest_hold > 1 or self.parameter_noise),
+                'subgoal_every excludes n_step and longest_hold above 1 and parameter_noise',
+            ),
+            (
+                guided and (conditioned or chosen or self.importance != 'none' or self.advantage),
+                'subgoal_every excludes condition, goal_choice, importance and advantage',
+            ),
+            (
+                guided and self.ticks_after_drop >= 0,
+                'subgoal_every excludes ticks_after_drop',
+            ),
+            (
+                guided and self.reward_type != 'sparse',
+                'subgoal_every needs reward_type sparse: a subgoal is reached or missed',
+            ),
+            (
+                self.subgoal_prior > 0.0 and (guided or conditioned or self.advantage),
+                'subgoal_prior excludes subgoal_every, condition and advantage',
+            ),
+            (
+                self.subgoal_prior > 0.0 and self.longest_hold > 1,
+                'subgoal_prior excludes longest_hold above 1',
+            ),
+        ]
+
+
+PLAIN_NETWORKS: dict[str, Any] = {
+    'algorithm': 'ddpg',
+    'critics': 1,
+    'norm': 'none',
+    'condition': 'none',
+    'longest_hold': 1,
+    'advantage': False,
+    'subgoal_every': 0,
+}
+"""Fields that decide what kind of networks there are, as most runs have them."""
+
 
 def require_idle_gripper(task: str) -> None:
     """Refuses a task that has no action to spare for a gamble.
@@ -401,6 +458,8 @@ ON_POLICY: dict[str, Any] = {
     'noise_seconds': 0.0,
     'parameter_noise': False,
     'longest_hold': 1,
+    'subgoal_every': 0,
+    'subgoal_prior': 0.0,
     'critics': 1,
     'norm': 'none',
     'target': 'polyak',
@@ -442,6 +501,8 @@ RANGES = (
     ('noise_spread', 0, 1),
     ('noise_seconds', 0, 10),
     ('longest_hold', 1, 1000),
+    ('subgoal_every', 0, 1000),
+    ('subgoal_prior', 0, _INFINITY),
     ('critic_first', 0, _INFINITY),
     ('total_steps', 1, _INFINITY),
     ('time_limit', 0, _INFINITY),

@@ -30,7 +30,7 @@ _ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'disco
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
+class Known:
     """A batch as tensors, and what the networks see of both its states."""
 
     observation: Tensor
@@ -89,8 +89,7 @@ class DDPG(ActorCritic):
         known = self._known(batch)
         weight = None if self._ratio is None else self._weights(self._ratio, known)
         critic_loss = self._update_critic(known, weight)
-        features = known.features
-        actor_loss, value = self._update_actor(features)
+        actor_loss, value = self._update_actor(known)
         self.updates += 1
         if self.updates % self.config.target_update_interval == 0:
             self._move_targets()
@@ -111,7 +110,7 @@ class DDPG(ActorCritic):
         target: Tensor = reward + discount * value
         return target.clamp(config.lowest_value, 0.0)
 
-    def _known(self, batch: Transitions) -> _Known:
+    def _known(self, batch: Transitions) -> Known:
         """What the networks see of a batch."""
         observation, next_observation, goal, action, reward, discount = (
             self.tensor(getattr(batch, name)) for name in _ALWAYS
@@ -123,9 +122,9 @@ class DDPG(ActorCritic):
             next_condition = self.tensor(batch.next_condition)
             next_features = torch.cat([next_features, next_condition], dim=-1)
         seen = observation, next_observation, goal, features, next_features
-        return _Known(*seen, action, reward, discount)
+        return Known(*seen, action, reward, discount)
 
-    def _update_critic(self, known: _Known, weight: Tensor | None) -> Tensor:
+    def _update_critic(self, known: Known, weight: Tensor | None) -> Tensor:
         with self._precision():
             error = self._errors(known)
             square = error.square() if weight is None else weight * error.square()
@@ -133,7 +132,7 @@ class DDPG(ActorCritic):
         self.step(self.critic_optimizer, loss, self.critic_parameters)
         return loss
 
-    def _errors(self, known: _Known) -> Tensor:
+    def _errors(self, known: Known) -> Tensor:
         """Values less targets: (batch,), of several critics (critics, batch)."""
         if self.config.norm == 'batch':
             return self._joint_errors(known)
@@ -141,13 +140,13 @@ class DDPG(ActorCritic):
             return self._advantage_errors(known, self.critic)
         return self._separate_errors(known)
 
-    def _separate_errors(self, known: _Known) -> Tensor:
+    def _separate_errors(self, known: Known) -> Tensor:
         with torch.no_grad():
             target = self.targets(known.reward, known.discount, known.next_features)
         error: Tensor = self.critic(known.features, known.action) - target
         return error
 
-    def _advantage_errors(self, known: _Known, critic: AdvantageCritic) -> Tensor:
+    def _advantage_errors(self, known: Known, critic: AdvantageCritic) -> Tensor:
         """The same of values of states and advantages of actions over the actor's."""
         slow = self.target_critic
         assert isinstance(slow, AdvantageCritic)
@@ -158,7 +157,7 @@ class DDPG(ActorCritic):
         error: Tensor = critic(known.features, known.action, own) - target
         return error
 
-    def _joint_errors(self, known: _Known) -> Tensor:
+    def _joint_errors(self, known: Known) -> Tensor:
         """The same from one pass over states and next states, as CrossQ (arXiv 1902.05605).
 
         A batch normalisation would otherwise see next actions that its statistics do not know.
@@ -175,7 +174,7 @@ class DDPG(ActorCritic):
         error: Tensor = value - self._bootstrap(known.reward, known.discount, next_value.detach())
         return error
 
-    def _weights(self, ratio: DensityRatio, known: _Known) -> Tensor:
+    def _weights(self, ratio: DensityRatio, known: Known) -> Tensor:
         """Importance weights (batch,) of transitions with goals chosen in hindsight."""
         observation, next_observation = known.observation, known.next_observation
         achieved = slice(self._achieved_start, self._achieved_start + known.goal.shape[-1])
@@ -192,19 +191,25 @@ class DDPG(ActorCritic):
         shuffled = replace(chosen, features=features, next_features=next_features, goal=goal)
         return ratio.update(chosen, shuffled, known.action)
 
-    def _update_actor(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def _update_actor(self, known: Known) -> tuple[Tensor, Tensor]:
+        features = known.features
         with self._precision():
             action = self.actor(features)
             if isinstance(self.critic, AdvantageCritic):
                 value = self.critic.advantage(features, action).mean()
             else:
                 value = self.critic(features, action).mean()
-            # How long an action holds costs nothing.
-            moved = action[..., : self._action_size].float()
-            loss = -value + self.config.action_l2 * moved.square().mean()
+            loss = -value + self._penalty(known, action)
         if self.updates >= self.critic_first:
             self.step(self.actor_optimizer, loss, self.actor_parameters)
         return loss, value
+
+    def _penalty(self, known: Known, action: Tensor) -> Tensor:
+        """What the actor's actions cost beside their value."""
+        del known
+        # How long an action holds costs nothing.
+        moved = action[..., : self._action_size].float()
+        return self.config.action_l2 * moved.square().mean()
 
     @torch.no_grad()
     def _move_targets(self) -> None:

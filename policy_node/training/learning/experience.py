@@ -15,6 +15,7 @@ from policy_node.training.learning.hindsight import goal_mixture, parse_mixture
 from policy_node.training.learning.normalizer import RunningStatistics
 from policy_node.training.learning.replay import EpisodeReplay, Episodes
 from policy_node.training.learning.sampling import TransitionSampler
+from policy_node.training.learning.subgoals import subgoal_columns
 from policy_node.training.learning.transitions import Transitions
 
 
@@ -62,7 +63,9 @@ class Experience:
             spec.episode_ticks,
             spec.observation_size,
             spec.goal.size,
-            spec.robot.action_size + (config.longest_hold > 1),
+            spec.robot.action_size
+            + (config.longest_hold > 1)
+            + subgoal_columns(config.subgoal_every, spec.goal.size),
             episode_weights(config.episode_weights, spec, config.control_hz),
             self._count_ticks,
         )
@@ -82,7 +85,8 @@ class Experience:
         if len(episodes):
             row = np.repeat(np.arange(len(episodes)), episodes.ticks)
             valid = None if self._count_ticks is None else self._count_ticks(episodes)
-            goal = self._sample(episodes, row, env_steps, valid, judge=None).goal
+            mixture = self.mixture(env_steps)
+            goal = self._sampler.sample(episodes, row, mixture, self.generator, valid).goal
         for name, values, normalizer in (
             ('observation_statistics', observation, actor.observation_normalizer),
             ('goal_statistics', goal, actor.goal_normalizer),
@@ -92,20 +96,19 @@ class Experience:
 
     def batch(self, env_steps: int) -> Transitions:
         """Draws the transitions of one update, after `env_steps` environment steps."""
-        row = self.replay.draw(self.batch_size, self.config.moved_share, self.generator)
-        valid = self.replay.valid_ticks
-        return self._sample(self.replay.episodes, row, env_steps, valid, self.judge)
+        return self._draw(self.mixture(env_steps))
 
-    def _sample(
-        self,
-        episodes: Episodes,
-        row: NDArray[np.int64],
-        env_steps: int,
-        valid_ticks: NDArray[np.int64] | None,
-        judge: Judge | None,
-    ) -> Transitions:
-        mixture = self.mixture(env_steps)
-        return self._sampler.sample(episodes, row, mixture, self.generator, valid_ticks, judge)
+    def _draw(self, mixture: dict[str, float]) -> Transitions:
+        """Draws transitions with goals from the sources of a mixture."""
+        replay, generator = self.replay, self.generator
+        row = self._draw_rows()
+        return self._sampler.sample(
+            replay.episodes, row, mixture, generator, replay.valid_ticks, self.judge
+        )
+
+    def _draw_rows(self) -> NDArray[np.int64]:
+        """Draws the episode of each transition of a batch."""
+        return self.replay.draw(self.batch_size, self.config.moved_share, self.generator)
 
     def mixture(self, env_steps: int) -> dict[str, float]:
         """Probability of each goal source after `env_steps` environment steps."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy_node.training.learning.replay import Array
+from policy_node.training.learning.subgoals import subgoals_of
 from policy_node.training.learning.transitions import Starts
 
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -22,6 +23,8 @@ RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np
 # this very step achieved; what one of the next ten achieved.
 SOURCES = ('real', 'future', 'final', 'episode', 'random', 'actual', 'next', 'near')
 _NEAR_TICKS = 10
+# One more, where there is a high level: what it had the actor pursue.
+_SUBGOAL = 'subgoal'
 
 
 def goal_mixture(strategy: str, k: int = 4) -> dict[str, float]:
@@ -66,6 +69,15 @@ def parse_mixture(text: str) -> dict[str, float]:
     return mixture
 
 
+def with_subgoals(mixture: dict[str, float]) -> dict[str, float]:
+    """The mixture with half of the goals that are not exchanged replaced by subgoals.
+
+    HAC would replace all, but its lowest level is never given the goal itself.
+    """
+    kept = mixture.get('real', 0.0) / 2
+    return mixture if kept == 0.0 else {**mixture, 'real': kept, _SUBGOAL: kept}
+
+
 def draw_sources(
     mixture: dict[str, float], count: int, generator: np.random.Generator
 ) -> NDArray[np.intp]:
@@ -97,6 +109,8 @@ def _goals(starts: Starts, source: str, generator: np.random.Generator) -> Array
     episodes, count = starts.episodes, len(starts.row)
     if source == 'actual':
         return episodes.desired_goal.take(generator.integers(len(episodes), size=count), axis=0)
+    if source == _SUBGOAL:
+        return subgoals_of(starts)
     if source == 'random':
         starts = replace(starts, row=generator.integers(len(episodes), size=count))
     tick, last = starts.tick, starts.last

@@ -14,7 +14,7 @@ from policy_node.policies import checkpoint
 from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.shipped import actor_path
-from policy_node.training.learning.config import TrainConfig, config_from_dict
+from policy_node.training.learning.config import PLAIN_NETWORKS, TrainConfig, config_from_dict
 from policy_node.training.learning.run_folder import STATE_FILE, companion_file
 from policy_node.training.learning.training_state import part_of, read_state
 
@@ -118,8 +118,7 @@ def _of_run(folder: Path) -> InitialNetworks:
 def _require_plain(config: TrainConfig, name: str) -> None:
     """Refuses networks of a run that no other run has the like of."""
     if not config.has_plain_networks:
-        names = ('algorithm', 'critics', 'norm', 'condition')
-        found = ', '.join(f'{field} {getattr(config, field)}' for field in names)
+        found = ', '.join(f'{field} {getattr(config, field)}' for field in PLAIN_NETWORKS)
         raise ValueError(f'{name} cannot be started from: {found}')
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from policy_node.policies.actor import Actor
+from policy_node.training.learning.subgoals import Proposer
 from policy_node.training.learning.transitions import Transitions
 
 
@@ -48,6 +49,10 @@ class Learner(Protocol):
 
     def acting_actor(self) -> Actor:
         """A copy, on the CPU, of the actor that collects."""
+        ...
+
+    def proposer(self, averaged: bool = False) -> Proposer | None:
+        """Who gives the actor subgoals; None where nobody does. Averaged as in evaluations."""
         ...
 
     def evaluation_actor(self) -> Actor:

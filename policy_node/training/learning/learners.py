@@ -10,6 +10,9 @@ from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.hierarchy import HierarchicalDDPG
+from policy_node.training.learning.hindsight_actions import HierarchicalExperience
+from policy_node.training.learning.imagined import ImaginingDDPG
 from policy_node.training.learning.initial_networks import network_shape
 from policy_node.training.learning.learner import Learner
 from policy_node.training.learning.on_policy import OnPolicyExperience
@@ -38,7 +41,11 @@ def make_learner(
     if config.algorithm == 'ppo':
         ppo = PPO(network_shape(config), config, device, workers)
         return ppo, OnPolicyExperience(config, spec, workers, sampler, generator, ppo)
-    ddpg = DDPG(network_shape(config), config, device, workers)
+    if config.subgoal_every:
+        levels = HierarchicalDDPG(network_shape(config), config, device, workers)
+        return levels, HierarchicalExperience(config, spec, workers, sampler, generator)
+    kind = ImaginingDDPG if config.subgoal_prior else DDPG
+    ddpg = kind(network_shape(config), config, device, workers)
     experience = Experience(config, spec, workers, sampler, generator)
     experience.judge = ddpg
     return ddpg, experience

@@ -27,6 +27,7 @@ COLUMNS = (
     'eval_dropped',
     'eval_distance',
     'eval_rotation',
+    'eval_guided',
     'critic_loss',
     'actor_loss',
     'mean_value',

@@ -15,7 +15,7 @@ import torch
 from msgs_spec.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
-from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
+from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator, success_rate
 from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.devices import choose_device
@@ -50,6 +50,7 @@ class Collected:
     train_success: float
     evaluation: EpisodeOutcomes | None
     evaluated: Actor | None
+    guided: EpisodeOutcomes | None = None
 
 
 class Trainer:
@@ -115,6 +116,7 @@ class Trainer:
             noise_ticks=config.noise_ticks,
             parameter_noise=config.parameter_noise,
             longest_hold=config.longest_hold,
+            subgoal_every=config.subgoal_every,
         )
         return np.random.default_rng(sampler_seed)
 
@@ -224,19 +226,22 @@ class Trainer:
         """What to collect next: with which actor, whether at random, and which to evaluate."""
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
+        self.collector.proposer = self.learner.proposer()
         actor, evaluated = self.learner.acting_actor(), None
         if may_evaluate and counters.updates > 0 and steps >= counters.next_evaluation:
             counters.next_evaluation = steps + self.config.evaluate_every
             if self.workers.is_first:
                 evaluated = self.learner.evaluation_actor()
+                self._evaluator.proposer = self.learner.proposer(averaged=True)
         return actor, steps < self.config.random_steps, evaluated
 
     def _collect(self, actor: Actor, random: bool, evaluated: Actor | None) -> Collected:
-        outcomes = None
+        outcomes = guided = None
         if evaluated is not None:
             outcomes = self._evaluator.evaluate(evaluated, self.counters.best_success)
+            guided = self._evaluator.evaluate_guided(evaluated)
         episodes, success = self.collector.collect(actor, random)
-        return Collected(episodes, success, outcomes, evaluated)
+        return Collected(episodes, success, outcomes, evaluated, guided)
 
     def _exploration(self) -> float:
         """Share of noise and random actions for a run as far as this one."""
@@ -322,7 +327,10 @@ class Trainer:
         speed = Speed(seconds, steps, len(losses) * batch * workers)
         success, outcomes = collected.train_success, collected.evaluation
         rule = self.config.success_rule
-        return progress_row(self.counters, success, outcomes, rule, losses, speed)
+        row = progress_row(self.counters, success, outcomes, rule, losses, speed)
+        if collected.guided is not None:
+            row['eval_guided'] = success_rate(collected.guided, rule)
+        return row
 
 
 class _Clock:

@@ -1,0 +1,128 @@
+"""Imagined subgoals as a prior on the actor, on a line whose values are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.imagined import ImaginingDDPG
+from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.learning.trainer import Trainer
+from policy_node.training.learning.transitions import Transitions
+from support.refusals import assert_refused
+
+torch.set_num_threads(1)
+
+SHAPE = NetworkShape(10, 3, 4, (64, 64))
+
+
+def configured(**changes: object) -> TrainConfig:
+    quick = {'precision': 'float32', 'action_l2': 0.0, 'goal_features': 'plain'}
+    return recipe_config('FetchReach', 'best', **{**quick, 'subgoal_prior': 1.0, **changes})
+
+
+class Distance(torch.nn.Module):
+    """Ticks to the goal at so many per unit of distance, whatever the action: the true value."""
+
+    def __init__(self, per_unit: float) -> None:
+        super().__init__()
+        self.per_unit = per_unit
+        self.unused = torch.nn.Parameter(torch.zeros(()))
+
+    def forward(self, features: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        distance = (features[:, :3] - features[:, -3:]).norm(dim=-1)
+        return -self.per_unit * distance + self.unused + 0.0 * action.sum(dim=-1)
+
+
+def learner_of(**changes: object) -> ImaginingDDPG:
+    """One whose critic knows the values."""
+    torch.manual_seed(0)
+    learner = ImaginingDDPG(SHAPE, configured(**changes), torch.device('cpu'), Workers())
+    learner.critic = learner.target_critic = Distance(20.0)
+    learner.critic_parameters = [learner.critic.unused]
+    learner.critic_optimizer = torch.optim.Adam(learner.critic_parameters, lr=0.0)
+    return learner
+
+
+def on_a_line(generator: np.random.Generator, count: int) -> Transitions:
+    """States and goals anywhere from -1 to 1 along the first axis."""
+    state, goal = np.zeros((count, 10), np.float32), np.zeros((count, 3), np.float32)
+    state[:, 0], goal[:, 0] = generator.uniform(-1, 1, (2, count))
+    nothing = np.zeros(count, np.float32)
+    return Transitions(state, state, goal, np.zeros((count, 4), np.float32), nothing, nothing)
+
+
+def test_what_is_imagined_lies_halfway_by_value() -> None:
+    learner, generator = learner_of(learning_rate=3e-3), np.random.default_rng(0)
+    for _ in range(400):
+        learner.update(on_a_line(generator, 512))
+    batch = on_a_line(generator, 500)
+    inputs = torch.from_numpy(batch.observation), torch.from_numpy(batch.goal)
+    with torch.no_grad():
+        imagined = learner.imagine(learner.actor.features(*inputs)).numpy()
+    middle = (batch.observation[:, 0] + batch.goal[:, 0]) / 2
+    assert np.abs(imagined[:, 0] - middle).mean() < 0.1
+    assert np.abs(imagined[:, 1:]).max() < 0.1
+
+
+def test_the_actor_is_drawn_to_what_it_does_for_the_subgoal() -> None:
+    """Values here say nothing of actions, so the prior alone moves the actor."""
+    learner, generator = learner_of(subgoal_prior=5.0), np.random.default_rng(0)
+    batch = on_a_line(generator, 512)
+    known = learner._known(batch)
+
+    def distance() -> float:
+        with torch.no_grad():
+            subgoal = learner.imagine(known.features)
+            prior = learner.act(batch.observation, subgoal.numpy())
+            own = learner.act(batch.observation, batch.goal)
+            penalty = learner._penalty(known, learner.actor(known.features))
+        assert float(penalty) == pytest.approx(5.0 * np.square(own - prior).mean(), rel=1e-4)
+        return float(penalty)
+
+    # Until the copy moves for the first time it is the actor as it was.
+    before = distance()
+    learner.config = configured(subgoal_prior=5.0, target_update_interval=1, polyak=0.0)
+    for _ in range(200):
+        learner.update(batch)
+    assert distance() < 0.1 * before
+
+
+def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    small = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
+    small |= {'simulation_threads': 1, 'torch_threads': 1, 'subgoal_prior': 0.3}
+    first = Trainer(
+        recipe_config('FetchReach', 'best', total_steps=800, **small), tmp_path, Workers()
+    )
+    first.train()
+    config = recipe_config('FetchReach', 'best', total_steps=1_200, **small)
+    again = Trainer(config, tmp_path, Workers())
+    again.resume(tmp_path / 'training_state.safetensors')
+    for name, value in first.learner.modules()['imagination'].state_dict().items():
+        assert torch.equal(value, again.learner.modules()['imagination'].state_dict()[name])
+    assert again.train() == '1,200 environment steps done'
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'subgoal_every': 10}, 'subgoal_prior excludes subgoal_every'),
+        ({'condition': 'horizon'}, 'subgoal_prior excludes subgoal_every, condition'),
+        ({'advantage': True, 'discount': 'time'}, 'condition and advantage'),
+        ({'longest_hold': 5}, 'subgoal_prior excludes longest_hold above 1'),
+        (
+            {'algorithm': 'ppo', 'overlap': False, 'random_epsilon': 0.0},
+            'algorithm ppo needs subgoal_prior=0.0$',
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(
+    changes: dict[str, object], message: str
+) -> None:
+    assert_refused(message, **{'subgoal_prior': 0.1, **changes})

@@ -1,0 +1,172 @@
+"""Subgoals while episodes are collected, and what a high level learns from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node.policies.actor import Actor
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.collector import Collector
+from policy_node.training.learning.hindsight import with_subgoals
+from policy_node.training.learning.hindsight_actions import SubgoalSampler
+from policy_node.training.learning.replay import Episodes
+from policy_node.training.learning.subgoals import TESTED, GuidedPolicy, Proposer
+from policy_node.training.train_her import main
+from support.refusals import assert_refused
+
+torch.set_num_threads(1)
+
+
+class Constant:
+    """A policy whose every action is the same number."""
+
+    def __init__(self, value: float, size: int) -> None:
+        self.value, self.size = value, size
+
+    def predict(self, observation: dict, *, deterministic: bool = True) -> tuple:
+        count = len(np.asarray(observation['observation']))
+        return np.full((count, self.size), self.value, np.float32), None
+
+
+def collected(proposer: Proposer | None, noise: tuple[float, float], actor: object) -> Episodes:
+    simulation = Simulation('FetchReach', num_envs=80, num_threads=1)
+    collector = Collector(simulation, list(range(80)), *noise, subgoal_every=20)
+    collector.proposer = proposer
+    return collector.collect(actor)[0]
+
+
+def test_subgoals_hold_follow_the_action_and_are_tested_without_noise() -> None:
+    torch.manual_seed(0)
+    actor = Actor(NetworkShape(10, 3, 4, (8,))).eval()
+    mean, std = np.full(3, 0.5, np.float32), np.full(3, 0.1, np.float32)
+    proposer = Proposer(Constant(0.2, 3), mean, std, is_pose=False)
+    episodes = collected(proposer, (0.2, 0.2), actor)
+    assert episodes.action.shape == (80, 50, 4 + 3 + 1)
+    subgoal, test = episodes.action[..., 4:7], episodes.action[..., 7]
+    for start, end in ((0, 20), (20, 40), (40, 50)):
+        for values in (subgoal, test):
+            assert (values[:, start:end] == values[:, start : start + 1]).all()
+    assert set(np.unique(test)) == {0.0, 1.0}
+    assert test.mean() == pytest.approx(TESTED, abs=0.1)
+    # Four fifths around .5 + 5 * .2 * .1 with .2 * .1; the others as goals are.
+    noise = (subgoal[:, ::20] - 0.6) / 0.1
+    assert np.median(noise) == pytest.approx(0.0, abs=0.1)
+    assert (np.abs(noise) < 0.6).all(axis=-1).mean() == pytest.approx(0.83, abs=0.1)
+    own, _ = actor.predict(
+        {'observation': episodes.observation[:, 30], 'desired_goal': subgoal[:, 30]}
+    )
+    moved = np.abs(episodes.action[:, 30, :4] - own).max(axis=-1)
+    assert (moved[test[:, 30] == 1.0] < 1e-5).all() and (moved[test[:, 30] == 0.0] > 1e-4).all()
+
+
+def test_without_a_high_level_the_goal_itself_is_pursued() -> None:
+    episodes = collected(None, (0.0, 0.0), Constant(0.0, 4))
+    goal = np.repeat(episodes.desired_goal[:, None], 50, axis=1)
+    np.testing.assert_array_equal(episodes.action[..., 4:7], goal)
+    assert (episodes.action[..., 7] == 0.0).all()
+
+
+def test_proposals_of_poses_end_with_unit_quaternions() -> None:
+    mean, std = np.zeros(7, np.float32), np.arange(1.0, 8.0, dtype=np.float32)
+    goals = Proposer(Constant(0.1, 7), mean, std, is_pose=True).goals(np.ones((2, 7), np.float32))
+    np.testing.assert_allclose(goals[:, :3], [[1, 2, 3]] * 2)
+    np.testing.assert_allclose(np.linalg.norm(goals[:, 3:], axis=1), 1.0, rtol=1e-6)
+
+
+def test_both_levels_act_as_one_for_whole_episodes() -> None:
+    asked: list[float] = []
+
+    class Counting(Constant):
+        def predict(self, observation: dict, *, deterministic: bool = True) -> tuple:
+            asked.append(float(observation['observation'][0, 0]))
+            return super().predict(observation)
+
+    one = np.ones(1, np.float32)
+    high = Proposer(Counting(0.5, 1), one, one, is_pose=False)
+    both = GuidedPolicy(Constant(0.7, 2), high, every=3, ticks=5)
+    for tick in range(10):
+        observation = {'observation': np.full((4, 1), tick), 'desired_goal': np.zeros((4, 1))}
+        assert (both.predict(observation)[0] == np.float32(0.7)).all()
+    assert asked == [0, 3, 5, 8]
+
+
+def walk(subgoal: float, tested: float) -> Episodes:
+    """To the right by one a tick, the subgoal the same throughout."""
+    place = np.arange(7, dtype=np.float32)[None, :, None]
+    action = np.tile(np.array([1.0, subgoal, tested], np.float32), (1, 6, 1))
+    return Episodes(place, place, np.full((1, 1), 5.0, np.float32), action)
+
+
+@pytest.mark.parametrize(
+    ('subgoal', 'tested', 'missed'), [(9.0, 1.0, True), (9.0, 0.0, False), (3.0, 1.0, False)]
+)
+def test_what_was_achieved_was_proposed_unless_a_test_was_missed(
+    subgoal: float, tested: float, missed: bool
+) -> None:
+    """Three ticks lead three places on; rewards are known, and so is what a test costs.
+
+    The second proposal of 3 is missed, at 6.
+    """
+    sampler = SubgoalSampler(3, lambda a, g: -1.0 * (a != g)[..., 0], 0.5, 1.0, missed_value=-2.0)
+    row = np.zeros(300, np.int64)
+    episodes = walk(subgoal, tested)
+    batch = sampler.sample(episodes, row, {'real': 1.0}, np.random.default_rng(0))
+    tick = batch.observation[:, 0].astype(int)
+    assert set(tick) == {0, 1, 2, 3}
+    penalty = (tick % 3 == 0) & missed
+    if subgoal == 3.0:
+        penalty = tick == 3
+    np.testing.assert_array_equal(batch.next_observation[:, 0], tick + 3)
+    np.testing.assert_array_equal(batch.action[:, 0], np.where(penalty, subgoal, tick + 3))
+    np.testing.assert_allclose(batch.discount, np.where(penalty, 0.0, 0.125))
+    summed = [-sum(0.5**i * (t + i + 1 != 5) for i in range(3)) for t in tick]
+    np.testing.assert_allclose(batch.reward, np.where(penalty, -2.0, summed))
+
+
+def test_half_of_the_goals_that_are_kept_are_subgoals() -> None:
+    assert with_subgoals({'future': 0.8, 'real': 0.2}) == {
+        'future': 0.8,
+        'real': 0.1,
+        'subgoal': 0.1,
+    }
+    assert with_subgoals({'future': 1.0}) == {'future': 1.0}
+
+
+def test_logged_episodes_have_no_subgoals(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ['--task', 'FetchReach', '--set', 'subgoal_every=10', '--output', str(tmp_path)]
+    assert main([*arguments, '--from-episodes', str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert 'subgoal_every excludes --from-episodes' in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'subgoal_every': 51}, 'subgoal_every 51 is longer than an episode'),
+        ({'subgoal_every': -1}, 'subgoal_every -1; allowed: 0'),
+        ({'n_step': 3}, 'subgoal_every excludes n_step'),
+        ({'longest_hold': 5}, 'subgoal_every excludes n_step and longest_hold'),
+        ({'parameter_noise': True}, 'and parameter_noise'),
+        ({'condition': 'horizon'}, 'subgoal_every excludes condition'),
+        ({'goal_choice': 'bellman'}, 'goal_choice, importance'),
+        ({'importance': 'density'}, 'goal_choice, importance'),
+        ({'advantage': True, 'discount': 'time'}, 'and advantage'),
+        ({'reward_type': 'dense'}, 'subgoal_every needs reward_type sparse'),
+        ({'init_from': 'FetchReach'}, 'init_from excludes .*subgoal_every'),
+        (
+            {'algorithm': 'ppo', 'overlap': False, 'random_epsilon': 0.0},
+            'algorithm ppo needs subgoal_every=0$',
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(
+    changes: dict[str, object], message: str
+) -> None:
+    assert_refused(message, **{'subgoal_every': 10, **changes})
