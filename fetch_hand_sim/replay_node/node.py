@@ -16,6 +16,7 @@ from std_srvs.srv import SetBool
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.replay_node import NODE_NAME
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
+from msgs_spec.listeners import Listeners
 from msgs_spec.parameters import REPLAY_NODE
 from msgs_spec.ros import (
     StopSignals,
@@ -96,16 +97,24 @@ class ReplayNode(Node):
             executor.remove_node(self)
 
     def _wait_for_commander(self, executor: SingleThreadedExecutor, stop: StopSignals) -> None:
-        """Shows the latched topics, from which a policy learns what robot this is."""
+        """Shows the latched topics, from which a policy learns what robot this is.
+
+        It begins when the policy hears everything: the first observation would be lost otherwise.
+        """
         self._publish_latched()
+        if not self._settings['wait_for_commands']:
+            return
+        listeners = Listeners(self, self._publishers_by_topic.values())
         commands = f'{self._schedule.namespace}/commands'
         own = int(commands in self._publishers_by_topic)
-        while (
-            self._settings['wait_for_commands']
-            and not stop
-            and self.count_publishers(commands) <= own
-        ):
+        had_commander = False
+        while not stop and not (had_commander and listeners.are_connected()):
             executor.spin_once(timeout_sec=_SPIN)
+            has_commander = self.count_publishers(commands) > own
+            if has_commander and not had_commander:
+                listeners.expect_more()
+            had_commander = has_commander
+            listeners.update()
 
     def _begin(self) -> None:
         """Goes to the start."""

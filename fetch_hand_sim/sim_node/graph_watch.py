@@ -7,16 +7,13 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from fetch_hand_sim.sim_node.commanders import CommanderWatch, Endpoint
+from msgs_spec.listeners import Listeners
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topics
 
 if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.publisher import Publisher
-
-# Seconds without news after which a node's subscriptions count as known: publishers and
-# subscriptions are discovered apart, in any order.
-_SETTLING_TIME = 0.2
 
 
 class GraphWatch:
@@ -36,7 +33,6 @@ class GraphWatch:
 
     def __init__(self, node: Node, spec: TaskSpec, publishers: Mapping[str, Publisher]) -> None:
         self._node = node
-        self._publishers = publishers
         self._command_topics = {
             node.resolve_topic_name(each.name): each.type_name
             for each in topics(spec)
@@ -46,8 +42,7 @@ class GraphWatch:
         self.clock_publishers: list[str] = []
         self.robots: list[str] = []
         self.has_newcomer = False
-        self._listeners = [0 for _ in publishers]
-        self._changed_at = 0.0
+        self._listeners = Listeners(node, publishers.values())
         self._status = node.resolve_topic_name('episode_status')
 
     def update(self) -> None:
@@ -56,20 +51,16 @@ class GraphWatch:
         found = [each for topic in self._command_topics for each in self._found(topic)]
         if self.commanders.update(found, now):
             self.has_newcomer = True
-            self._changed_at = now
+            self._listeners.expect_more()
         me = self._node.get_fully_qualified_name()
         self.clock_publishers = sorted({each.node for each in self._found('/clock')} - {me})
         self.robots = sorted(each.node for each in self._found(self._status))
-        self._count_listeners(now)
+        self.has_newcomer |= self._listeners.update()
 
     def is_heard(self) -> bool:
         """Whether everybody who subscribes is connected: only then a message reaches them."""
-        now = time.monotonic()
-        self._count_listeners(now)
-        if now - self._changed_at < _SETTLING_TIME:
-            return False
-        connected = (each.get_subscription_count() for each in self._publishers.values())
-        return all(have >= want for have, want in zip(connected, self._listeners, strict=True))
+        self.has_newcomer |= self._listeners.update()
+        return self._listeners.are_connected()
 
     def waiting_elsewhere(self) -> list[str]:
         """Policies that wait for a robot in another namespace than this one's."""
@@ -84,16 +75,6 @@ class GraphWatch:
     def will_introduce(self) -> bool:
         """Whether somebody publishes `policy_status`."""
         return bool(self._node.count_publishers('policy_status'))
-
-    def _count_listeners(self, now: float) -> None:
-        before = self._listeners
-        self._listeners = [
-            self._node.count_subscribers(each.topic_name) for each in self._publishers.values()
-        ]
-        if self._listeners != before:
-            self._changed_at = now
-            came = (have > had for have, had in zip(self._listeners, before, strict=True))
-            self.has_newcomer |= any(came)
 
     def _found(self, topic_name: str) -> list[Endpoint]:
         return [
