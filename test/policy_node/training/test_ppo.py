@@ -167,7 +167,7 @@ def test_updates_move_probabilities_less_far_with_the_clip_than_without(
 
 
 def log_ratio_after_updates() -> tuple[np.ndarray, np.ndarray]:
-    """How far 300 updates on one rollout move probabilities, and where the advantage is positive."""
+    """How far 300 updates move probabilities, and where the advantage is positive."""
     learner, maker = learn(1, strategy='none')
     action = np.full((64, 1, 1), 0.4, np.float32)
     achieved = np.concatenate([np.zeros_like(action), action], axis=1)
