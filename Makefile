@@ -72,7 +72,7 @@ test-nodes: env
 	$(BIN)/python -m pytest $(NODE_TESTS)
 
 test-others: env
-	$(BIN)/python -m pytest $(addprefix --ignore=,$(NODE_TESTS))
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(addprefix --ignore=,$(NODE_TESTS))
 
 lint: env
 	$(BIN)/python -m ruff check $(PYTHON_FILES)

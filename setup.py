@@ -41,6 +41,7 @@ TEST = [
     'mcap-ros2-support',
     'pytest',
     'pytest-timeout',
+    'pytest-xdist',
     'setuptools',
     'yourdfpy',
 ]
