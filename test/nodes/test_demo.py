@@ -44,4 +44,5 @@ def test_a_node_that_is_still_loaded_ends_quietly(seconds):
         time.sleep(seconds)
         assert stop_node(process) == 0
         log.seek(0)
-        assert log.read() == ''
+        # A quick machine has it loaded by then, and it says what it is.
+        assert [line for line in log if not line.startswith('[INFO]')] == []
