@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 # Seconds without news after which a node's subscriptions count as known: publishers and
 # subscriptions are discovered apart, in any order.
 _SETTLING_TIME = 0.2
+# Seconds without news after which who is not connected will never be: it asks for another quality
+# of service than is offered. A busy machine has taken three.
+_PATIENCE = 6.0
 
 
 class Listeners:
@@ -42,8 +45,10 @@ class Listeners:
         return any(have > had for have, had in zip(self._counts, before, strict=True))
 
     def are_connected(self) -> bool:
-        """Whether all are, and nothing has changed for a while."""
-        if time.monotonic() - self._changed_at < _SETTLING_TIME:
-            return False
+        """Whether all are that can be, and nothing has changed for a while."""
+        quiet_for = time.monotonic() - self._changed_at
+        if quiet_for > _PATIENCE:
+            return True
         connected = (each.get_subscription_count() for each in self._publishers)
-        return all(have >= want for have, want in zip(connected, self._counts, strict=True))
+        pairs = zip(connected, self._counts, strict=True)
+        return quiet_for >= _SETTLING_TIME and all(have >= want for have, want in pairs)

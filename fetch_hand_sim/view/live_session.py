@@ -139,7 +139,7 @@ def _serve(
     session: Session, loop: EventLoop, nodes: list[subprocess.Popen[str]], stop: StopSignals
 ) -> None:
     while not stop and all(node.poll() is None for node in nodes):
-        # Asleep, not waiting for messages: a robot in lockstep sends thousands between two frames.
+        # Asleep, not waiting for messages: a robot in lockstep sends thousands a second.
         time.sleep(_FRAME_TIME)
         loop.serve_pending(_SERVED_FIRST)
         session.update()

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
@@ -176,6 +178,19 @@ def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
     assert code == 0
     assert 'of episode' in output
     assert 'waits for a valid command; /policy_node sends none' in output
+
+
+def test_a_listener_that_cannot_be_connected_does_not_hold_the_robot_up(
+    start_process: Start,
+) -> None:
+    """A subscription that asks for more than is offered shows in the graph and never matches."""
+    profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    with client(REACH) as connection:
+        connection.node.create_subscription(JointState, 'joint_states', print, profile)
+        connection.subscribe('applied_command')
+        start_process(*SIM_NODE, *ros_args(task='FetchReach', wait_for_commands=True))
+        start_process(*POLICY_NODE)
+        connection.spin_until(lambda: connection.received['applied_command'], 'tick')
 
 
 def test_two_commanders_are_named_and_health_is_published(start_process: Start) -> None:
