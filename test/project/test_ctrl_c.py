@@ -23,19 +23,7 @@ GUARD = 'msgs_spec.loading'
 
 
 def interrupt(command: Sequence[str | Path], imports: int, after: str = GUARD) -> tuple[int, str]:
-    """Presses Ctrl-C when so many modules have been loaded after one; returns code and stderr.
-
-    On a busy machine a short command may be over before the signal reaches it: then again.
-    """
-    for _ in range(3):
-        answer = interrupt_once(command, imports, after)
-        if answer[0] not in (0, 2):
-            break
-    return answer
-
-
-def interrupt_once(command: Sequence[str | Path], imports: int, after: str) -> tuple[int, str]:
-    """As `interrupt`, whenever the signal arrives."""
+    """Presses Ctrl-C when so many modules have been loaded after one; returns code and stderr."""
     process = subprocess.Popen(
         [sys.executable, '-X', 'importtime', *command],
         stdin=subprocess.DEVNULL,
@@ -58,6 +46,18 @@ def interrupt_once(command: Sequence[str | Path], imports: int, after: str) -> t
     return process.wait(60), ''.join(said)
 
 
+def interrupt_at_once(command: Sequence[str | Path]) -> tuple[int, str]:
+    """As `interrupt`, after the first module.
+
+    On a busy machine a short command may be over before the signal reaches it: then again.
+    """
+    for _ in range(3):
+        answer = interrupt(command, 1)
+        if answer[0] not in (0, 2):
+            break
+    return answer
+
+
 @pytest.fixture(scope='module')
 def programs(tmp_path_factory) -> Path:
     """A folder of programs, as an installation makes it."""
@@ -73,13 +73,13 @@ def test_the_names_of_executables_are_known():
 
 @pytest.mark.parametrize('name', sorted(EXECUTABLES))
 def test_a_program_that_has_hardly_begun(name, programs):
-    assert interrupt([programs / name], 1) == (130, f'{name}: stopping\n')
+    assert interrupt_at_once([programs / name]) == (130, f'{name}: stopping\n')
 
 
 @pytest.mark.parametrize('module', started_as_modules())
 def test_a_module_that_has_hardly_begun(module):
     name = module.rpartition('.')[2]
-    assert interrupt(['-m', module], 1) == (130, f'{name}: stopping\n')
+    assert interrupt_at_once(['-m', module]) == (130, f'{name}: stopping\n')
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,8 @@ def test_values_of_a_chain_are_its_discounted_rewards(changes: dict[str, object]
                 values = learner.critic(features, torch.zeros(4, 1))
             seen.append((values if values.ndim == 1 else values.mean(dim=0)).numpy())
     # The average: without target networks batch normalisation keeps them moving by 0.2.
-    np.testing.assert_allclose(np.mean(seen, axis=0), [-1.5, -1.0, 0.0, 0.0], atol=0.2)
+    atol = 0.2 if changes.get('norm') == 'batch' else 0.15
+    np.testing.assert_allclose(np.mean(seen, axis=0), [-1.5, -1.0, 0.0, 0.0], atol=atol)
 
 
 def test_without_target_networks_there_are_none_to_move() -> None:
