@@ -55,6 +55,11 @@ class TrainConfig:
     the actor learns to come closer than it has to; evaluation keeps the task's distance."""
     reward_rotation: float = 1.0
     """Share of the task's success rotation likewise."""
+    first_distance: float = 1.0
+    """What `reward_distance` is multiplied by at the start of the run; this factor falls
+    geometrically to 1 over the first two thirds. Coarse goals, which are met often, come first."""
+    first_rotation: float = 1.0
+    """What `reward_rotation` is multiplied by at the start, likewise."""
     strategy: str = 'future'
     """Hindsight goals: final, future, episode, random, futureactual, or none (no hindsight)."""
     hindsight_k: int = 4
@@ -225,6 +230,11 @@ class TrainConfig:
         return all(getattr(self, name) == value for name, value in PLAIN_NETWORKS.items())
 
     @property
+    def narrows(self) -> bool:
+        """Whether goals are met more easily at the start of a run than at its end."""
+        return self.first_distance != 1.0 or self.first_rotation != 1.0
+
+    @property
     def tick_share(self) -> float:
         """Duration of a tick in units of what `gamma` discounts."""
         return DEFAULT_CONTROL_HZ / self.control_hz if self.discount == 'time' else 1.0
@@ -263,8 +273,12 @@ class TrainConfig:
             raise ValueError(f'ticks_after_drop: {self.task} has no palm to drop an object from')
         if self.drop_is_lost and (self.ticks_after_drop < 0 or self.reward_type != 'sparse'):
             raise ValueError('drop_is_lost needs ticks_after_drop of 0 or more and sparse rewards')
-        if self.reward_rotation != 1.0 and spec.rotation_threshold is None:
-            raise ValueError(f'reward_rotation: goals of {self.task} have no rotation')
+        self._require_rotation(spec)
+
+    def _require_rotation(self, spec: TaskSpec) -> None:
+        for name in ('reward_rotation', 'first_rotation'):
+            if spec.rotation_threshold is None and getattr(self, name) != 1.0:
+                raise ValueError(f'{name}: goals of {self.task} have no rotation')
 
     def _contradictions(self) -> list[tuple[bool, str]]:
         """Fields that exclude each other, or that nothing would look at, and why."""
@@ -311,6 +325,14 @@ class TrainConfig:
             (
                 self.condition == 'threshold' and self.reward_type == 'dense',
                 'condition threshold needs reward_type sparse',
+            ),
+            (
+                self.narrows and (conditioned or self.reward_type == 'dense'),
+                'first_distance and first_rotation need reward_type sparse and condition none',
+            ),
+            (
+                self.narrows and self.subgoal_every > 0,
+                'first_distance and first_rotation exclude subgoal_every',
             ),
             (weighted and self.n_step > 1, f'importance {self.importance} excludes n_step above 1'),
             (
@@ -450,6 +472,8 @@ ON_POLICY: dict[str, Any] = {
     'random_steps': 0,
     'moved_share': 0.0,
     'ticks_after_drop': -1,
+    'first_distance': 1.0,
+    'first_rotation': 1.0,
     'goal_choice': 'uniform',
     'condition': 'none',
     'n_step': 1,
@@ -492,6 +516,8 @@ RANGES = (
     ('hindsight_k', 1, 1000),
     ('reward_distance', 1e-3, 1000),
     ('reward_rotation', 1e-3, 1000),
+    ('first_distance', 1, 1000),
+    ('first_rotation', 1, 1000),
     ('moved_share', 0, 1),
     ('ticks_after_drop', -1, _INFINITY),
     ('n_step', 1, 100),

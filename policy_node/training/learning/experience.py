@@ -96,13 +96,13 @@ class Experience:
 
     def batch(self, env_steps: int) -> Transitions:
         """Draws the transitions of one update, after `env_steps` environment steps."""
-        return self._draw(self.mixture(env_steps))
+        return self._draw(self.mixture(env_steps), env_steps)
 
-    def _draw(self, mixture: dict[str, float]) -> Transitions:
-        """Draws transitions with goals from the sources of a mixture."""
+    def _draw(self, mixture: dict[str, float], env_steps: int) -> Transitions:
+        """Draws transitions with goals from the sources of a mixture, and rewards of then."""
         replay, generator = self.replay, self.generator
         row = self._draw_rows()
-        return self._sampler.sample(
+        return self._sampler.at(env_steps / self.config.total_steps).sample(
             replay.episodes, row, mixture, generator, replay.valid_ticks, self.judge
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +35,7 @@ class TransitionSampler:
         reward_scale: What rewards are multiplied by.
         lost_value: What follows the last valid tick of an episode that is longer; None if that is
             still to be learnt.
+        reward_at: Progress of the run, 0 ... 1 -> `compute_reward` of then; None if it stays.
     """
 
     compute_reward: RewardFunction
@@ -43,6 +45,13 @@ class TransitionSampler:
     goal_choice: str = 'uniform'
     reward_scale: float = 1.0
     lost_value: float | None = None
+    reward_at: Callable[[float], RewardFunction] | None = None
+
+    def at(self, progress: float) -> TransitionSampler:
+        """The sampler of a run that is this far, 0 ... 1."""
+        if self.reward_at is None:
+            return self
+        return replace(self, compute_reward=self.reward_at(progress))
 
     def sample(
         self,
@@ -170,22 +179,37 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
         config: The configuration.
         metric: Distances and thresholds of the task, and its reward.
     """
-    metric = scale_thresholds(metric, config.reward_distance, config.reward_rotation)
+
+    def reward_at(progress: float) -> RewardFunction:
+        return narrowed(metric, config, progress).reward
+
+    final = narrowed(metric, config, progress=1.0)
     counter: StepCounter | HeldSteps | None = None
     if config.longest_hold > 1:
         counter = HeldSteps(config.longest_hold)
     if config.n_step > 1:
         limits = config.correction, config.trace, config.cut_distance
         counter = StepCounter(config.n_step, *limits)
-    condition = make_condition(config.condition, metric)
+    condition = make_condition(config.condition, final)
     return TransitionSampler(
-        metric.reward,
+        final.reward,
         config.tick_gamma,
         counter,
         condition,
         config.goal_choice,
         config.tick_share,
         config.lowest_value if config.drop_is_lost else None,
+        reward_at if config.narrows else None,
+    )
+
+
+def narrowed(metric: GoalMetric, config: TrainConfig, progress: float) -> GoalMetric:
+    """The metric by which a run that is this far, 0 ... 1, rewards goals."""
+    left = max(1.0 - 1.5 * progress, 0.0)
+    return scale_thresholds(
+        metric,
+        config.reward_distance * config.first_distance**left,
+        config.reward_rotation * config.first_rotation**left,
     )
 
 

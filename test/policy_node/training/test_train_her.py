@@ -258,10 +258,29 @@ def test_training_may_ask_for_less_rotation_than_the_task(tmp_path: Path) -> Non
     assert tighter.reward(achieved, goal).tolist() == [0.0, -1.0, -1.0]
 
 
+def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_path: Path) -> None:
+    """FetchReach's 0.05 m are 0.2 m at the start, 0.1 m after a third of the run, then 0.05 m."""
+    config = small_config(batch_size=512, first_distance=4.0, total_steps=3_000, goals='random=1')
+    trainer = Trainer(config, tmp_path, Workers())
+    trainer.experience.replay.add(trainer.collector.collect(trainer.learner.actor, random=True)[0])
+    for env_steps, threshold in ((0, 0.2), (1_000, 0.1), (2_000, 0.05), (3_000, 0.05)):
+        batch = trainer.experience.batch(env_steps)
+        position = batch.next_observation[:, :3].astype(np.float64)
+        distance = np.linalg.norm(position - batch.goal, axis=-1)
+        clear = np.abs(distance - threshold) > 1e-4
+        np.testing.assert_array_equal(batch.reward[clear] == 0.0, distance[clear] < threshold)
+        assert ((distance > 0.5 * threshold) & (distance < threshold)).any()
+    with pytest.raises(ValueError, match='first_rotation: goals of FetchReach have no rotation'):
+        small_config(first_rotation=2.0)
+    with pytest.raises(ValueError, match='need reward_type sparse'):
+        small_config(first_distance=2.0, reward_type='dense')
+
+
 def test_evaluation_sees_nothing_of_what_training_may_change(tmp_path: Path) -> None:
     """The same actor gets the same evaluation, whatever the rewards and draws of training are."""
     task, small = 'HandManipulatePenRotate', {'num_envs': 2, 'evaluation_episodes': 2}
     changes = {'reward_rotation': 20.0, 'reward_distance': 0.1, 'noise_spread': 1.0, 'gamma': 0.5}
+    changes |= {'first_distance': 9.0, 'first_rotation': 9.0}
     changes |= {'ticks_after_drop': 2, 'goals': 'next=1', 'episode_weights': 'energy'}
     results = []
     for extra in ({}, changes):
