@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from policy_node.training.learning.training_state import part_of, read_state
 # Updates of the critic alone where it starts from nothing beside an actor that is already good:
 # the gradient of a critic that knows nothing would ruin it.
 CRITIC_FIRST = 5_000
+_FIRST_WEIGHT = 'hidden.0.weight'
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,29 @@ class InitialNetworks:
         if differing:
             origin = f'{self.origin["name"]} ({self.origin["task"]})'
             raise ValueError(f'{config.task} cannot start from {origin}: {"; ".join(differing)}')
+
+    def fitted(self, config: TrainConfig) -> InitialNetworks:
+        """These networks for another run, in which the position of an object may begin to count.
+
+        Where it did not count its inputs were zero, so their weights are still the random ones of
+        the first step, and would ruin all that was learnt. They become zero.
+
+        Raises:
+            ValueError: If the run cannot start from them; one line names the sizes of both.
+        """
+        self.require_fit(config)
+        before, now = task_spec(self.origin['task']), task_spec(config.task)
+        is_new = now.position_counts and not before.position_counts
+        if config.goal_features == 'plain' or not is_new:
+            return self
+        # The position is what the features end with; the critic's inputs go on with the action.
+        end = self.shape.feature_size
+        tensors = dict(self.tensors)
+        for name in tensors:
+            if name.endswith(_FIRST_WEIGHT):
+                tensors[name] = tensors[name].clone()
+                tensors[name][:, end - 3 : end] = 0.0
+        return replace(self, tensors=tensors)
 
 
 def network_shape(config: TrainConfig) -> NetworkShape:

@@ -139,8 +139,7 @@ def lock_run(folder: Path) -> Iterator[None]:
 def _initial_networks(config: TrainConfig) -> InitialNetworks:
     """Reads the networks to start from."""
     try:
-        networks = read_initial_networks(config.init_from)
-        networks.require_fit(config)
+        networks = read_initial_networks(config.init_from).fitted(config)
     except ValueError as error:
         raise UsageError(str(error)) from None
     if not networks.has_critic:
