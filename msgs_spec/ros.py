@@ -9,8 +9,9 @@ from importlib import import_module
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol
 
-from msgs_spec.command_line import EXIT_SUCCESS, CommandError, complain, require_extra
+from msgs_spec.command_line import EXIT_FAILURE, EXIT_SUCCESS, CommandError, complain, require_extra
 from msgs_spec.command_line import UsageError as UsageError
+from msgs_spec.last_resort import ends_within
 from msgs_spec.parameters import ParameterSpec, unknown_parameter, usage, validate
 from msgs_spec.topics import QosSpec
 from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 # Seconds between looks at what no callback announces: signals, the graph.
 BEAT = 0.1
+# Enough for any node on a busy machine: 0.3 s are usual.
+_DESTROY_SECONDS = 10.0
 
 
 class NodeFailure(CommandError):
@@ -266,6 +269,17 @@ def _run(load: Callable[[], Callable[[], RunnableNode]], stop: StopSignals) -> N
     try:
         node.run(stop)
     finally:
+        destroy(node)
+
+
+def destroy(node: RunnableNode | Node) -> None:
+    """Destroys a node whose work is done; if that takes too long the process ends all the same.
+
+    It then ends as it would have: with 0, or with the code of the error on its way.
+    """
+    error = sys.exception()
+    exit_code = EXIT_SUCCESS if error is None else getattr(error, 'exit_code', EXIT_FAILURE)
+    with ends_within(_DESTROY_SECONDS, exit_code):
         node.destroy_node()
 
 

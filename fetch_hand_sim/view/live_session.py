@@ -22,7 +22,7 @@ from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import open_page
-from msgs_spec.ros import EventLoop, NodeFailure, StopSignals, run_node
+from msgs_spec.ros import EventLoop, NodeFailure, StopSignals, destroy, run_node
 
 NODE_NAME = 'view'
 _FRAME_TIME = 1.0 / 60.0
@@ -42,7 +42,7 @@ def run_live(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace, stop: StopSignals) -> None:
     with ExitStack() as stack:
         node = rclpy.create_node(NODE_NAME, namespace=options.robot)
-        stack.callback(node.destroy_node)
+        stack.callback(destroy, node)
         robot = LiveRobot(node, may_command=not options.read_only)
         loop = EventLoop(node)
         stack.callback(loop.close)

@@ -1,0 +1,37 @@
+"""Processes that a library does not let go end all the same."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+# A library that spins and holds the interpreter: `PyDLL` does not let go of its lock.
+HELD = """
+import ctypes, time
+from msgs_spec.last_resort import ends_within
+print('done', flush=False)
+with ends_within({limit}, {code}):
+    ctypes.PyDLL(None).usleep(ctypes.c_uint({microseconds}))
+print('left')
+"""
+
+
+def run(limit: float, code: int, held: float) -> tuple[int, str, float]:
+    started = time.monotonic()
+    program = HELD.format(limit=limit, code=code, microseconds=int(held * 1e6))
+    ended = subprocess.run([sys.executable, '-c', program], capture_output=True, timeout=30)
+    return ended.returncode, ended.stdout.decode(), time.monotonic() - started
+
+
+@pytest.mark.parametrize('code', [0, 1, 130])
+def test_a_process_that_is_held_ends_with_its_own_exit_code(code: int) -> None:
+    ended, output, seconds = run(0.3, code, held=20.0)
+    assert (ended, output) == (code, 'done\n')
+    assert seconds < 10.0
+
+
+def test_a_process_that_is_let_go_in_time_goes_on() -> None:
+    assert run(0.5, 3, held=0.1)[:2] == (0, 'done\nleft\n')
