@@ -17,8 +17,8 @@ from pathlib import Path
 
 from fetch_hand_sim.commands.main import COMMANDS, Command
 from msgs_spec.tasks import TASKS
-from policy_node.training.learning import config
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.config_rules import CHOICES, RANGES
 from policy_node.training.learning.recipes import recipe_config
 
 _COLUMNS = '88'
@@ -75,8 +75,8 @@ def help_of(path: tuple[str, ...]) -> str:
 def train_config_page() -> str:
     """Returns the fields of `TrainConfig`, and where the recipes differ from their defaults."""
     documented = field_docstrings(TrainConfig)
-    ranges = {name: _range(low, high) for name, low, high in config.RANGES}
-    choices = {name: ', '.join(map(_code, values)) for name, values in config.CHOICES.items()}
+    ranges = {name: _range(low, high) for name, low, high in RANGES}
+    choices = {name: ', '.join(map(_code, values)) for name, values in CHOICES.items()}
     allowed = {'task': f'one of the {len(TASKS)} tasks'} | ranges | choices
     rows = []
     for field in dataclasses.fields(TrainConfig):

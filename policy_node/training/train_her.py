@@ -19,12 +19,9 @@ from msgs_spec.command_line import (
     say,
 )
 from msgs_spec.tasks import TASKS, task_spec
-from policy_node.training.learning.config import (
-    RECIPES,
-    TrainConfig,
-    config_from_dict,
-    parse_assignment,
-)
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.config_rules import RECIPES
+from policy_node.training.learning.config_values import config_from_dict, parse_assignment
 from policy_node.training.learning.recipes import recipe_config
 
 if TYPE_CHECKING:

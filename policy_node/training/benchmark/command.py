@@ -45,7 +45,8 @@ from policy_node.training.benchmark.results import write_report
 from policy_node.training.benchmark.studies import best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
 from policy_node.training.evaluation.shipping import ship
-from policy_node.training.learning.config import RECIPES, parse_assignment
+from policy_node.training.learning.config_rules import RECIPES
+from policy_node.training.learning.config_values import parse_assignment
 from policy_node.training.learning.run_folder import BEST_FILE
 
 _NAME = 'benchmark'

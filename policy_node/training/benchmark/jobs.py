@@ -10,7 +10,8 @@ from typing import Any
 
 from msgs_spec.command_line import CommandError
 from policy_node.training.benchmark.final import FINAL_FILE, measure_final
-from policy_node.training.learning.config import TrainConfig, config_from_dict
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.config_values import config_from_dict
 from policy_node.training.learning.run import RunTakenError, train_run
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.run_log import read_progress

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.simulation import Array, Seeds
-from policy_node.training.learning.config import require_idle_gripper
+from policy_node.training.learning.config_rules import require_idle_gripper
 
 # The idle part of the action, and the value above which it is the gamble.
 GRIPPER_ACTION = 3

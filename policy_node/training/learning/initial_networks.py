@@ -14,7 +14,9 @@ from policy_node.policies import checkpoint
 from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.shipped import actor_path
-from policy_node.training.learning.config import PLAIN_NETWORKS, TrainConfig, config_from_dict
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.config_rules import unusual_networks
+from policy_node.training.learning.config_values import config_from_dict
 from policy_node.training.learning.run_folder import STATE_FILE, companion_file
 from policy_node.training.learning.training_state import part_of, read_state
 
@@ -141,9 +143,8 @@ def _of_run(folder: Path) -> InitialNetworks:
 
 def _require_plain(config: TrainConfig, name: str) -> None:
     """Refuses networks of a run that no other run has the like of."""
-    if not config.has_plain_networks:
-        found = ', '.join(f'{field} {getattr(config, field)}' for field in PLAIN_NETWORKS)
-        raise ValueError(f'{name} cannot be started from: {found}')
+    if found := unusual_networks(config):
+        raise ValueError(f'{name} cannot be started from: {", ".join(found)}')
 
 
 def _of_actor(name: str, path: Path) -> InitialNetworks:

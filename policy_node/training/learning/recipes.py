@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from msgs_spec.tasks import task_spec
-from policy_node.training.learning.config import RECIPES, TrainConfig
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.config_rules import RECIPES
 
 
 def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:

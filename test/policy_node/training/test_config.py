@@ -13,12 +13,9 @@ import pytest
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.learning import config as config_module
-from policy_node.training.learning.config import (
-    RECIPES,
-    TrainConfig,
-    config_from_dict,
-    parse_assignment,
-)
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.config_rules import RECIPES
+from policy_node.training.learning.config_values import config_from_dict, parse_assignment
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.threads import split_threads
 from support import ROOT
