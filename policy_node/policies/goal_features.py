@@ -45,6 +45,10 @@ class GoalFeatures(Protocol):
         """Inputs (..., size), from what is seen in the units of the task and normalised."""
         ...
 
+    def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
+        """Indices of the inputs that say where a pose goal is, not how it is turned."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class RelativeGoal:
@@ -82,6 +86,11 @@ class RelativeGoal:
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
         """Normalised observation and goal, then the difference."""
         return _concatenate(*normalized, self.difference(*seen))
+
+    def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
+        """The first three of the goal and the last three of the difference."""
+        end = self.size(observation_size, goal_size)
+        return [*range(observation_size, observation_size + 3), *range(end - 3, end)]
 
     def difference(self, observation: Array, goal: Array) -> Array:
         """The difference (..., difference_size) of both in the units of the task."""
@@ -138,6 +147,11 @@ class SymmetricObject:
             shape,
             self.relative.difference(observation, goal),
         )
+
+    def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
+        """The last three of the difference."""
+        end = self.size(observation_size, goal_size)
+        return [*range(end - 3, end)]
 
 
 def goal_features(kind: str, spec: TaskSpec) -> GoalFeatures | None:

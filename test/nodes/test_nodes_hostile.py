@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from std_msgs.msg import Float64MultiArray
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.ros import rclpy_profile
 from msgs_spec.tasks import task_spec
-from msgs_spec.topics import QosSpec, topic
+from msgs_spec.topics import QosSpec, topic, topics
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,
@@ -29,6 +30,7 @@ from support.graph import (
     finish,
     ros_args,
 )
+from support.hostile_messages import hostile_bytes
 
 REACH = task_spec('FetchReach')
 
@@ -71,6 +73,44 @@ def test_flood_of_commands_neither_delays_nor_grows_the_robot(start_process: Sta
     assert rate > 12.5
     assert grown < 20_000
     end(sim)
+
+
+def test_hostile_messages_on_every_input_leave_robot_policy_and_log_sound(
+    start_process: Start, tmp_path: Path, hostile_count: int
+) -> None:
+    """`make torture` sends 100,000: the robot ticks on, and its log passes `check_episode`."""
+    task = 'HandReach'
+    spec, generator = task_spec(task), np.random.default_rng(11)
+    sim = start_process(*SIM_NODE, *ros_args(task=task, episode_dir=tmp_path))
+    policy = start_process(*POLICY_NODE, *ros_args(task=task))
+    inputs = [each for each in topics(spec) if each.direction == 'subscribed']
+    with client(spec) as robot:
+        robot.subscribe('joint_states', 'policy_status', '/diagnostics')
+        for each in inputs:
+            robot.connect(each.name)
+        robot.spin_until(lambda: bool(robot.received['policy_status']), 'a policy')
+        for index in range(hostile_count):
+            target = inputs[generator.integers(len(inputs))]
+            robot.publish(target.name, hostile_bytes(generator, target))
+            # About as fast as they are read, so that hardly any pushes another one out.
+            if index % 5 == 0:
+                robot.spin(0.005)
+        seen = len(robot.received['joint_states'])
+        robot.spin_until(lambda: len(robot.received['joint_states']) > seen + 10, 'more ticks')
+        robot.spin_until(lambda: len(robot.reports()) > 1, 'a report')
+        report = robot.values()
+        positions = np.array([message.position for message in robot.received['joint_states']])
+    assert np.isfinite(positions).all()
+    refused = [int(count) for name, count in report.items() if name.startswith('rejected: ')]
+    assert sum(refused) > hostile_count / 20
+    assert int(report['commands accepted']) > hostile_count / 20
+    assert int(report['divergences']) == 0
+    end(sim)
+    end(policy)
+    logged = [str(path) for path in tmp_path.iterdir()]
+    check = [sys.executable, '-m', 'fetch_hand_sim', 'episodes', 'check', *logged]
+    result = subprocess.run(check, capture_output=True, text=True)
+    assert logged and result.returncode == 0, result.stdout + result.stderr
 
 
 def random_value(generator: np.random.Generator) -> ParameterValue:

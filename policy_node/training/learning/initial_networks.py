@@ -71,24 +71,24 @@ class InitialNetworks:
     def fitted(self, config: TrainConfig) -> InitialNetworks:
         """These networks for another run, in which the position of an object may begin to count.
 
-        Where it did not count its inputs were zero, so their weights are still the random ones of
-        the first step, and would ruin all that was learnt. They become zero.
+        Where it did not count, the goal's position was always about the object's own: networks have
+        learnt nothing from it, and what they do elsewhere is chance (an actor that dropped 1 block
+        in 200 dropped half of them). So they start blind to it: its weights become zero.
 
         Raises:
             ValueError: If the run cannot start from them; one line names the sizes of both.
         """
         self.require_fit(config)
-        before, now = task_spec(self.origin['task']), task_spec(config.task)
-        is_new = now.position_counts and not before.position_counts
-        if config.goal_features == 'plain' or not is_new:
+        before, now, shape = task_spec(self.origin['task']), task_spec(config.task), self.shape
+        if shape.goal_features is None or before.position_counts or not now.position_counts:
             return self
-        # The position is what the features end with; the critic's inputs go on with the action.
-        end = self.shape.feature_size
+        inputs = shape.goal_features.goal_position(shape.observation_size, shape.goal_size)
         tensors = dict(self.tensors)
         for name in tensors:
+            # The critic's inputs are the actor's, then the action.
             if name.endswith(_FIRST_WEIGHT):
                 tensors[name] = tensors[name].clone()
-                tensors[name][:, end - 3 : end] = 0.0
+                tensors[name][:, inputs] = 0.0
         return replace(self, tensors=tensors)
 
 

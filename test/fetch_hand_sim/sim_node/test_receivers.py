@@ -2,61 +2,21 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
 from fetch_hand_sim.episode_log.limits import MAX_MESSAGE_BYTES
 from fetch_hand_sim.sim_node.receivers import Receivers
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.codecs import build_message, build_status
+from msgs_spec.codecs import build_message
 from msgs_spec.schemas import message_class, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics
+from support.hostile_messages import hostile_bytes, introduction
 
 COMMANDS, SET_GOAL, POLICY_STATUS = (
     topic(task_spec('FetchReach'), name) for name in ('commands', 'set_goal', 'policy_status')
 )
-HOSTILE = [math.nan, math.inf, -math.inf, 5e-324, -5e-324, 1e308, -1e308, 0.0, -0.0, 1.0, 1e-310]
-
-
-def hostile_vector(generator, size):
-    length = int(generator.choice([size, size, size, 0, 1, abs(size - 1), size + 1, 1000]))
-    if generator.random() < 0.5:
-        return generator.uniform(-2.0, 2.0, length)
-    return generator.choice(HOSTILE, length)
-
-
-def hostile_message(generator, spec):
-    if spec.name == 'commands':
-        array = message_class(spec.type_name)
-        layout = message_class('std_msgs/msg/MultiArrayLayout')(dim=[], data_offset=2**32 - 1)
-        return array(layout=layout, data=hostile_vector(generator, spec.size))
-    if spec.name == 'joint_commands':
-        names = [*spec.names, '', 'robot0:', '\N{SNOWMAN}' * 100, spec.names[0]]
-        chosen = [str(name) for name in generator.choice(names, generator.integers(0, 24))]
-        message = build_message(spec, 0, np.zeros(spec.size))
-        message.name, message.position = chosen, hostile_vector(generator, len(chosen))
-        return message
-    if spec.name == 'policy_status':
-        return introduction('' if generator.random() < 0.5 else 'not a fingerprint')
-    values = hostile_vector(generator, spec.size)
-    return build_message(spec, 0, np.resize(values, spec.size) if values.size else [0] * spec.size)
-
-
-def damaged(generator, data):
-    """The bytes, every twentieth time cut off or with wrong ones among them."""
-    if generator.random() > 0.05:
-        return data
-    found = bytearray(data)
-    found[generator.integers(len(found))] ^= 0xFF
-    return bytes(found[: generator.integers(len(found))])
-
-
-def introduction(sha256):
-    """What a commander says of itself."""
-    return build_status(POLICY_STATUS, 0, 'policy', {'checkpoint_sha256': sha256})
 
 
 @pytest.mark.parametrize('task', ['FetchReach', 'HandReach'])
@@ -73,8 +33,7 @@ def test_hostile_messages_are_refused_and_counted_and_no_state_is_lost(make, tas
     sent = dict.fromkeys(callbacks, 0)
     for index in range(hostile_count):
         target = targets[generator.integers(len(targets))]
-        data = serialize(target.type_name, hostile_message(generator, target))
-        callbacks[target.name](damaged(generator, data))
+        callbacks[target.name](hostile_bytes(generator, target))
         sent[target.name] += 1
         if index % 10 == 0:
             case.clock.now += 0.04

@@ -66,27 +66,35 @@ def test_a_run_starts_with_all_networks_of_another(tmp_path: Path, block_run: Pa
     assert source.learner.critic_optimizer.state_dict()['state'] != {}
 
 
+@pytest.mark.parametrize('features', ['relative', 'symmetric'])
 def test_a_position_that_begins_to_count_changes_nothing_at_first(
-    tmp_path: Path, block_run: Path
+    tmp_path: Path, block_run: Path, features: str
 ) -> None:
-    """BlockFull from RotateXYZ: actor and critic say what they said, wherever the goal lies."""
-    config = tiny('HandManipulateBlockFull')
-    before, after = config.goal_features, read_initial_networks(str(block_run))
-    assert before == 'relative' and after.goal_features == 'relative'
-    blind = Trainer(tiny('HandManipulateBlockRotateXYZ'), tmp_path, Workers(), init_from=after)
-    seeing = Trainer(config, tmp_path, Workers(), init_from=after.fitted(config))
-    episodes = blind.collector.collect(blind.learner.actor, random=True)[0]
+    """EggFull from EggRotate: actor and critic say the same wherever the goal lies."""
+    before = Trainer(tiny('HandManipulateEggRotate', goal_features=features), tmp_path, Workers())
+    before.save()
+    config = tiny('HandManipulateEggFull', goal_features=features)
+    networks = read_initial_networks(str(tmp_path))
+    after = Trainer(config, tmp_path, Workers(), init_from=networks.fitted(config))
+    episodes = before.collector.collect(before.learner.actor, random=True)[0]
     observation = torch.tensor(episodes.observation[0])
-    goal = torch.tensor(episodes.desired_goal[0]).repeat(len(observation), 1)
-    goal[:, :3] += 0.03 * torch.randn(len(goal), 3)
-    action = torch.rand(len(goal), 20)
-    found = []
-    for learner in (blind.learner, seeing.learner):
-        features = learner.actor.features(observation, goal)
-        found.append((features, learner.actor(features), learner.critic(features, action)))
-    assert not torch.equal(found[0][0], found[1][0]), 'the position is among the inputs'
-    torch.testing.assert_close(found[0][1:], found[1][1:])
-    assert after.fitted(tiny('HandManipulateBlockRotateParallel')) is after
+    here = torch.tensor(episodes.desired_goal[0]).repeat(len(observation), 1)
+    there = here + torch.tensor([0.03, -0.02, 0.05, 0.0, 0.0, 0.0, 0.0])
+    action = torch.rand(len(here), 20)
+    learner, found = after.learner, []
+    for goal in (here, there):
+        inputs = learner.actor.features(observation, goal)
+        found.append((learner.actor(inputs), learner.critic(inputs, action), inputs))
+    assert not torch.equal(found[0][2], found[1][2]), 'the position is among the inputs'
+    torch.testing.assert_close(found[0][:2], found[1][:2])
+    first = 'actor.network.hidden.0.weight'
+    fitted = networks.fitted(config).tensors
+    assert (fitted[first] != networks.tensors[first]).any(dim=0).sum() in (3, 6)
+    assert all(
+        torch.equal(fitted[k], v) for k, v in networks.tensors.items() if 'hidden.0.w' not in k
+    )
+    block = read_initial_networks(str(block_run))
+    assert block.fitted(tiny('HandManipulateBlockRotateParallel')) is block
 
 
 def test_where_it_started_is_kept_through_resume_and_shipped(
