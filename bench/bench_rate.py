@@ -1,7 +1,8 @@
 """The rate of `joint_states` in real time, as an independent subscriber sees it.
 
-`make bench-rate` runs it: on the machine as it is, then with every CPU kept busy by a process of
-its own. Late ticks are those `sim_node` counts itself, read from `/diagnostics`.
+`make bench-rate` runs it: on the machine as it is, while somebody sends ten messages of 10 MB a
+second, then with every CPU kept busy by a process of its own. Late ticks are those `sim_node`
+counts itself, read from `/diagnostics`. At the end: how soon after its start a policy commands.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +34,7 @@ from msgs_spec.ros import (  # noqa: E402
 )
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic  # noqa: E402
-from msgs_spec.transport import keep_discovery_local  # noqa: E402
+from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402
 
 
 class Watcher:
@@ -43,14 +45,14 @@ class Watcher:
         self.missed = 0
         self._node = rclpy.create_node('watcher')
         for spec, callback in ((joint_states, self._on_state), (DIAGNOSTICS, self._on_report)):
-            self._node.create_subscription(
-                ros_message_class(spec.type_name),
-                spec.name,
-                callback,
-                rclpy_profile(spec.qos),
-                raw=spec is joint_states,
-            )
+            self.subscribe(spec, callback, raw=spec is joint_states)
         self._loop = EventLoop(self._node)
+
+    def subscribe(self, spec: TopicSpec, callback: Callable[[Any], None], raw: bool) -> None:
+        """Subscribes to a topic, as bytes if `raw`."""
+        self._node.create_subscription(
+            ros_message_class(spec.type_name), spec.name, callback, rclpy_profile(spec.qos), raw=raw
+        )
 
     def watch(self, seconds: float) -> None:
         """Serves callbacks for this long."""
@@ -89,8 +91,25 @@ def report(label: str, times: list[float], missed: int, factor: float) -> None:
     )
 
 
+def first_command(watcher: Watcher, task: str, commands: list[float]) -> float:
+    """Starts a policy; returns the seconds until it commands, which is noted in `commands`."""
+    commands.clear()
+    started = time.perf_counter()
+    words = ['-m', 'policy_node.node', '--ros-args', '-p', f'task:={task}']
+    policy = subprocess.Popen([sys.executable, *words], cwd=ROOT)
+    try:
+        while not commands:
+            watcher.watch(0.01)
+            if policy.poll() is not None:
+                raise SystemExit('bench_rate: the policy ended')
+        return commands[0] - started
+    finally:
+        policy.send_signal(signal.SIGINT)
+        policy.wait()
+
+
 def main() -> int:
-    """Measures twice and prints both."""
+    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--task', default='FetchPush', choices=tuple(TASKS))
     parser.add_argument('--seconds', type=float, default=60.0, help='per measurement')
@@ -98,30 +117,44 @@ def main() -> int:
     parser.add_argument('--busy', type=int, default=os.cpu_count(), help='busy processes; 0: none')
     options = parser.parse_args()
     keep_discovery_local()
+    leave_out_shared_memory()
     rclpy.init()
-    watcher = Watcher(topic(task_spec(options.task), 'joint_states'))
+    spec = task_spec(options.task)
+    watcher = Watcher(topic(spec, 'joint_states'))
     parameters = [f'task:={options.task}', f'real_time_factor:={options.real_time_factor}']
     words = [word for parameter in parameters for word in ('-p', parameter)]
     command = [sys.executable, '-m', 'fetch_hand_sim.sim_node', '--ros-args', *words]
     sim = subprocess.Popen(command, cwd=ROOT)
-    busy: list[subprocess.Popen[bytes]] = []
     print(f'{options.task} on {platform.machine()}, {os.cpu_count()} CPUs')
+    spin, send = ['-c', 'while True: pass'], ['bench/large_messages.py']
+    phases: list[tuple[str, list[list[str]]]] = [
+        ('machine as it is', []),
+        ('10 messages of 10 MB a second', [send]),
+        (f'{options.busy} busy processes', [spin] * options.busy),
+    ]
     try:
         watcher.wait_for_ticks()
-        for count in (0, options.busy) if options.busy else (0,):
-            busy += [
-                subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(count)
-            ]
-            watcher.watch(2.0)
-            watcher.times.clear()
-            before = watcher.missed
-            watcher.watch(options.seconds)
-            label = f'{count} busy processes' if count else 'machine as it is'
-            times, missed = list(watcher.times), watcher.missed - before
+        for label, programs in phases if options.busy else phases[:2]:
+            others = [subprocess.Popen([sys.executable, *words], cwd=ROOT) for words in programs]
+            try:
+                watcher.watch(4.0)
+                watcher.times.clear()
+                before = watcher.missed
+                watcher.watch(options.seconds)
+                times, missed = list(watcher.times), watcher.missed - before
+            finally:
+                for process in others:
+                    process.kill()
+                    process.wait()
             report(label, times, missed, options.real_time_factor)
+        commands: list[float] = []
+        watcher.subscribe(
+            topic(spec, 'commands'), lambda data: commands.append(time.perf_counter()), raw=True
+        )
+        for _ in range(5):
+            seconds = first_command(watcher, options.task, commands)
+            print(f'first command {seconds:.2f} s after the start of a policy', flush=True)
     finally:
-        for process in busy:
-            process.kill()
         sim.send_signal(signal.SIGINT)
         code = sim.wait()
     rclpy.shutdown()

@@ -1,0 +1,40 @@
+"""Sends messages of 10 MB as commands, ten a second, until it is ended, for `bench_rate.py`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import rclpy  # noqa: E402
+
+from msgs_spec.cdr import TopicCodec  # noqa: E402
+from msgs_spec.ros import rclpy_profile, ros_message_class  # noqa: E402
+from msgs_spec.tasks import task_spec  # noqa: E402
+from msgs_spec.topics import topic  # noqa: E402
+from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402
+
+BYTES = 10_000_000
+
+
+def main() -> None:
+    """Publishes for ever."""
+    keep_discovery_local()
+    leave_out_shared_memory()
+    rclpy.init()
+    commands = topic(task_spec('FetchReach'), 'commands')
+    large = TopicCodec(commands).encode(0, [0.0] * 4) + bytes(BYTES)
+    node = rclpy.create_node('large_messages')
+    publisher = node.create_publisher(
+        ros_message_class(commands.type_name), commands.name, rclpy_profile(commands.qos)
+    )
+    while True:
+        publisher.publish(large)
+        time.sleep(0.1)
+
+
+if __name__ == '__main__':
+    main()
