@@ -58,10 +58,21 @@ def quaternion_conjugate(quaternion: ArrayLike) -> Array:
 def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
     """Unit quaternions wxyz from axes (..., 3) of any length and angles (...) in radians."""
     direction = np.array(axis, dtype=np.float64)
-    direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction = direction / _length(direction)
     half = np.asarray(angle, dtype=np.float64)[..., None] / 2.0
     quaternion = np.concatenate([np.cos(half), np.sin(half) * direction], axis=-1)
-    return np.asarray(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True))
+    return np.asarray(quaternion / _length(quaternion))
+
+
+def _length(vectors: Array) -> Array:
+    """Lengths (..., 1) of vectors (..., n), each taken alone as `np.linalg.norm` does.
+
+    That is BLAS, which on many processors rounds once less than a sum along an axis: one start in
+    eight would otherwise differ from Gymnasium-Robotics in its last bit, and soon in all.
+    """
+    rows = vectors.reshape(-1, vectors.shape[-1])
+    lengths = np.array([np.linalg.norm(row) for row in rows])
+    return lengths.reshape(*vectors.shape[:-1], 1)
 
 
 def quaternion_to_matrix(quaternion: ArrayLike) -> Array:

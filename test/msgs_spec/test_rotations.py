@@ -7,6 +7,7 @@ import platform
 import mujoco
 import numpy as np
 import pytest
+from gymnasium_robotics.envs.shadow_dexterous_hand.manipulate import quat_from_angle_and_axis
 from gymnasium_robotics.utils import rotations as reference
 
 from msgs_spec import rotations
@@ -88,6 +89,15 @@ def test_quaternion_from_axis_angle_equals_mujoco():
         mujoco.mju_axisAngle2Quat(quaternion, axis / np.linalg.norm(axis), angle)
     ours = rotations.quaternion_from_axis_angle(axes, angles)
     np.testing.assert_allclose(ours, expected, atol=1e-15)
+
+
+def test_quaternion_from_axis_angle_equals_the_reference_to_the_last_bit():
+    """As the reference draws the start of an object: one by one."""
+    generator = np.random.default_rng(7)
+    for _ in range(COUNT):
+        angle, axis = generator.uniform(-np.pi, np.pi), generator.uniform(-1.0, 1.0, size=3)
+        ours = rotations.quaternion_from_axis_angle(axis, angle)
+        assert_same_bits(ours, quat_from_angle_and_axis(angle, axis))
 
 
 def test_message_order_and_back():
