@@ -272,13 +272,16 @@ def _run(load: Callable[[], Callable[[], RunnableNode]], stop: StopSignals) -> N
         destroy(node)
 
 
-def destroy(node: RunnableNode | Node) -> None:
+def destroy(node: RunnableNode | Node, exit_code: int | None = None) -> None:
     """Destroys a node whose work is done; if that takes too long the process ends all the same.
 
-    It then ends as it would have: with 0, or with the code of the error on its way.
+    Args:
+        node: Of a process that has nothing else to do.
+        exit_code: What the process then ends with; None for 0, or the code of the error on its way.
     """
     error = sys.exception()
-    exit_code = EXIT_SUCCESS if error is None else getattr(error, 'exit_code', EXIT_FAILURE)
+    if exit_code is None:
+        exit_code = EXIT_SUCCESS if error is None else getattr(error, 'exit_code', EXIT_FAILURE)
     with ends_within(_DESTROY_SECONDS, exit_code):
         node.destroy_node()
 

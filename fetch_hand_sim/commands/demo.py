@@ -27,6 +27,7 @@ from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import EpisodeReadError, EpisodeRecord, read_episode
 from msgs_spec.codecs import decode_status
 from msgs_spec.command_line import (
+    EXIT_FAILURE,
     EXIT_SUCCESS,
     CommandParser,
     FormerOption,
@@ -37,7 +38,7 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
-from msgs_spec.ros import StopSignals, rclpy_profile, ros_message_class
+from msgs_spec.ros import StopSignals, destroy, rclpy_profile, ros_message_class
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
@@ -112,10 +113,10 @@ class Watcher:
         """Serves callbacks for a moment."""
         self._executor.spin_once(timeout_sec=0.05)
 
-    def close(self) -> None:
-        """Leaves the graph."""
+    def close(self, exit_code: int) -> None:
+        """Leaves the graph; a process that cannot ends with `exit_code`."""
         self._executor.remove_node(self._node)
-        self._node.destroy_node()
+        destroy(self._node, exit_code)
 
     def _on_status(self, message: Any) -> None:
         self.status = EpisodeStatus.from_values(decode_status(message))
@@ -144,8 +145,16 @@ class Demo:
 
     def run(self, stop: StopSignals) -> int:
         """Runs the demo and returns the exit code."""
-        commander = self._policy()
+        commander, exit_code = self._policy(), EXIT_FAILURE
         watcher = Watcher(self._spec)
+        try:
+            exit_code = self._play(commander, watcher, stop)
+            return exit_code
+        finally:
+            watcher.close(exit_code)
+
+    def _play(self, commander: str, watcher: Watcher, stop: StopSignals) -> int:
+        """Runs the nodes, prints what they did and returns the exit code."""
         began = time.monotonic()
         with _logs() as logs:
             policy = start_node('policy_node', [f'policy:={commander}'], logs)
@@ -156,12 +165,11 @@ class Demo:
                     complain(_NAME, 'stopping')
             finally:
                 codes = [stop_node(process) for process in (sim, policy)]
-                watcher.close()
             self._print_new_rows()
             if any(codes) or (len(self._rows) < self._options.episodes and not stop):
                 self._console.print(Path(logs.name).read_text(), markup=False, highlight=False)
                 self._console.print(f'the nodes ended with exit codes {codes}')
-                return 1
+                return EXIT_FAILURE
         self._print_summary(time.monotonic() - began)
         return _SIGNALLED + signal.Signals[stop.received] if stop.received else EXIT_SUCCESS
 
