@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -265,7 +265,7 @@ def validate(spec: ParameterSpec, value: object) -> None:
         ValueError: If it is not allowed; the message is one line and says what is.
     """
     if not _is_allowed(spec, value):
-        hint = _suggestion(str(value), spec.choices)
+        hint = _suggestion(str(value), {choice: choice for choice in spec.choices})
         raise ValueError(f'{spec.name}: {value!r} given; allowed: {spec.allowed}{hint}')
 
 
@@ -296,13 +296,15 @@ def unknown_parameter(specs: Sequence[ParameterSpec], name: str) -> str | None:
     is_known = any(name in (spec.name, spec.former) for node in NODES.values() for spec in node)
     if is_known or name == 'use_sim_time' or name.startswith('qos_overrides.'):
         return None
-    hint = _suggestion(name, [spec.name for spec in specs])
+    # Who mistypes a former name means the one of today.
+    names = {known: spec.name for spec in specs for known in (spec.former, spec.name) if known}
+    hint = _suggestion(name, names)
     return f'there is no parameter {name!r}{hint or "; it is ignored"}'
 
 
-def _suggestion(given: str, allowed: Iterable[str]) -> str:
-    """What was probably meant, to end a line with."""
-    by_lower = {name.lower(): name for name in allowed if name}
+def _suggestion(given: str, allowed: Mapping[str, str]) -> str:
+    """What was probably meant, to end a line with: the value of the key most alike."""
+    by_lower = {name.lower(): meant for name, meant in allowed.items() if name}
     found = difflib.get_close_matches(given.lower(), by_lower, n=1)
     return f'; did you mean {by_lower[found[0]]!r}?' if found else ''
 

@@ -182,11 +182,15 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 
 
 def set_callback(
-    specs: Iterable[ParameterSpec],
+    specs: Iterable[ParameterSpec], *, makes_time: bool = False
 ) -> Callable[[list[Parameter]], SetParametersResult]:
     """Returns the callback for `Node.add_on_set_parameters_callback` that checks new values.
 
     Parameters of other names pass: they belong to ROS.
+
+    Args:
+        specs: Parameters of the node.
+        makes_time: Whether it makes simulated time, so that it can follow none.
     """
     from rcl_interfaces.msg import SetParametersResult
 
@@ -197,6 +201,8 @@ def set_callback(
             for parameter in parameters:
                 if parameter.name in by_name:
                     validate(by_name[parameter.name], parameter.value)
+                elif makes_time and parameter.name == 'use_sim_time' and parameter.value:
+                    raise ValueError('use_sim_time: this node makes simulated time, follows none')
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -47,15 +47,22 @@ class ReceivedAllowance:
         self._messages: Counter[str] = Counter()
         self._bytes: Counter[str] = Counter()
 
-    def takes(self, topic: str, size: int, has_room: bool = True) -> bool:
-        """Whether a message of `size` bytes is logged; only if the file has room for it."""
+    def takes(
+        self, topic: str, size: int, has_room: bool = True, *, is_refused: bool = False
+    ) -> bool:
+        """Whether a message of `size` bytes is logged; only if the file has room for it.
+
+        Those that the robot refused get half of the allowance at most, so that a flood of them
+        takes no room from what decides the episode, and are counted as `<topic> (refused)`.
+        """
+        share = 2 if is_refused else 1
         if (
             not has_room
             or size > MAX_MESSAGE_BYTES
-            or self._messages[topic] >= MAX_RECEIVED_MESSAGES
-            or self._bytes[topic] + size > MAX_RECEIVED_BYTES
+            or self._messages[topic] >= MAX_RECEIVED_MESSAGES // share
+            or self._bytes[topic] + size > MAX_RECEIVED_BYTES // share
         ):
-            self.omitted[topic] += 1
+            self.omitted[f'{topic} (refused)' if is_refused else topic] += 1
             return False
         self._messages[topic] += 1
         self._bytes[topic] += size

@@ -130,8 +130,13 @@ class EpisodeWriter:
             self._flush(stamp_ns)
         return self._is_open
 
-    def write_received(self, topic: TopicSpec, data: bytes) -> bool:
+    def write_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> bool:
         """Appends a message received since the last tick: it follows the messages of that tick.
+
+        Args:
+            topic: Of the message.
+            data: CDR bytes.
+            is_refused: Whether it decided nothing; such a one may be left out sooner.
 
         Returns:
             False if it is not taken: the allowance of its topic is used up, or see `write`.
@@ -143,7 +148,7 @@ class EpisodeWriter:
             return False
         # While a robot is paused, what it receives is flushed without end.
         has_room = self._bag.takes(len(data)) and self._bag.chunks <= MAX_CHUNKS // 2
-        if not self._received.takes(topic.name, len(data), has_room):
+        if not self._received.takes(topic.name, len(data), has_room, is_refused=is_refused):
             return False
         return self._append_next(topic, data)
 

@@ -6,6 +6,7 @@ times and metadata keys, so whatever reads the node's episodes reads these.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -75,16 +76,22 @@ class EpisodeGenerator:
 
         Raises:
             EpisodeLogError: If a file cannot be written.
+            KeyboardInterrupt: At Ctrl-C, after what is finished.
         """
         with ThreadPoolExecutor(_COMPLETING_THREADS, 'episode_log') as pool:
-            waiting: list[Future[LoggedEpisode]] = []
-            for first in range(0, episodes, self._simulation.num_envs):
-                count = min(self._simulation.num_envs, episodes - first)
-                robots = [self._robot(first + i, first_seed) for i in range(count)]
-                self._run(robots, first_seed + first)
-                yield from (future.result() for future in waiting)
-                waiting = [pool.submit(_complete, self._write(robot), robot) for robot in robots]
-            yield from (future.result() for future in waiting)
+            waiting: deque[Future[LoggedEpisode]] = deque()
+            try:
+                for first in range(0, episodes, self._simulation.num_envs):
+                    count = min(self._simulation.num_envs, episodes - first)
+                    robots = [self._robot(first + i, first_seed) for i in range(count)]
+                    self._run(robots, first_seed + first)
+                    yield from _completed(waiting)
+                    for robot in robots:
+                        waiting.append(pool.submit(_complete, self._write(robot), robot))
+                yield from _completed(waiting)
+            except KeyboardInterrupt:
+                yield from _completed(waiting)
+                raise
 
     def _robot(self, episode: int, first_seed: int) -> _Robot:
         ticks = self._simulation.spec.episode_ticks + 1
@@ -131,12 +138,24 @@ class EpisodeGenerator:
             self._context.metadata(status),
             self._context.attachments,
         )
-        for stamp_ns, messages, command in robot.messages:
-            writer.write_tick(stamp_ns, messages)
-            if command is not None:
-                writer.write_received(self._commands, command)
+        try:
+            for stamp_ns, messages, command in robot.messages:
+                writer.write_tick(stamp_ns, messages)
+                if command is not None:
+                    writer.write_received(self._commands, command)
+        except KeyboardInterrupt:
+            writer.abort('interrupted')
+            raise
         robot.messages.clear()
         return writer
+
+
+def _completed(waiting: deque[Future[LoggedEpisode]]) -> Iterator[LoggedEpisode]:
+    """Waits for the files, in order; what has not been waited for is left."""
+    while waiting:
+        logged = waiting[0].result()
+        waiting.popleft()
+        yield logged
 
 
 def _complete(writer: EpisodeWriter, robot: _Robot) -> LoggedEpisode:

@@ -70,6 +70,7 @@ class _TickMessages:
 class _Received:
     topic: TopicSpec
     data: bytes
+    is_refused: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +144,10 @@ class EpisodeRecorder:
         if tick.status.phase == 'finished':
             self._end(None)
 
-    def record_received(self, topic: TopicSpec, data: bytes) -> None:
+    def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> None:
         """Logs a message received since the last tick; between episodes there is no file."""
         if self._status is not None:
-            self._put(_Received(topic, data))
+            self._put(_Received(topic, data, is_refused))
 
     def interrupt(self, reason: str) -> None:
         """Completes the running episode, if there is one, marked as cut short."""
@@ -260,8 +261,8 @@ class _EpisodeFiles:
                 )
             case _TickMessages(stamp_ns, messages) if self._writer is not None:
                 self._writer.write_tick(stamp_ns, messages)
-            case _Received(topic, data) if self._writer is not None:
-                self._writer.write_received(topic, data)
+            case _Received(topic, data, is_refused) if self._writer is not None:
+                self._writer.write_received(topic, data, is_refused=is_refused)
             case _End(status, reason) if self._writer is not None:
                 writer, self._writer = self._writer, None
                 writer.end(episode_result(status), reason)

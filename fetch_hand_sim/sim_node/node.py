@@ -83,7 +83,7 @@ class SimNode(Node):
         self._has_introduction = False
         self._beat_due = self._ticked_at = now
         self._report_due = now + REPORT_PERIOD
-        self.add_on_set_parameters_callback(set_callback(SIM_NODE))
+        self.add_on_set_parameters_callback(set_callback(SIM_NODE, makes_time=True))
         self.add_post_set_parameters_callback(self._apply_changes)
 
     # Set-up

@@ -16,8 +16,8 @@ from msgs_spec.topics import TopicSpec
 class ReceivedLog(Protocol):
     """Keeps what was received beside what was published."""
 
-    def record_received(self, topic: TopicSpec, data: bytes) -> None:
-        """Takes the CDR bytes of one message."""
+    def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool) -> None:
+        """Takes the CDR bytes of one message, and whether the robot refused it."""
 
 
 class Receivers:
@@ -62,13 +62,16 @@ class Receivers:
             message = self._read(spec, data)
             if message is None:
                 return
-            if self._log is not None:
-                # Serialised again, because senders leave the bytes between fields uninitialised.
-                self._log.record_received(spec, serialize(spec.type_name, message))
+            is_refused = False
             try:
                 handle(spec, message)
             except ValueError as error:
+                is_refused = True
                 self._warn(f'{spec.name} dropped: {error}')
+            if self._log is not None:
+                # Serialised again, because senders leave the bytes between fields uninitialised.
+                data = serialize(spec.type_name, message)
+                self._log.record_received(spec, data, is_refused=is_refused)
 
         return on_message
 

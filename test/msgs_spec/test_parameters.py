@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from msgs_spec.parameters import NODES, SIM_NODE, unknown_parameter, usage, validate
+from msgs_spec.parameters import NODES, POLICY_NODE, SIM_NODE, unknown_parameter, usage, validate
 from msgs_spec.ros import UsageError, declare_parameters, descriptor, set_callback
 
 SPECS = {
@@ -161,6 +161,11 @@ def test_a_mistyped_parameter_is_named_with_the_nearest(make_node, capfd):
     assert 'use_sim_time' not in said
 
 
+def test_a_mistyped_former_name_points_to_that_of_today():
+    line = unknown_parameter(POLICY_NODE, 'chekpoint')
+    assert line == "there is no parameter 'chekpoint'; did you mean 'policy'?"
+
+
 @pytest.mark.parametrize('name', ['qos_overrides./clock.publisher.depth', 'use_sim_time', 'rate'])
 def test_parameters_of_others_are_no_mistake(name):
     assert unknown_parameter(SIM_NODE, name) is None
@@ -209,4 +214,8 @@ def test_new_values_are_checked_while_the_node_runs(make_node):
     )
     assert node.get_parameter('real_time_factor').value == 0.5
     assert put('task', 'FetchPush') == (False, 'Trying to set a read-only parameter: task.')
+    assert put('use_sim_time', False) == (True, '')
+    node.add_on_set_parameters_callback(set_callback(SIM_NODE, makes_time=True))
+    is_taken, reason = put('use_sim_time', True)
+    assert (is_taken, 'this node makes simulated time' in reason) == (False, True)
     assert put('use_sim_time', False) == (True, '')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import suppress
 
 import numpy as np
@@ -114,5 +115,30 @@ def test_the_check_takes_the_goals_that_the_robot_took(tmp_path, interface_versi
     path, count = record_with_goals(tmp_path, interface_version)
     assert count == taken
     assert len(read_episode(path).topics['/set_goal'].messages) == 6
+    result = EpisodeChecker().check(path)
+    assert result.difference is None, result
+
+
+def test_a_flood_of_refused_goals_leaves_an_episode_that_can_be_checked(tmp_path):
+    recorder = Recorder('FetchReach')
+    runner, encoder = recorder.runner, TickEncoder(recorder.spec)
+    writer = EpisodeDirectory(tmp_path).begin('FetchReach', 0, recorder.metadata())
+    refused = goal_message([1.3, 0.7, 0.5], 'x' * 28_000)
+    taken = goal_message([1.3, 0.6, 0.5])
+    logged = 0
+    for number in range(recorder.spec.episode_ticks + 1):
+        tick = runner.advance(runner.resting_command())
+        latched = tick.status.phase != 'running'
+        writer.write_tick(tick.stamp_ns, encoder.encode(tick, latched=latched))
+        if number == 10:
+            data = serialize(SET_GOAL.type_name, refused)
+            for _ in range(300):
+                logged += writer.write_received(SET_GOAL, data, is_refused=True)
+            assert writer.write_received(SET_GOAL, serialize(SET_GOAL.type_name, taken))
+            accept_goal(runner, SET_GOAL, taken)
+    path = writer.finish({})
+    assert 0 < logged < 40
+    omitted = json.loads(read_episode(path).result['received_not_logged'])
+    assert omitted == {'set_goal (refused)': 300 - logged}
     result = EpisodeChecker().check(path)
     assert result.difference is None, result

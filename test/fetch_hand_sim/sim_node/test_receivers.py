@@ -59,10 +59,11 @@ class Log:
     """Notes what would be logged."""
 
     def __init__(self):
-        self.received = []
+        self.received, self.refused = [], 0
 
-    def record_received(self, topic, data):
+    def record_received(self, topic, data, *, is_refused):
         self.received.append((topic.name, data))
+        self.refused += is_refused
 
 
 @pytest.fixture
@@ -98,6 +99,7 @@ def test_a_message_is_logged_if_it_can_be_read_and_as_short_as_a_log_allows(list
         receive(listening, COMMANDS, array(layout=layout, data=np.zeros(size)))
     listening.receivers.callback(COMMANDS)(b'no message')
     assert [len(data) for _, data in listening.log.received] == [52, 44, 20 + 8 * longest]
+    assert listening.log.refused == 2
     assert listening.robot.buffer.accepted == 1
     assert dict(listening.robot.buffer.rejected) == {
         'wrong size': 2,

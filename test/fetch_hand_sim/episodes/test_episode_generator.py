@@ -1,0 +1,60 @@
+"""Episodes by the thousand, and Ctrl-C; what they contain is in `test_episode_tools.py`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.episode_log import EpisodeWriter
+from fetch_hand_sim.episodes.context import RecordingContext
+from fetch_hand_sim.episodes.generator import EpisodeGenerator
+from fetch_hand_sim.simulation import Simulation
+
+ROBOTS = 2
+
+
+def test_ctrl_c_tells_of_every_episode_that_is_finished(tmp_path: Path) -> None:
+    logged = []
+    simulation = Simulation('FetchReach', num_envs=ROBOTS, num_threads=1)
+    asked = 0
+
+    def act(observation: object) -> np.ndarray:
+        nonlocal asked
+        asked += 1
+        if asked == 2 * simulation.spec.episode_ticks + 10:
+            raise KeyboardInterrupt
+        return np.zeros((ROBOTS, 4))
+
+    generator = EpisodeGenerator(simulation, tmp_path, act, RecordingContext(simulation))
+    with pytest.raises(KeyboardInterrupt):
+        for each in generator.generate(10 * ROBOTS):
+            logged.append(each.path)
+    assert logged == sorted(tmp_path.iterdir())
+    assert len(logged) == 2 * ROBOTS
+
+
+def test_ctrl_c_while_a_file_is_written_leaves_nothing_hidden(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written, write = 0, EpisodeWriter.write_received
+
+    def interrupted(self: EpisodeWriter, *arguments: object, **options: object) -> bool:
+        nonlocal written
+        written += 1
+        if written == 70:
+            raise KeyboardInterrupt
+        return write(self, *arguments, **options)
+
+    monkeypatch.setattr(EpisodeWriter, 'write_received', interrupted)
+    logged = []
+    simulation = Simulation('FetchReach', num_envs=ROBOTS, num_threads=1)
+    context = RecordingContext(simulation)
+    generator = EpisodeGenerator(simulation, tmp_path, lambda _: np.zeros((ROBOTS, 4)), context)
+    with pytest.raises(KeyboardInterrupt):
+        for each in generator.generate(ROBOTS):
+            logged.append(each.path)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert len(logged) == 1 and len(names) == 2
+    assert not any(name.startswith('.') for name in names)
