@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from msgs_spec.tasks import TASKS
+from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, Job
 from policy_node.training.learning.recipes import recipe_config
 
@@ -34,6 +34,21 @@ STARTS_FROM = {
     'HandManipulateEggFull': 'HandManipulateEggRotate',
     'HandManipulatePenFull': 'HandManipulatePenRotate',
 }
+# What keeps what the networks know already: a full replay before the first update, smaller steps,
+# less noise; and where goals gain a position, goals that are coarse at first (docs/training.md).
+_FINE_TUNING = {
+    'learning_starts': 100_000,
+    'learning_rate': 5e-4,
+    'noise_std': 0.15,
+    'random_epsilon': 0.2,
+}
+_COARSE_FIRST = {'first_distance': 8.0}
+
+
+def start_from(task: str, networks: str) -> dict[str, Any]:
+    """Fields of a run that starts from the networks of the task named in `STARTS_FROM`."""
+    coarse = _COARSE_FIRST if task_spec(task).position_counts else {}
+    return {**_FINE_TUNING, **coarse, 'init_from': networks}
 
 
 def reduced_budget(task: str) -> dict[str, Any]:
@@ -109,8 +124,8 @@ def best_jobs(
     for seed in seeds:
         for task in (name for name in BEST_ORDER if name in tasks):
             before = jobs.get((STARTS_FROM.get(task, ''), seed))
-            start = {'init_from': str(before.folder)} if before else {}
-            config = recipe_config(task, 'best', **{**overrides, **start, 'seed': seed})
+            start = start_from(task, str(before.folder)) if before else {}
+            config = recipe_config(task, 'best', **{**start, **overrides, 'seed': seed})
             folder = output / task / BEST_ARM.name / f'seed{seed}'
             jobs[task, seed] = Job(BEST_ARM, config, folder, before)
     return list(jobs.values())

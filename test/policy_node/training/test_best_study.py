@@ -18,7 +18,7 @@ from policy_node.policies import checkpoint
 from policy_node.training.benchmark.actors_table import steps_behind
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.jobs import Job
-from policy_node.training.benchmark.studies import STARTS_FROM
+from policy_node.training.benchmark.studies import STARTS_FROM, start_from
 from policy_node.training.benchmark.workers import LOG_FILE, Outcome, run_jobs
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import read_progress
@@ -29,6 +29,7 @@ TINY = [
     *['--study', 'best', '--set', 'num_envs=2', '--set', 'updates_per_cycle=2'],
     *['--set', 'batch_size=32', '--set', 'evaluation_episodes=2', '--set', 'evaluate_every=1000'],
     *['--set', 'hidden_sizes=32,32', '--set', 'replay_transitions=4000'],
+    *['--set', 'learning_starts=0'],
 ]
 EGGS = ['HandManipulateEggRotate', 'HandManipulateEggFull']
 
@@ -44,11 +45,15 @@ def test_every_task_is_trained_with_its_best_recipe_after_what_it_starts_from(
     assert {job.config.task for job in jobs} == set(TASKS) and len(jobs) == len(TASKS)
     for number, job in enumerate(jobs):
         start = STARTS_FROM.get(job.config.task)
-        chained = {'init_from': str(tmp_path / start / 'best' / 'seed0')} if start else {}
+        folder = str(tmp_path / start / 'best' / 'seed0') if start else ''
+        chained = start_from(job.config.task, folder) if start else {}
         threads = {'simulation_threads': 1, 'torch_threads': 1}
         assert job.config == recipe_config(job.config.task, 'best', **threads, **chained)
         assert job.is_ready == (start is None)
+        gains_position = job.config.task.endswith('Full') and start is not None
+        assert (job.config.first_distance > 1.0) == gains_position
         if start:
+            assert job.config.init_from == folder and job.config.learning_starts > 0
             assert job.after in jobs[:number] and job.after.config.task == start
 
 
