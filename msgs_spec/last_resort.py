@@ -11,7 +11,7 @@ from __future__ import annotations
 import ctypes
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 _CLOCK_MONOTONIC = 1
 _SIGEV_THREAD = 2
@@ -45,8 +45,10 @@ def ends_within(seconds: float, exit_code: int) -> Iterator[None]:
     Nothing is flushed but standard output and error, and these before. It works where the C library
     is glibc; elsewhere nothing happens.
     """
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        # Whoever read it may be gone.
+        with suppress(OSError, ValueError):
+            stream.flush()
     disarm = _arm(seconds, exit_code)
     try:
         yield

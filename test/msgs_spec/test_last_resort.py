@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -35,3 +36,18 @@ def test_a_process_that_is_held_ends_with_its_own_exit_code(code: int) -> None:
 
 def test_a_process_that_is_let_go_in_time_goes_on() -> None:
     assert run(0.5, 3, held=0.1)[:2] == (0, 'done\nleft\n')
+
+
+def test_output_that_nobody_reads_any_more_is_no_obstacle() -> None:
+    program = HELD.format(limit=5, code=3, microseconds=1000).replace(
+        "print('left')", "open('/dev/stderr', 'w').write('left')"
+    )
+    held = subprocess.Popen(
+        [sys.executable, '-c', f'import time; time.sleep(.5)\n{program}'],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={name: value for name, value in os.environ.items() if name != 'PYTHONUNBUFFERED'},
+    )
+    assert held.stdout is not None
+    held.stdout.close()
+    assert b'left' in held.communicate(timeout=30)[1]
