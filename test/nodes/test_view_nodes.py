@@ -140,7 +140,10 @@ def test_the_page_commands_until_somebody_else_does(start_process: Start) -> Non
             lambda p: not p.facts.is_commanding and 'your sliders do not' in p.facts.notice,
             'page that gives way',
         )
-        assert connection.node.count_publishers('/commands') == 1
+        # The robot may know the policy before this client does.
+        connection.spin_until(
+            lambda: connection.node.count_publishers('/commands') == 1, 'commands of one node'
+        )
         follower.robot.perform(SetCommand(values))
         stamp = follower.picture.stamp_ns
         follower.until(lambda p: p.stamp_ns > stamp + 10**9, 'a second more')
