@@ -91,6 +91,29 @@ def report(label: str, times: list[float], missed: int, factor: float) -> None:
     )
 
 
+def measure_beside(
+    programs: list[list[str]], watcher: Watcher, seconds: float
+) -> tuple[list[float], int]:
+    """Watches the robot while other programs run; returns arrival times and ticks missed.
+
+    Args:
+        programs: What Python is started with, for each.
+        watcher: Listens to the robot.
+        seconds: How long, after a while to settle.
+    """
+    others = [subprocess.Popen([sys.executable, *program], cwd=ROOT) for program in programs]
+    try:
+        watcher.watch(4.0)
+        watcher.times.clear()
+        before = watcher.missed
+        watcher.watch(seconds)
+        return list(watcher.times), watcher.missed - before
+    finally:
+        for process in others:
+            process.kill()
+            process.wait()
+
+
 def first_command(watcher: Watcher, task: str, commands: list[float]) -> float:
     """Starts a policy; returns the seconds until it commands, which is noted in `commands`."""
     commands.clear()
@@ -135,17 +158,7 @@ def main() -> int:
     try:
         watcher.wait_for_ticks()
         for label, programs in phases if options.busy else phases[:2]:
-            others = [subprocess.Popen([sys.executable, *words], cwd=ROOT) for words in programs]
-            try:
-                watcher.watch(4.0)
-                watcher.times.clear()
-                before = watcher.missed
-                watcher.watch(options.seconds)
-                times, missed = list(watcher.times), watcher.missed - before
-            finally:
-                for process in others:
-                    process.kill()
-                    process.wait()
+            times, missed = measure_beside(programs, watcher, options.seconds)
             report(label, times, missed, options.real_time_factor)
         commands: list[float] = []
         watcher.subscribe(

@@ -297,7 +297,7 @@ def unknown_parameter(specs: Sequence[ParameterSpec], name: str) -> str | None:
     if is_known or name == 'use_sim_time' or name.startswith('qos_overrides.'):
         return None
     # Who mistypes a former name means the one of today.
-    names = {known: spec.name for spec in specs for known in (spec.former, spec.name) if known}
+    names = {known: spec.name for spec in specs for known in (spec.former, spec.name)}
     hint = _suggestion(name, names)
     return f'there is no parameter {name!r}{hint or "; it is ignored"}'
 

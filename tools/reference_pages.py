@@ -18,6 +18,7 @@ from pathlib import Path
 from fetch_hand_sim.commands.main import COMMANDS, Command
 from msgs_spec.tasks import TASKS
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.config_fields import ConfigFields
 from policy_node.training.learning.config_rules import CHOICES, RANGES
 from policy_node.training.learning.recipes import recipe_config
 
@@ -74,7 +75,7 @@ def help_of(path: tuple[str, ...]) -> str:
 
 def train_config_page() -> str:
     """Returns the fields of `TrainConfig`, and where the recipes differ from their defaults."""
-    documented = field_docstrings(TrainConfig)
+    documented = field_docstrings(ConfigFields)
     ranges = {name: _range(low, high) for name, low, high in RANGES}
     choices = {name: ', '.join(map(_code, values)) for name, values in CHOICES.items()}
     allowed = {'task': f'one of the {len(TASKS)} tasks'} | ranges | choices

@@ -6,12 +6,10 @@ from typing import Any
 
 from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, TaskSpec, task_spec
 from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
+from policy_node.training.learning.config_fields import ConfigFields
 from policy_node.training.learning.goal_choice import GOAL_CHOICES
 from policy_node.training.learning.hindsight import parse_mixture
 from policy_node.training.learning.multi_step import CORRECTIONS
-
-# A `TrainConfig`, which asks this module whether it is allowed and so is not imported here.
-Config = Any
 
 RECIPES = ('paper', 'best')
 # Tasks that ignore their gripper action.
@@ -122,7 +120,7 @@ RANGES = (
 """Least and largest value of the fields that have them."""
 
 
-def require_allowed(config: Config) -> None:
+def require_allowed(config: ConfigFields) -> None:
     """Refuses values that are not allowed, and fields that exclude each other.
 
     Raises:
@@ -143,7 +141,7 @@ def require_allowed(config: Config) -> None:
         raise ValueError(f'hidden_sizes {config.hidden_sizes}; allowed: one or more widths >= 1')
 
 
-def unusual_networks(config: Config) -> list[str]:
+def unusual_networks(config: ConfigFields) -> list[str]:
     """Fields, `name value`, by which a run has networks that few others could start from."""
     found = {name: getattr(config, name) for name in _PLAIN_NETWORKS}
     return [f'{name} {value}' for name, value in found.items() if value != _PLAIN_NETWORKS[name]]
@@ -160,7 +158,7 @@ def require_idle_gripper(task: str) -> None:
         raise ValueError(f'gamble: {task} uses its gripper; allowed: {allowed}')
 
 
-def _refuse_what_has_no_effect(config: Config, spec: TaskSpec) -> None:
+def _refuse_what_has_no_effect(config: ConfigFields, spec: TaskSpec) -> None:
     if config.goals:
         parse_mixture(config.goals)
         if config.strategy == 'none':
@@ -177,13 +175,13 @@ def _refuse_what_has_no_effect(config: Config, spec: TaskSpec) -> None:
     _require_rotation(config, spec)
 
 
-def _require_rotation(config: Config, spec: TaskSpec) -> None:
+def _require_rotation(config: ConfigFields, spec: TaskSpec) -> None:
     for name in ('reward_rotation', 'first_rotation'):
         if spec.rotation_threshold is None and getattr(config, name) != 1.0:
             raise ValueError(f'{name}: goals of {config.task} have no rotation')
 
 
-def _contradictions(config: Config) -> list[tuple[bool, str]]:
+def _contradictions(config: ConfigFields) -> list[tuple[bool, str]]:
     """Fields that exclude each other, or that nothing would look at, and why."""
     sources = config.goals or config.strategy
     replays_later = 'future' in sources or 'near' in sources
@@ -253,7 +251,7 @@ def _contradictions(config: Config) -> list[tuple[bool, str]]:
     ]
 
 
-def _set_for_ddpg(config: Config) -> list[str]:
+def _set_for_ddpg(config: ConfigFields) -> list[str]:
     """What `ppo` would not look at, as it has to be: `name=value`."""
     return [
         f'{name}={str(value).lower()}'
@@ -262,7 +260,7 @@ def _set_for_ddpg(config: Config) -> list[str]:
     ]
 
 
-def _contradictions_of_rates(config: Config) -> list[tuple[bool, str]]:
+def _contradictions_of_rates(config: ConfigFields) -> list[tuple[bool, str]]:
     """The same of what is for other rates than 25 Hz."""
     holds, several = config.longest_hold > 1, config.n_step > 1
     chosen = config.goal_choice != 'uniform'
@@ -308,7 +306,7 @@ def _contradictions_of_rates(config: Config) -> list[tuple[bool, str]]:
     ]
 
 
-def _contradictions_of_subgoals(config: Config) -> list[tuple[bool, str]]:
+def _contradictions_of_subgoals(config: ConfigFields) -> list[tuple[bool, str]]:
     """The same of a high level."""
     guided, every = config.subgoal_every > 0, config.subgoal_every
     conditioned, chosen = config.condition != 'none', config.goal_choice != 'uniform'

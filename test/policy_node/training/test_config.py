@@ -12,7 +12,7 @@ import pytest
 
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.research import STUDIES
-from policy_node.training.learning import config as config_module
+from policy_node.training.learning import config_fields
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.config_rules import RECIPES
 from policy_node.training.learning.config_values import config_from_dict, parse_assignment
@@ -46,7 +46,7 @@ def test_recipes_exist_for_every_task_and_survive_json(task: str, recipe: str) -
 
 
 def test_every_field_is_explained() -> None:
-    source = Path(config_module.__file__).read_text()
+    source = Path(config_fields.__file__).read_text()
     for field in dataclasses.fields(TrainConfig):
         assert re.search(rf'    {field.name}: .*\n    """[^"]+\."""\n', source), field.name
 
