@@ -42,6 +42,9 @@ class ConfigFields:
     geometrically to 1 over the first two thirds. Coarse goals, which are met often, come first."""
     first_rotation: float = 1.0
     """What `reward_rotation` is multiplied by at the start, likewise."""
+    narrow_above: float = 0.0
+    """Share of a cycle's episodes that must end in success, by goals as coarse as they are then,
+    for these to narrow on; steps of other cycles do not count towards it. 0 never waits."""
     strategy: str = 'future'
     """Hindsight goals: final, future, episode, random, futureactual, or none (no hindsight)."""
     hindsight_k: int = 4

@@ -34,6 +34,7 @@ _ON_POLICY: dict[str, Any] = {
     'ticks_after_drop': -1,
     'first_distance': 1.0,
     'first_rotation': 1.0,
+    'narrow_above': 0.0,
     'goal_choice': 'uniform',
     'condition': 'none',
     'n_step': 1,
@@ -78,6 +79,7 @@ RANGES = (
     ('reward_rotation', 1e-3, 1000),
     ('first_distance', 1, 1000),
     ('first_rotation', 1, 1000),
+    ('narrow_above', 0, 1),
     ('moved_share', 0, 1),
     ('ticks_after_drop', -1, _INFINITY),
     ('n_step', 1, 100),
@@ -231,6 +233,10 @@ def _contradictions(config: ConfigFields) -> list[tuple[bool, str]]:
         (
             config.narrows and (conditioned or config.reward_type == 'dense'),
             'first_distance and first_rotation need reward_type sparse and condition none',
+        ),
+        (
+            config.narrow_above > 0 and not config.narrows,
+            'narrow_above needs first_distance or first_rotation above 1',
         ),
         (
             config.narrows and config.subgoal_every > 0,

@@ -48,7 +48,7 @@ class Experience:
     ) -> None:
         self.config = config
         self._workers = workers
-        self._sampler = sampler
+        self._sampler = self._first_sampler = sampler
         self.judge: Judge | None = None
         self.generator = generator
         self.batch_size = workers.share(config.batch_size)
@@ -94,15 +94,28 @@ class Experience:
             self.statistics[name].update(values, self._workers)
             self.statistics[name].write(normalizer)
 
+    def narrow(self, progress: float) -> None:
+        """Rewards goals as a run does in which they have narrowed this far, 0 ... 1."""
+        self._sampler = self._first_sampler.at(progress)
+
+    def count_met(self, episodes: Episodes) -> int:
+        """How many episodes end at their goal, by rewards of now; lost ones do not."""
+        last, desired = episodes.achieved_goal[:, -1], episodes.desired_goal
+        reward = self._sampler.compute_reward(last.astype(np.float64), desired.astype(np.float64))
+        met = reward == 0.0
+        if self.config.drop_is_lost and self._count_ticks is not None:
+            met &= self._count_ticks(episodes) == episodes.ticks
+        return int(met.sum())
+
     def batch(self, env_steps: int) -> Transitions:
         """Draws the transitions of one update, after `env_steps` environment steps."""
-        return self._draw(self.mixture(env_steps), env_steps)
+        return self._draw(self.mixture(env_steps))
 
-    def _draw(self, mixture: dict[str, float], env_steps: int) -> Transitions:
-        """Draws transitions with goals from the sources of a mixture, and rewards of then."""
+    def _draw(self, mixture: dict[str, float]) -> Transitions:
+        """Draws transitions with goals from the sources of a mixture, and rewards of now."""
         replay, generator = self.replay, self.generator
         row = self._draw_rows()
-        return self._sampler.at(env_steps / self.config.total_steps).sample(
+        return self._sampler.sample(
             replay.episodes, row, mixture, generator, replay.valid_ticks, self.judge
         )
 

@@ -154,7 +154,7 @@ class HierarchicalExperience(Experience):
     def batch(self, env_steps: int) -> HierarchicalTransitions:
         """Draws the transitions of one update of both levels."""
         mixture = self.mixture(env_steps)
-        low = self._draw(with_subgoals(mixture), env_steps)
+        low = self._draw(with_subgoals(mixture))
         rows = self._draw_rows()
         high = self._subgoals.sample(self.replay.episodes, rows, mixture, self.generator)
         values = {name: getattr(low, name) for name in Transitions.__slots__}

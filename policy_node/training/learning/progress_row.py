@@ -57,6 +57,7 @@ def progress_row(
         'episodes': counters.episodes,
         'updates': counters.updates,
         'train_success': train_success,
+        'narrowing_steps': counters.narrowing_steps,
         'eval_success': evaluated,
         'eval_episodes': None if outcomes is None else len(outcomes),
         **_diagnostics(outcomes),

@@ -19,6 +19,7 @@ COLUMNS = (
     'episodes',
     'updates',
     'train_success',
+    'narrowing_steps',
     'eval_success',
     'eval_episodes',
     'eval_touched',

@@ -35,7 +35,8 @@ class TransitionSampler:
         reward_scale: What rewards are multiplied by.
         lost_value: What follows the last valid tick of an episode that is longer; None if that is
             still to be learnt.
-        reward_at: Progress of the run, 0 ... 1 -> `compute_reward` of then; None if it stays.
+        reward_at: How far goals have narrowed, 0 ... 1 -> `compute_reward` of then; None if they
+            do not.
     """
 
     compute_reward: RewardFunction
@@ -48,7 +49,7 @@ class TransitionSampler:
     reward_at: Callable[[float], RewardFunction] | None = None
 
     def at(self, progress: float) -> TransitionSampler:
-        """The sampler of a run that is this far, 0 ... 1."""
+        """The sampler of a run in which goals have narrowed this far, 0 ... 1."""
         if self.reward_at is None:
             return self
         return replace(self, compute_reward=self.reward_at(progress))
@@ -204,7 +205,7 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
 
 
 def narrowed(metric: GoalMetric, config: TrainConfig, progress: float) -> GoalMetric:
-    """The metric by which a run that is this far, 0 ... 1, rewards goals."""
+    """The metric by which a run rewards goals that have narrowed this far, 0 ... 1."""
     left = max(1.0 - 1.5 * progress, 0.0)
     return scale_thresholds(
         metric,

@@ -143,6 +143,7 @@ class Trainer:
         """
         state = load_state(path, self.learner, self.experience.statistics)
         self.counters = state.counters
+        self.experience.narrow(state.counters.narrowing_steps / self.config.total_steps)
         origin = state.extra.get('init_from', {})
         self._saver.folder = replace(self._saver.folder, init_from=origin)
         self._let_critic_learn_first()
@@ -267,6 +268,19 @@ class Trainer:
         self.counters.episodes += int(count)
         self.counters.env_steps += int(count) * self.spec.episode_ticks
         self.experience.normalize(episodes, self.learner.actor, self.counters.env_steps)
+        if self.config.narrows:
+            self._narrow(episodes, int(count))
+
+    def _narrow(self, episodes: Episodes, count: int) -> None:
+        """Narrows goals by one cycle of `count` episodes, unless too few of these met theirs."""
+        counters, config = self.counters, self.config
+        if config.narrow_above == 0.0:
+            counters.narrowing_steps = counters.env_steps
+        elif counters.updates > 0:
+            met = self.workers.sum(torch.tensor([self.experience.count_met(episodes)])).item()
+            if met >= config.narrow_above * count:
+                counters.narrowing_steps += count * self.spec.episode_ticks
+        self.experience.narrow(counters.narrowing_steps / config.total_steps)
 
     def _learn(self) -> list[Losses]:
         first = self.workers.share(self.config.learning_starts) if self.counters.updates == 0 else 0

@@ -31,6 +31,7 @@ class Counters:
         best_success: Best evaluated success so far; -1 before the first evaluation.
         best_return: Mean return of that evaluation.
         next_evaluation: Environment steps at which the next evaluation is due.
+        narrowing_steps: Environment steps during which goals narrowed (`narrow_above`).
     """
 
     env_steps: int = 0
@@ -41,6 +42,7 @@ class Counters:
     best_success: float = -1.0
     best_return: float = -1e9
     next_evaluation: int = 0
+    narrowing_steps: int = 0
 
 
 @dataclass(frozen=True, slots=True)

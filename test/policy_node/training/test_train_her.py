@@ -23,7 +23,7 @@ from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.logged_episodes import read_experience
 from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.run_log import read_progress
+from policy_node.training.learning.run_log import RunLog, read_progress
 from policy_node.training.learning.sampling import scale_thresholds
 from policy_node.training.learning.trainer import (
     Collected,
@@ -264,6 +264,7 @@ def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_p
     trainer = Trainer(config, tmp_path, Workers())
     trainer.experience.replay.add(trainer.collector.collect(trainer.learner.actor, random=True)[0])
     for env_steps, threshold in ((0, 0.2), (1_000, 0.1), (2_000, 0.05), (3_000, 0.05)):
+        trainer.experience.narrow(env_steps / config.total_steps)
         batch = trainer.experience.batch(env_steps)
         position = batch.next_observation[:, :3].astype(np.float64)
         distance = np.linalg.norm(position - batch.goal, axis=-1)
@@ -274,6 +275,44 @@ def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_p
         small_config(first_rotation=2.0)
     with pytest.raises(ValueError, match='need reward_type sparse'):
         small_config(first_distance=2.0, reward_type='dense')
+
+
+@pytest.mark.parametrize(
+    ('first_distance', 'above', 'narrowing_steps'),
+    [(1.1, 0.0, 1_200), (1.1, 1.0, 0), (1000.0, 1.0, 800)],
+)
+def test_goals_narrow_on_only_after_cycles_that_met_them(
+    tmp_path: Path, first_distance: float, above: float, narrowing_steps: int
+) -> None:
+    """Three cycles of 400 steps: nobody misses a goal of 1 m, noise misses some of 0.055 m.
+
+    The first cycle ends before anything was learnt and counts for nothing where goals can wait.
+    """
+    config = small_config(total_steps=1_200, first_distance=first_distance, narrow_above=above)
+    trainer = Trainer(config, tmp_path, Workers())
+    log = RunLog(tmp_path, config.total_steps, config.time_limit)
+    trainer.train(log)
+    log.close()
+    assert trainer.counters.narrowing_steps == narrowing_steps
+    assert read_progress(tmp_path / 'progress.csv')[-1]['narrowing_steps'] == narrowing_steps
+    with pytest.raises(ValueError, match='narrow_above needs first_distance or first_rotation'):
+        small_config(narrow_above=0.5)
+
+
+def test_a_dropped_object_met_no_goal_where_a_drop_is_lost(tmp_path: Path) -> None:
+    """At 8 rad every turn is near enough, but what ends below the palm is not."""
+    counts = []
+    for lost in (False, True):
+        changes = {'first_rotation': 80.0, 'ticks_after_drop': 3, 'drop_is_lost': lost}
+        config = recipe_config('HandManipulatePenRotate', 'best', num_envs=16, **changes)
+        trainer = Trainer(config, tmp_path, Workers())
+        trainer.experience.narrow(0.0)
+        episodes, _ = trainer.collector.collect(trainer.learner.actor, random=True)
+        dropped = (episodes.achieved_goal[:, -4, 2] < 0.04).sum()
+        assert dropped > 0
+        counts.append(trainer.experience.count_met(episodes))
+    assert counts[0] == 16
+    assert counts[1] <= 16 - dropped
 
 
 def test_evaluation_sees_nothing_of_what_training_may_change(tmp_path: Path) -> None:
