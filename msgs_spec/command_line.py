@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shlex
 import signal
 import sys
@@ -18,6 +19,7 @@ from importlib.util import find_spec
 from types import FrameType
 from typing import Any, NoReturn
 
+from msgs_spec.hints import did_you_mean
 from msgs_spec.loading import EXIT_INTERRUPTED as EXIT_INTERRUPTED
 from msgs_spec.loading import is_nobodys
 
@@ -55,8 +57,10 @@ class CommandParser(argparse.ArgumentParser):
     """A parser whose errors are one line, as those of `run_command` are."""
 
     def error(self, message: str) -> NoReturn:
-        """Says what is wrong and exits."""
-        complain(self.prog, message)
+        """Says what is wrong and exits; of an unknown option, which one was probably meant."""
+        unknown = re.match(r'unrecognized arguments: (--[\w-]+)', message)
+        hint = did_you_mean(unknown[1], list(self._option_string_actions)) if unknown else ''
+        complain(self.prog, f'{message}{hint}')
         sys.exit(EXIT_USAGE)
 
 

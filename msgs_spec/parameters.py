@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from msgs_spec.hints import did_you_mean
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
@@ -265,7 +265,7 @@ def validate(spec: ParameterSpec, value: object) -> None:
         ValueError: If it is not allowed; the message is one line and says what is.
     """
     if not _is_allowed(spec, value):
-        hint = _suggestion(str(value), {choice: choice for choice in spec.choices})
+        hint = did_you_mean(str(value), spec.choices)
         raise ValueError(f'{spec.name}: {value!r} given; allowed: {spec.allowed}{hint}')
 
 
@@ -298,15 +298,8 @@ def unknown_parameter(specs: Sequence[ParameterSpec], name: str) -> str | None:
         return None
     # Who mistypes a former name means the one of today.
     names = {known: spec.name for spec in specs for known in (spec.former, spec.name)}
-    hint = _suggestion(name, names)
+    hint = did_you_mean(name, names)
     return f'there is no parameter {name!r}{hint or "; it is ignored"}'
-
-
-def _suggestion(given: str, allowed: Mapping[str, str]) -> str:
-    """What was probably meant, to end a line with: the value of the key most alike."""
-    by_lower = {name.lower(): meant for name, meant in allowed.items() if name}
-    found = difflib.get_close_matches(given.lower(), by_lower, n=1)
-    return f'; did you mean {by_lower[found[0]]!r}?' if found else ''
 
 
 def usage(node: str, summary: str) -> str:

@@ -5,10 +5,7 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
-import inspect
-import itertools
 import os
 import subprocess
 import sys
@@ -19,6 +16,7 @@ from fetch_hand_sim.commands.main import COMMANDS, Command
 from msgs_spec.tasks import TASKS
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.config_fields import ConfigFields
+from policy_node.training.learning.config_options import field_docstrings
 from policy_node.training.learning.config_rules import CHOICES, RANGES
 from policy_node.training.learning.recipes import recipe_config
 
@@ -89,8 +87,9 @@ def train_config_page() -> str:
             [
                 '# Fields of training',
                 'Everything that decides what `train_her` learns: '
-                '`policy_node.training.learning.config.TrainConfig`. Any field can be given as '
-                '`--set name=value`; each is in the JSON of the actor. [Training](../training.md) '
+                '`policy_node.training.learning.config.TrainConfig`. Any field is an option, '
+                '`--learning-rate 1e-4`, or `--set learning_rate=1e-4`; each is in the JSON of the '
+                'actor. [Training](../training.md) '
                 'says what they bought.',
                 _table(('field', 'default', 'allowed', 'meaning'), rows),
                 '## Recipes\n\nWhere a recipe differs from the default. `paper` is given for '
@@ -100,18 +99,6 @@ def train_config_page() -> str:
         )
         + '\n'
     )
-
-
-def field_docstrings(kind: type) -> dict[str, str]:
-    """Returns what stands below each field of a class, on one line."""
-    (definition,) = ast.parse(inspect.getsource(kind)).body
-    assert isinstance(definition, ast.ClassDef)
-    found = {}
-    for field, below in itertools.pairwise(definition.body):
-        match field, below:
-            case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                found[name] = ' '.join(text.split())
-    return found
 
 
 def _recipes() -> str:

@@ -6,7 +6,6 @@ The commands are the executables that `ros2 run fetch_hand_sim` also finds, unde
 from __future__ import annotations
 
 import argparse
-import difflib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ import shtab
 
 from fetch_hand_sim.commands.executables import UnknownExecutableError, find_executable
 from msgs_spec.command_line import EXIT_USAGE, CommandParser, UsageError, run_command, start_command
+from msgs_spec.hints import did_you_mean
 
 _NAME = 'fetch_hand_sim'
 
@@ -126,10 +126,9 @@ class _Parser(CommandParser):
         """Says what is wrong and exits."""
         if "invalid choice: '" in message:
             given = message.split("invalid choice: '")[1].split("'")[0]
-            near = difflib.get_close_matches(given, list(self._names()), 1)
-            message = f'no command {given!r}; ' + (
-                f'did you mean {near[0]!r}?' if near else f'allowed: {", ".join(self._names())}'
-            )
+            names = self._names()
+            hint = did_you_mean(given, names) or f'; allowed: {", ".join(names)}'
+            message = f'no command {given!r}{hint}'
         super().error(message)
 
     def _names(self) -> list[str]:

@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from msgs_spec.command_line import (
     EXIT_SUCCESS,
@@ -20,6 +20,7 @@ from msgs_spec.command_line import (
 )
 from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.config_options import add_field_options, given_fields
 from policy_node.training.learning.config_rules import RECIPES
 from policy_node.training.learning.config_values import config_from_dict, parse_assignment
 from policy_node.training.learning.recipes import recipe_config
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 
 _NAME = 'train_her'
+# Fields that say which recipe there is to start from.
+_OWN_OPTIONS = ('task', 'recipe')
 # A process that a signal ended returns 128 + its number, as shells say it.
 EXIT_SIGNAL = 128
 
@@ -43,41 +46,13 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add('--task', choices=list(TASKS), metavar='TASK', help=', '.join(TASKS))
     add('--recipe', choices=RECIPES, default='best', help='default: best')
-    add('--seed', type=int)
-    add('--num-envs', type=int, help='simulations, of all workers')
-    add(
-        '--threads',
-        type=int,
-        dest='simulation_threads',
-        help='simulation threads; default: what tensors leave',
-    )
-    add('--torch-threads', type=int, help='threads of one tensor operation')
-    add('--steps', type=int, dest='total_steps', help='environment steps of the run')
-    add('--time-limit', type=float, help='seconds')
-    add('--success-target', type=float, help='end when an evaluation reaches it')
     add('--her', action=argparse.BooleanOptionalAction, default=True, help='hindsight on or off')
-    add('--strategy', help='final, future, episode, random, futureactual or none')
-    add('--reward-type', help='sparse or dense')
-    add('--set', action='append', default=[], metavar='NAME=VALUE', help='any field of TrainConfig')
+    add('--set', action='append', default=[], metavar='NAME=VALUE', help='a field by its name')
     add('--output', type=Path, help='default: runs/<task>_<recipe>_seed<seed>')
     add('--resume', type=Path, help='folder of a run to continue; its configuration is kept')
-    add('--init-from', metavar='RUN', help='run folder or actor whose networks it starts from')
     add('--from-episodes', type=Path, metavar='DIR', help='logged episodes to learn from as well')
+    add_field_options(parser, _OWN_OPTIONS)
     return parser.parse_args(arguments)
-
-
-_FIELD_OPTIONS = (
-    'seed',
-    'num_envs',
-    'simulation_threads',
-    'torch_threads',
-    'total_steps',
-    'time_limit',
-    'success_target',
-    'strategy',
-    'reward_type',
-    'init_from',
-)
 
 
 def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
@@ -86,11 +61,7 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
     Raises:
         ValueError: If something is missing, unknown or not allowed.
     """
-    overrides: dict[str, Any] = {
-        name: getattr(options, name)
-        for name in _FIELD_OPTIONS
-        if getattr(options, name) is not None
-    }
+    overrides = given_fields(options, _OWN_OPTIONS)
     if not options.her:
         if overrides.get('strategy', 'none') != 'none':
             raise ValueError(f'--no-her excludes --strategy {overrides["strategy"]}')

@@ -6,6 +6,7 @@ import types
 import typing
 from typing import Any
 
+from msgs_spec.hints import did_you_mean
 from policy_node.training.learning.config import TrainConfig
 
 
@@ -18,12 +19,23 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     name, separator, value = text.partition('=')
     hints = typing.get_type_hints(TrainConfig)
     if not separator or name not in hints:
-        raise ValueError(f'{text!r} is not name=value; names: {", ".join(hints)}')
+        near = did_you_mean(name, list(hints))
+        raise ValueError(f'{text!r} is not name=value{near}; names: {", ".join(hints)}')
+    return name, parse_value(name, value)
+
+
+def parse_value(name: str, text: str) -> Any:
+    """Parses a value of the field `name`.
+
+    Raises:
+        ValueError: If it does not fit the field's type.
+    """
+    kind = typing.get_type_hints(TrainConfig)[name]
     try:
-        return name, _parse(value, hints[name])
+        return _parse(text, kind)
     except ValueError:
-        kind = getattr(hints[name], '__name__', str(hints[name]))
-        raise ValueError(f'{name} {value!r} is not of type {kind}') from None
+        kind = getattr(kind, '__name__', str(kind))
+        raise ValueError(f'{name} {text!r} is not of type {kind}') from None
 
 
 def _parse(value: str, kind: Any) -> Any:
