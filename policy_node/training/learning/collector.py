@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.policy import Policy
-from policy_node.training.learning.exploration import ActionNoise, ParameterNoise, actor_of
+from policy_node.training.learning.exploration import ActionNoise, ParameterNoise
 from policy_node.training.learning.frame_skip import Holder
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.subgoals import Guide, Proposer, subgoal_columns
@@ -117,7 +117,7 @@ class Collector:
         if self._parameters is None:
             return policy
         self._parameters.share = self.exploration
-        return self._parameters.perturb(actor_of(policy))
+        return self._parameters.perturb(policy)
 
     def _adapt(self, policy: Policy, acting: Policy, episodes: Episodes) -> None:
         if self._parameters is not None:

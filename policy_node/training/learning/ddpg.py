@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.actor_critic import ActorCritic
+from policy_node.training.learning.actor_critic import ActorCritic, Losses
 from policy_node.training.learning.advantage import AdvantageCritic
 from policy_node.training.learning.conditions import ACTING_INPUT, fold
 from policy_node.training.learning.config import TrainConfig
@@ -21,7 +21,6 @@ from policy_node.training.learning.density_ratio import DensityRatio, GoalView
 from policy_node.training.learning.devices import uses_bfloat16
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.frame_skip import plain_actor
-from policy_node.training.learning.learner import Losses
 from policy_node.training.learning.replay import Array
 from policy_node.training.learning.transitions import Transitions
 

@@ -9,7 +9,7 @@ import torch
 
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
 from policy_node.training.evaluation.evaluator import success_rate
-from policy_node.training.learning.learner import Losses
+from policy_node.training.learning.actor_critic import Losses
 from policy_node.training.learning.training_state import Counters
 
 

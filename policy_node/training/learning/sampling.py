@@ -12,7 +12,7 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from policy_node.training.learning.conditions import Condition, make_condition
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.frame_skip import HeldSteps
-from policy_node.training.learning.goal_choice import CANDIDATES, GOAL_CHOICES, Judge, best_of
+from policy_node.training.learning.goal_choice import CANDIDATES, GOAL_CHOICES, Judge
 from policy_node.training.learning.hindsight import RewardFunction, draw_sources, flat, goals_of
 from policy_node.training.learning.multi_step import StepCounter, discounted_rewards
 from policy_node.training.learning.replay import Array, Episodes
@@ -169,7 +169,8 @@ class TransitionSampler:
         repeated = starts.select(np.tile(np.arange(len(names)), CANDIDATES))
         batch = self._single(repeated, np.concatenate(candidates))
         score = GOAL_CHOICES[self.goal_choice](judge, batch)
-        best = best_of(score.reshape(CANDIDATES, -1))
+        # The first of equals.
+        best: NDArray[np.intp] = score.reshape(CANDIDATES, -1).argmax(axis=0)
         return np.stack(candidates)[best, np.arange(len(names))]
 
 

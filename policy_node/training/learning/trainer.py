@@ -16,12 +16,12 @@ from msgs_spec.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator, success_rate
+from policy_node.training.learning.actor_critic import Losses
 from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.devices import choose_device
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.initial_networks import CRITIC_FIRST, InitialNetworks
-from policy_node.training.learning.learner import Losses
 from policy_node.training.learning.learners import make_learner
 from policy_node.training.learning.progress_row import Speed, progress_row
 from policy_node.training.learning.replay import Episodes
