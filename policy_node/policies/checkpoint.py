@@ -244,28 +244,21 @@ def _check_values(path: str | Path, tensors: dict[str, NDArray[np.float32]]) -> 
 # What a value of the metadata may be.
 
 
-def _text(value: object) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f'{value!r:.80} is no text')
-    return value
+def _of_type(kind: type, complaint: str) -> Callable[[object], Any]:
+    """What reads a value of a type of JSON, for which true is no number."""
+
+    def read_value(value: object) -> Any:
+        if type(value) is not kind:
+            raise TypeError(f'{value!r:.80} {complaint}')
+        return value
+
+    return read_value
 
 
-def _whole(value: object) -> int:
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise TypeError(f'{value!r:.80} is no whole number')
-    return value
-
-
-def _flag(value: object) -> bool:
-    if not isinstance(value, bool):
-        raise TypeError(f'{value!r:.80} is neither true nor false')
-    return value
-
-
-def _object(value: object) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise TypeError(f'{value!r:.80} is no object')
-    return value
+_text = _of_type(str, 'is no text')
+_whole = _of_type(int, 'is no whole number')
+_flag = _of_type(bool, 'is neither true nor false')
+_object = _of_type(dict, 'is no object')
 
 
 def _rate(value: object) -> float:

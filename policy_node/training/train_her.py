@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -66,30 +67,15 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-_FIELD_OPTIONS = (
-    'seed',
-    'num_envs',
-    'simulation_threads',
-    'torch_threads',
-    'total_steps',
-    'time_limit',
-    'success_target',
-    'strategy',
-    'reward_type',
-    'init_from',
-)
-
-
 def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
     """Builds the configuration: recipe or resumed run, then options, then `--set`.
 
     Raises:
         ValueError: If something is missing, unknown or not allowed.
     """
+    fields = {field.name for field in dataclasses.fields(TrainConfig)} - {'task', 'recipe'}
     overrides: dict[str, Any] = {
-        name: getattr(options, name)
-        for name in _FIELD_OPTIONS
-        if getattr(options, name) is not None
+        name: value for name, value in vars(options).items() if name in fields and value is not None
     }
     if not options.her:
         if overrides.get('strategy', 'none') != 'none':

@@ -194,13 +194,11 @@ def draw(
         path: PNG file to write.
         paper_epochs: Whether the epochs of the paper are marked on a second axis.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = min(len(bands), 4)
     rows = -(-len(bands) // columns)
     figure = Figure(figsize=(4.6 * columns + 0.8, 3.9 * rows), layout='constrained')
-    FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels[len(bands) :]:
         axes.set_visible(False)

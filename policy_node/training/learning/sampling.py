@@ -96,7 +96,7 @@ class TransitionSampler:
             if self.steps is not None:
                 act = None if judge is None else judge.act
                 steps = self.steps.count(starts, goal, generator, act)
-            batch = self._several(starts, steps, goal, generator)
+            batch = self.several(starts, steps, goal, generator)
         if self.lost_value is None:
             return batch
         return _with_losses(starts, steps, batch, self.lost_value)
@@ -117,14 +117,21 @@ class TransitionSampler:
             discount=np.full(len(row), self.gamma, np.float32),
         )
 
-    def _several(
+    def several(
         self,
         starts: Starts,
         steps: NDArray[np.int64],
         goal: Array,
         generator: np.random.Generator,
     ) -> Transitions:
-        """Transitions of several steps, or under a condition."""
+        """Transitions of several steps, or under a condition.
+
+        Args:
+            starts: Where they begin.
+            steps: How many steps each has, (batch,).
+            goal: (batch, goal_size).
+            generator: Source of randomness for conditions.
+        """
         episodes, row, tick = starts.episodes, starts.row, starts.tick
         condition = self.condition
         drawn = None if condition is None else condition.draw(len(row), generator)

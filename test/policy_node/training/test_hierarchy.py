@@ -70,7 +70,7 @@ def proposals(tested: float, updates: int) -> np.ndarray:
     config, generator = configured(gamma=0.95), make_generator()
     learner = HierarchicalDDPG(SHAPE, config, CPU, Workers())
     learner.actor.goal_normalizer.std.fill_(1.0 / NORMALIZED_CLIP)
-    sampler = SubgoalSampler(10, reached, 0.95, 1.0, config.lowest_value)
+    sampler = SubgoalSampler(TransitionSampler(reached, 0.95), 10, config.lowest_value)
     episodes = walks(2_000, tested, generator)
     mixture = {'near': 0.6, 'future': 0.2, 'actual': 0.2}
     for _ in range(updates):

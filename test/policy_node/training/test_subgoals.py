@@ -15,6 +15,7 @@ from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.hindsight import with_subgoals
 from policy_node.training.learning.hindsight_actions import SubgoalSampler
 from policy_node.training.learning.replay import Episodes
+from policy_node.training.learning.sampling import TransitionSampler
 from policy_node.training.learning.subgoals import TESTED, GuidedPolicy, Proposer
 from policy_node.training.train_her import main
 from support.refusals import assert_refused
@@ -112,7 +113,8 @@ def test_what_was_achieved_was_proposed_unless_a_test_was_missed(
 
     The second proposal of 3 is missed, at 6.
     """
-    sampler = SubgoalSampler(3, lambda a, g: -1.0 * (a != g)[..., 0], 0.5, 1.0, missed_value=-2.0)
+    rewards = TransitionSampler(lambda a, g: -1.0 * (a != g)[..., 0], 0.5)
+    sampler = SubgoalSampler(rewards, 3, missed_value=-2.0)
     row = np.zeros(300, np.int64)
     episodes = walk(subgoal, tested)
     batch = sampler.sample(episodes, row, {'real': 1.0}, np.random.default_rng(0))
