@@ -9,7 +9,6 @@ from policy_node.policies.actor import Actor
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
 from policy_node.training.evaluation.evaluator import success_rate
 from policy_node.training.learning.actor_critic import ActorCritic
-from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
 from policy_node.training.learning.replay_file import save_replay
@@ -26,16 +25,15 @@ class Saver:
 
     Args:
         folder: Where they go.
-        config: Configuration of the run.
         workers: This worker among all.
 
     Attributes:
         folder: Where they go.
     """
 
-    def __init__(self, folder: RunFolder, config: TrainConfig, workers: Workers) -> None:
+    def __init__(self, folder: RunFolder, workers: Workers) -> None:
         self.folder = folder
-        self._config = config
+        self._config = folder.config
         self._workers = workers
         self._last_checkpoint = self._last_replay = time.monotonic()
 

@@ -123,11 +123,12 @@ def test_both_levels_learn_a_line_together() -> None:
     """Collected through subgoals; reached with and without them at the end."""
     torch.manual_seed(0)
     changes = {'num_envs': 32, 'batch_size': 256, 'gamma': 0.95, 'goal_features': 'plain'}
+    changes |= {'noise_std': 0.2, 'random_epsilon': 0.3}
     config, line, generator = configured(**changes), Line(32), make_generator()
     learner = HierarchicalDDPG(SHAPE, config, CPU, Workers())
     sampler = TransitionSampler(reached, config.tick_gamma)
     experience = HierarchicalExperience(config, line.spec, Workers(), sampler, generator)
-    collector = Collector(line, [0] * 32, 0.2, 0.3, subgoal_every=10)
+    collector = Collector(line, [0] * 32, config)
     for cycle in range(20):
         collector.proposer = learner.proposer()
         assert (collector.proposer is None) == (cycle == 0), 'nothing is proposed at first'

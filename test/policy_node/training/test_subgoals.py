@@ -12,6 +12,7 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.collector import Collector
+from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.hindsight import with_subgoals
 from policy_node.training.learning.hindsight_actions import SubgoalSampler
 from policy_node.training.learning.replay import Episodes
@@ -36,7 +37,9 @@ class Constant:
 
 def collected(proposer: Proposer | None, noise: tuple[float, float], actor: object) -> Episodes:
     simulation = Simulation('FetchReach', num_envs=80, num_threads=1)
-    collector = Collector(simulation, list(range(80)), *noise, subgoal_every=20)
+    std, epsilon = noise
+    config = TrainConfig('FetchReach', noise_std=std, random_epsilon=epsilon, subgoal_every=20)
+    collector = Collector(simulation, list(range(80)), config)
     collector.proposer = proposer
     return collector.collect(actor)[0]
 
