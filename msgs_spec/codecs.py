@@ -121,14 +121,9 @@ def _pose(position: Array, wxyz: Array) -> Any:
     return _geometry('Pose', position=_xyz('Point', position), orientation=_quaternion(wxyz))
 
 
-def _twist(values: Array) -> Any:
-    linear, angular = _xyz('Vector3', values[:3]), _xyz('Vector3', values[3:])
-    return _geometry('Twist', linear=linear, angular=angular)
-
-
-def _wrench(values: Array) -> Any:
-    force, torque = _xyz('Vector3', values[:3]), _xyz('Vector3', values[3:])
-    return _geometry('Wrench', force=force, torque=torque)
+def _two_vectors(name: str, first: str, second: str, values: Array) -> Any:
+    parts = {first: _xyz('Vector3', values[:3]), second: _xyz('Vector3', values[3:])}
+    return _geometry(name, **parts)
 
 
 def _read_xyz(*parts: Any) -> list[float]:
@@ -167,7 +162,7 @@ def _build_free_joint(topic: TopicSpec, values: Array) -> dict[str, Any]:
     return {
         'joint_names': list(topic.names),
         'transforms': [transform],
-        'twist': [_twist(values[7:])],
+        'twist': [_two_vectors('Twist', 'linear', 'angular', values[7:])],
         'wrench': [],
     }
 
@@ -227,11 +222,11 @@ _CODECS: dict[str, tuple[_Builder, _Reader]] = {
     ),
     'geometry_msgs/msg/PoseArray': (_build_pose_array, _read_pose_array),
     'geometry_msgs/msg/TwistStamped': (
-        lambda _, values: {'twist': _twist(values)},
+        lambda _, values: {'twist': _two_vectors('Twist', 'linear', 'angular', values)},
         lambda _, message: _read_xyz(message.twist.linear, message.twist.angular),
     ),
     'geometry_msgs/msg/WrenchStamped': (
-        lambda _, values: {'wrench': _wrench(values)},
+        lambda _, values: {'wrench': _two_vectors('Wrench', 'force', 'torque', values)},
         lambda _, message: _read_xyz(message.wrench.force, message.wrench.torque),
     ),
     'std_msgs/msg/Float64': (

@@ -66,38 +66,19 @@ class RobotSpec:
         return replace(self, joints=joints, command=command)
 
 
-_FETCH_JOINTS = (
-    'robot0:slide0',
-    'robot0:slide1',
-    'robot0:slide2',
-    'robot0:torso_lift_joint',
-    'robot0:head_pan_joint',
-    'robot0:head_tilt_joint',
-    'robot0:shoulder_pan_joint',
-    'robot0:shoulder_lift_joint',
-    'robot0:upperarm_roll_joint',
-    'robot0:elbow_flex_joint',
-    'robot0:forearm_roll_joint',
-    'robot0:wrist_flex_joint',
-    'robot0:wrist_roll_joint',
-    'robot0:r_gripper_finger_joint',
-    'robot0:l_gripper_finger_joint',
-)
+_FETCH_NAMES = (
+    'slide0 slide1 slide2 torso_lift_joint head_pan_joint head_tilt_joint shoulder_pan_joint '
+    'shoulder_lift_joint upperarm_roll_joint elbow_flex_joint forearm_roll_joint wrist_flex_joint '
+    'wrist_roll_joint r_gripper_finger_joint l_gripper_finger_joint'
+).split()
 _FETCH_SLIDING = (
-    'slide0',
-    'slide1',
-    'slide2',
-    'torso_lift_joint',
-    'r_gripper_finger_joint',
-    'l_gripper_finger_joint',
-)
+    'slide0 slide1 slide2 torso_lift_joint r_gripper_finger_joint l_gripper_finger_joint'
+).split()
 
 FETCH = RobotSpec(
     name='fetch',
-    joints=_FETCH_JOINTS,
-    joint_units=tuple(
-        'm' if name.split(':')[1] in _FETCH_SLIDING else 'rad' for name in _FETCH_JOINTS
-    ),
+    joints=tuple(f'{JOINT_PREFIX}{name}' for name in _FETCH_NAMES),
+    joint_units=tuple('m' if name in _FETCH_SLIDING else 'rad' for name in _FETCH_NAMES),
     command=(
         CommandPart('x', -1.0, 1.0, 'x 0.05 m'),
         CommandPart('y', -1.0, 1.0, 'x 0.05 m'),

@@ -12,42 +12,35 @@ class ServiceSpec:
     Attributes:
         name: `~/` stands for the node's own name.
         type_name: ROS name of the service type.
-        node: The node that offers it.
         description: What a call does.
+        node: The node that offers it.
     """
 
     name: str
     type_name: str
-    node: str
     description: str
+    node: str = 'sim_node'
 
 
 # A call that steps blocks the robot; this many ticks take the slowest task a few seconds.
 MAX_STEPS = 1000
 
 RESET = ServiceSpec(
-    '~/reset',
-    'std_srvs/srv/Trigger',
-    'sim_node',
-    'Ends the running episode; the next tick starts another.',
+    '~/reset', 'std_srvs/srv/Trigger', 'Ends the running episode; the next tick starts another.'
 )
 PAUSE = ServiceSpec(
     '~/pause',
     'std_srvs/srv/SetBool',
-    'sim_node',
     'Stops the ticks and simulated time (true) or goes on (false).',
 )
 STEP = ServiceSpec(
-    '~/step',
-    'std_srvs/srv/Trigger',
-    'sim_node',
-    'Runs one tick now; while paused, or in lockstep.',
+    '~/step', 'std_srvs/srv/Trigger', 'Runs one tick now; while paused, or in lockstep.'
 )
 STANDARD_SERVICES = (RESET, PAUSE, STEP)
 
 
 def _interface(name: str, type_name: str, description: str) -> ServiceSpec:
-    return ServiceSpec(name, f'simulation_interfaces/srv/{type_name}', 'sim_node', description)
+    return ServiceSpec(name, f'simulation_interfaces/srv/{type_name}', description)
 
 
 # Offered where the package simulation_interfaces is installed; PyPI does not have it.

@@ -7,7 +7,6 @@ from typing import Any
 
 from msgs_spec.diagnostics import Increase, Report
 from msgs_spec.tick import EpisodeStatus
-from policy_node.node.commander import Commander
 from policy_node.node.responder import Responder
 
 # Seconds without a complete observation after which the report says so. A robot that is paused
@@ -38,22 +37,21 @@ class Health:
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._commander: Commander | None = None
         self._responder: Responder | None = None
         self._tick_duration = 0.0
         self._answered, self._dropped, self._unusable = Increase(), Increase(), Increase()
         self._then: float | None = None
         self._said: set[str] = set()
 
-    def start(self, commander: Commander, responder: Responder, status: EpisodeStatus) -> None:
+    def start(self, responder: Responder, status: EpisodeStatus) -> None:
         """Takes the robot that was found."""
-        self._commander, self._responder = commander, responder
+        self._responder = responder
         self._tick_duration = 1.0 / status.control_hz
         self._answered, self._dropped, self._unusable = Increase(), Increase(), Increase()
 
     def stop(self) -> None:
         """Waits for a robot again."""
-        self._commander = self._responder = None
+        self._responder = None
 
     def report(
         self, now: float, robots: int, is_paused: bool = False, elsewhere: Sequence[str] = ()
@@ -66,10 +64,10 @@ class Health:
             is_paused: Whether the robot says that it is paused.
             elsewhere: Namespaces of other robots, told where there is none here.
         """
-        if self._commander is None or self._responder is None:
+        if self._responder is None:
             report = Report(self._name, '', {'robots': str(robots)}, 'waits for a robot')
         else:
-            report = self._report(self._commander, self._responder, now, robots, is_paused)
+            report = self._report(self._responder, now, robots, is_paused)
         if robots == 0 and elsewhere:
             report.warn(
                 f'no robot here: there is one in {", ".join(elsewhere)}; join it with '
@@ -86,14 +84,7 @@ class Health:
         self._said = set(kinds)
         return fresh
 
-    def _report(
-        self,
-        commander: Commander,
-        responder: Responder,
-        now: float,
-        robots: int,
-        is_paused: bool,
-    ) -> Report:
+    def _report(self, responder: Responder, now: float, robots: int, is_paused: bool) -> Report:
         seconds = now - self._then if self._then is not None else 0.0
         self._then = now
         answered = self._answered.since(responder.answered)
@@ -102,8 +93,8 @@ class Health:
         inference = responder.inference.milliseconds()
         values = {
             'robots': str(robots),
-            'commander': commander.description,
-            'checkpoint sha256': commander.sha256,
+            'commander': responder.commander.description,
+            'checkpoint sha256': responder.commander.sha256,
             'commands': str(responder.answered),
             'rate (Hz)': f'{rate:.2f}',
             **{f'inference {name} (ms)': value for name, value in inference.items()},
@@ -111,7 +102,7 @@ class Health:
             'unusable messages': str(responder.unusable),
             'observation age (s)': '-' if age is None else f'{age:.3f}',
         }
-        task = commander.spec.name
+        task = responder.commander.spec.name
         pace = 'the robot is paused' if is_paused else f'{rate:.1f} commands per second'
         report = Report(self._name, task, values, f'{task}: {pace}')
         dropped = self._dropped.since(responder.join.dropped)

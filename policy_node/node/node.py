@@ -128,7 +128,7 @@ class PolicyNode(Node):
         # Last of all: its appearance tells the robot that everything before it is in place.
         self._commands = self._publisher(topic(commander.spec, 'commands'))
         self._of_robot.append(self._commands)
-        self._health.start(commander, responder, status)
+        self._health.start(responder, status)
         self.get_logger().info(f'{commander.spec.name}: commands come from {commander.description}')
 
     def _load_for(self, status: EpisodeStatus) -> LoadedPolicy:

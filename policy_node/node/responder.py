@@ -28,6 +28,7 @@ class Responder:
         clock: A steady clock, seconds.
 
     Attributes:
+        commander: Who decides.
         topics: The topics it needs.
         join: Joins them by stamp.
         answered: Commands sent.
@@ -43,7 +44,7 @@ class Responder:
         send: Callable[[bytes], bool],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._commander = commander
+        self.commander = commander
         spec = task_spec(status.task, status.joint_prefix)
         self._assembler = ObservationAssembler(spec, status.control_hz)
         self._send = send
@@ -90,7 +91,7 @@ class Responder:
 
     def _answer(self, observation: dict[str, NDArray[np.float64]]) -> None:
         self.received_at = began = self._clock()
-        command = self._commander.command(observation)
+        command = self.commander.command(observation)
         self.inference.add(self._clock() - began)
         self._unsent = self._commands.encode(0, command)
         self.send_unsent()

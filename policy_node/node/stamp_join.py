@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Vectors = dict[str, NDArray[np.float64]]
 
+# Nanoseconds: a stamp further back is no late message but a simulation started anew.
+_LONGEST_DELAY = 1_000_000_000
+
 
 class StampJoin:
     """Collects the vectors of several topics until one stamp has them all.
@@ -41,9 +44,9 @@ class StampJoin:
             The vectors of all topics if they are complete for this stamp, else None.
         """
         if self._last is not None and stamp <= self._last:
-            self._forget_if_restarted(stamp)
-            if self._last is not None:
+            if self._last - stamp <= _LONGEST_DELAY:
                 return None
+            self.forget()
         vectors = self._pending.setdefault(stamp, {})
         vectors[topic] = vector
         if vectors.keys() == self._topics:
@@ -65,8 +68,3 @@ class StampJoin:
         self.dropped += len(incomplete)
         for other in (*incomplete, stamp):
             del self._pending[other]
-
-    def _forget_if_restarted(self, stamp: int) -> None:
-        """A stamp more than a second back is no late message but a simulation started anew."""
-        if self._last is not None and self._last - stamp > 1_000_000_000:
-            self.forget()

@@ -20,6 +20,7 @@ from msgs_spec.tasks import TASKS, TaskSpec, substeps_per_tick, task_spec
 from policy_node.policies.files import one_line, read_file, sha256
 from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
+from policy_node.policies.policy import LoadedPolicy, Policy
 from policy_node.policies.tensor_file import (
     TensorHeader,
     parse_header,
@@ -166,6 +167,18 @@ def load(path: str | Path, task: str | None = None) -> tuple[Actor, ActorInfo]:
     return Actor.from_arrays(checkpoint.info.shape, checkpoint.tensors), checkpoint.info
 
 
+def loaded_actor(policy: Policy, info: ActorInfo, path: Path, digest: str) -> LoadedPolicy:
+    """An actor of this project and what its file says about it, whatever the format.
+
+    Args:
+        policy: What acts.
+        info: What the metadata say.
+        path: The file.
+        digest: Its fingerprint.
+    """
+    return LoadedPolicy(policy, info.task, f'actor {path.name}', info.control_hz, digest)
+
+
 def checkpoint_hash(path: str | Path) -> str:
     """SHA-256 of the file, hexadecimal."""
     return sha256(read_file(Path(path)))
@@ -180,13 +193,14 @@ def parse_metadata(metadata: dict[str, str], path: str | Path) -> ActorInfo:
     _check_format(path, metadata)
     # Files from before there were goal features have plain ones, and started from nothing.
     metadata = {'goal_features': '"plain"', 'init_from': '{}', **metadata}
-    missing = [name for name in _READERS if name not in metadata]
+    fields = {field.name: field.type for field in dataclasses.fields(ActorInfo)}
+    missing = [name for name in fields if name not in metadata]
     if missing:
         raise ValueError(f'{path} lacks metadata: {", ".join(missing)}')
     values = {}
-    for name, read_value in _READERS.items():
+    for name, kind in fields.items():
         try:
-            values[name] = read_value(json.loads(metadata[name]))
+            values[name] = _READERS[kind](json.loads(metadata[name]))
         except (ArithmeticError, RecursionError, TypeError, ValueError) as error:
             line = one_line(error)
             raise ValueError(f'{path} has unreadable metadata: {name}: {line}') from None
@@ -244,28 +258,21 @@ def _check_values(path: str | Path, tensors: dict[str, NDArray[np.float32]]) -> 
 # What a value of the metadata may be.
 
 
-def _text(value: object) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f'{value!r:.80} is no text')
-    return value
+def _of_type(kind: type, complaint: str) -> Callable[[object], Any]:
+    """What reads a value of a type of JSON, for which true is no number."""
+
+    def read_value(value: object) -> Any:
+        if type(value) is not kind:
+            raise TypeError(f'{value!r:.80} {complaint}')
+        return value
+
+    return read_value
 
 
-def _whole(value: object) -> int:
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise TypeError(f'{value!r:.80} is no whole number')
-    return value
-
-
-def _flag(value: object) -> bool:
-    if not isinstance(value, bool):
-        raise TypeError(f'{value!r:.80} is neither true nor false')
-    return value
-
-
-def _object(value: object) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise TypeError(f'{value!r:.80} is no object')
-    return value
+_text = _of_type(str, 'is no text')
+_whole = _of_type(int, 'is no whole number')
+_flag = _of_type(bool, 'is neither true nor false')
+_object = _of_type(dict, 'is no object')
 
 
 def _rate(value: object) -> float:
@@ -288,20 +295,13 @@ def _layout(value: Any) -> tuple[tuple[str, int], ...]:
     return tuple((_text(name), _whole(size)) for name, size in value)
 
 
-_READERS: dict[str, Callable[[Any], Any]] = {
-    'task': _text,
-    'observation_layout': _layout,
-    'goal_size': _whole,
-    'action_size': _whole,
-    'hidden_sizes': _widths,
-    'layer_norm': _flag,
-    'control_hz': _rate,
-    'seed': _whole,
-    'command': _text,
-    'source_revision': _text,
-    'env_steps': _whole,
-    'config': _object,
-    'success': _object,
-    'goal_features': _text,
-    'init_from': _object,
+_READERS: dict[Any, Callable[[Any], Any]] = {
+    'str': _text,
+    'int': _whole,
+    'bool': _flag,
+    'float': _rate,
+    'dict[str, Any]': _object,
+    'tuple[int, ...]': _widths,
+    'tuple[tuple[str, int], ...]': _layout,
 }
+"""By the type of a field of `ActorInfo`."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -32,22 +32,6 @@ _ROTATION_SCALE = 10.0
 # World frame; its standard deviation in a run is about 2 rad/s.
 _ANGULAR_VELOCITY_SCALE = 0.5
 _POSITION_SCALES = {GoalKind.POINT: 10.0, GoalKind.POSE: 50.0, GoalKind.FINGERTIPS: 50.0}
-
-
-class GoalFeatures(Protocol):
-    """What turns an observation and a goal into inputs of the networks."""
-
-    def size(self, observation_size: int, goal_size: int) -> int:
-        """Number of inputs."""
-        ...
-
-    def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Inputs (..., size), from what is seen in the units of the task and normalised."""
-        ...
-
-    def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
-        """Indices of the inputs that say where a pose goal is, not how it is turned."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,15 +64,21 @@ class RelativeGoal:
         return {GoalKind.POINT: 6, GoalKind.FINGERTIPS: 15, GoalKind.POSE: 10}[self.goal]
 
     def size(self, observation_size: int, goal_size: int) -> int:
-        """Observation, goal and the difference."""
+        """Number of inputs: observation, goal and the difference."""
         return observation_size + goal_size + self.difference_size
 
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Normalised observation and goal, then the difference."""
+        """Inputs (..., size), from what is seen in the units of the task and normalised.
+
+        They are the normalised observation and goal, then the difference.
+        """
         return _concatenate(*normalized, self.difference(*seen))
 
     def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
-        """The first three of the goal and the last three of the difference."""
+        """Indices of the inputs that say where a pose goal is, not how it is turned.
+
+        They are the first three of the goal and the last three of the difference.
+        """
         end = self.size(observation_size, goal_size)
         return [*range(observation_size, observation_size + 3), *range(end - 3, end)]
 
@@ -128,7 +118,7 @@ class SymmetricObject:
     symmetry: str
 
     def size(self, observation_size: int, goal_size: int) -> int:
-        """Observation with shape and world velocity instead of 7 values, and the difference."""
+        """Number of inputs: shape and world velocity instead of 7 values, and the difference."""
         del goal_size
         shape_size = 15 if self.symmetry == 'cube' else 6
         return observation_size - 7 + shape_size + 3 + self.relative.difference_size
@@ -149,9 +139,13 @@ class SymmetricObject:
         )
 
     def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
-        """The last three of the difference."""
+        """As `RelativeGoal` has them: the last three of the difference."""
         end = self.size(observation_size, goal_size)
         return [*range(end - 3, end)]
+
+
+GoalFeatures = RelativeGoal | SymmetricObject
+"""What turns an observation and a goal into inputs of the networks."""
 
 
 def goal_features(kind: str, spec: TaskSpec) -> GoalFeatures | None:

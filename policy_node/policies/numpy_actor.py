@@ -112,10 +112,5 @@ def load_checkpoint(path: Path, task: str | None = None) -> LoadedPolicy:
         ValueError: As `checkpoint.read`.
     """
     found = checkpoint.read(path, task)
-    return LoadedPolicy(
-        policy=NumpyActor(found.info.shape, found.tensors),
-        task=found.info.task,
-        description=f'actor {path.name}',
-        control_hz=found.info.control_hz,
-        sha256=found.sha256,
-    )
+    actor = NumpyActor(found.info.shape, found.tensors)
+    return checkpoint.loaded_actor(actor, found.info, path, found.sha256)

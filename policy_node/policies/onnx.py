@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from policy_node.policies.checkpoint import ActorInfo, parse_metadata
+from policy_node.policies.checkpoint import ActorInfo, loaded_actor, parse_metadata
 from policy_node.policies.files import one_line, read_file, sha256
 from policy_node.policies.policy import LoadedPolicy, Observation, observation_part
 
@@ -94,13 +94,7 @@ def load_onnx(path: Path, task: str | None = None) -> LoadedPolicy:
     actor = OnnxActor(data, path)
     if task is not None and actor.info.task != task:
         raise ValueError(f'{path} was trained on {actor.info.task}, not on {task}')
-    return LoadedPolicy(
-        policy=actor,
-        task=actor.info.task,
-        description=f'actor {path.name}',
-        control_hz=actor.info.control_hz,
-        sha256=sha256(data),
-    )
+    return loaded_actor(actor, actor.info, path, sha256(data))
 
 
 def _require_onnxruntime(path: Path) -> Any:

@@ -23,8 +23,7 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES
-from policy_node.policies.policy import LoadedPolicy, Policy
+from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import (
     FIRST_SEED,
     EpisodeOutcomes,
@@ -32,7 +31,13 @@ from policy_node.training.evaluation.episodes import (
     summarize,
 )
 from policy_node.training.evaluation.table import print_table
-from policy_node.training.policy_options import add_policy_options, load_chosen_policy
+from policy_node.training.policy_options import (
+    add_batch_options,
+    add_policy_options,
+    add_reward_options,
+    load_chosen_policy,
+    make_chosen_simulation,
+)
 
 _NAME = 'evaluate_policy'
 # What `--json` without a file means.
@@ -43,19 +48,10 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser, former='--actor')
-    add = parser.add_argument
-    count, seed = whole_number(1), whole_number(0, LARGEST_SEED)
-    add('--episodes', type=count, default=1000, help='default: 1000')
+    add_batch_options(parser, num_envs=100)
+    add_reward_options(parser)
+    add, seed = parser.add_argument, whole_number(0, LARGEST_SEED)
     add('--first-seed', type=seed, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
-    add(
-        '--num-envs',
-        type=count,
-        default=100,
-        help='simulations in the batch; default: 100',
-    )
-    add('--threads', type=int, default=0, help='simulation threads; default: all cores')
-    add('--success-rule', choices=SUCCESS_RULES, default='gymnasium', help='of the reward')
-    add('--reward-type', choices=REWARD_TYPES, default='sparse', help='of the return')
     add(
         '--json',
         type=Path,
@@ -77,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     loaded = load_chosen_policy(options)
     try:
-        simulation = _simulation(options, loaded)
+        simulation = make_chosen_simulation(options, loaded)
     except ValueError as error:
         raise UsageError(str(error)) from None
     outcomes, code = _evaluate(options, simulation, loaded.policy)
@@ -124,17 +120,6 @@ def _evaluate(
             if not finished:
                 raise
             return finished[-1], EXIT_INTERRUPTED
-
-
-def _simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:
-    return Simulation(
-        loaded.task,
-        num_envs=min(options.num_envs, options.episodes),
-        num_threads=options.threads,
-        reward_type=options.reward_type,
-        success_rule=options.success_rule,
-        control_hz=loaded.control_hz or DEFAULT_CONTROL_HZ,
-    )
 
 
 def write_csv(outcomes: EpisodeOutcomes, path: Path) -> None:

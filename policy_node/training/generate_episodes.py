@@ -30,8 +30,13 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES
-from policy_node.training.policy_options import add_policy_options, load_chosen_policy
+from policy_node.training.policy_options import (
+    add_batch_options,
+    add_policy_options,
+    add_reward_options,
+    load_chosen_policy,
+    make_chosen_simulation,
+)
 
 _NAME = 'generate_episodes'
 
@@ -40,15 +45,11 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser)
-    add = parser.add_argument
-    count, seed = whole_number(1), whole_number(0, LARGEST_SEED)
-    add('--episodes', type=count, default=1000, help='default: 1000')
+    add_batch_options(parser, num_envs=64)
+    add_reward_options(parser)
+    add, seed = parser.add_argument, whole_number(0, LARGEST_SEED)
     add('--output', type=Path, required=True, help='directory in which episodes are collected')
     add('--first-seed', type=seed, default=0, help='episode i has this seed plus i; default: 0')
-    add('--num-envs', type=count, default=64, help='simulations in the batch; default: 64')
-    add('--threads', type=int, default=0, help='simulation threads; default: all cores')
-    add('--success-rule', choices=SUCCESS_RULES, default='gymnasium')
-    add('--reward-type', choices=REWARD_TYPES, default='sparse')
     add('--compiled-model', action='store_true', help='store the compiled model in every file')
     return parser.parse_args(arguments)
 
@@ -61,14 +62,7 @@ def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simul
         ValueError: If an option does not fit it.
     """
     loaded = load_chosen_policy(options)
-    simulation = Simulation(
-        loaded.task,
-        num_envs=min(options.num_envs, options.episodes),
-        num_threads=options.threads,
-        reward_type=options.reward_type,
-        success_rule=options.success_rule,
-        control_hz=loaded.control_hz or DEFAULT_CONTROL_HZ,
-    )
+    simulation = make_chosen_simulation(options, loaded)
     context = RecordingContext(simulation, with_compiled_model=options.compiled_model)
     context.checkpoint_sha256 = loaded.sha256 or None
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from msgs_spec.command_line import FormerOption, UsageError, complain
-from msgs_spec.tasks import TASKS
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.command_line import FormerOption, UsageError, complain, whole_number
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES, TASKS
 from policy_node.policies.loading import POLICY_NAMES, load_policy
 from policy_node.policies.policy import LoadedPolicy
 
@@ -29,6 +30,22 @@ def add_policy_options(parser: argparse.ArgumentParser, former: str | None = Non
     )
 
 
+def add_batch_options(parser: argparse.ArgumentParser, num_envs: int) -> None:
+    """Adds `--episodes`, `--num-envs` (with this default) and `--threads`."""
+    add, count = parser.add_argument, whole_number(1)
+    add('--episodes', type=count, default=1000, help='default: 1000')
+    simulations = f'simulations in the batch; default: {num_envs}'
+    add('--num-envs', type=count, default=num_envs, help=simulations)
+    add('--threads', type=int, default=0, help='simulation threads; default: all cores')
+
+
+def add_reward_options(parser: argparse.ArgumentParser) -> None:
+    """Adds `--success-rule` and `--reward-type`."""
+    add = parser.add_argument
+    add('--success-rule', choices=SUCCESS_RULES, default='gymnasium', help='of the reward')
+    add('--reward-type', choices=REWARD_TYPES, default='sparse', help='of the return')
+
+
 def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
     """Loads the policy that the options of `add_policy_options` name.
 
@@ -46,3 +63,19 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
         return load_policy(name, options.task, trust=options.trust)
     except ValueError as error:
         raise UsageError(str(error)) from None
+
+
+def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:
+    """Simulations for a policy, as batch and reward options say.
+
+    Raises:
+        ValueError: If an option does not fit it.
+    """
+    return Simulation(
+        loaded.task,
+        num_envs=min(options.num_envs, options.episodes),
+        num_threads=options.threads,
+        reward_type=options.reward_type,
+        success_rule=options.success_rule,
+        control_hz=loaded.control_hz or DEFAULT_CONTROL_HZ,
+    )

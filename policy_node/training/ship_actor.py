@@ -14,8 +14,8 @@ from msgs_spec.command_line import (
     UsageError,
     require_extra,
     run_command,
-    whole_number,
 )
+from policy_node.training.policy_options import add_batch_options
 
 _NAME = 'ship_actor'
 ACTORS = Path(__file__).parents[1] / 'actors'
@@ -24,16 +24,9 @@ ACTORS = Path(__file__).parents[1] / 'actors'
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
     parser = CommandParser(prog=_NAME, description=__doc__)
-    add, count = parser.add_argument, whole_number(1)
+    add_batch_options(parser, num_envs=100)
+    add = parser.add_argument
     add('run', type=Path, help='output folder of train_her')
-    add('--episodes', type=count, default=1000, help='default: 1000')
-    add(
-        '--num-envs',
-        type=count,
-        default=100,
-        help='simulations in the batch; default: 100',
-    )
-    add('--threads', type=int, default=0, help='simulation threads; default: all cores')
     add('--checkpoint', default='best.safetensors', help='file in the run; default: %(default)s')
     add('--actors', type=Path, default=ACTORS, help='where to; default: the package')
     return parser.parse_args(arguments)

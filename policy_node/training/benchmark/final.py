@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from policy_node.policies import checkpoint
+from policy_node.policies.files import write_file
 from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, wilson_interval
 from policy_node.training.evaluation.evaluator import successes
 from policy_node.training.learning.config import TrainConfig
@@ -41,9 +41,7 @@ def measure_final(config: TrainConfig, folder: Path, episodes: int) -> None:
         'episodes': episodes,
         'first_seed': FIRST_SEED,
     }
-    partial = folder / f'.{FINAL_FILE}.partial'
-    partial.write_text(json.dumps(found, indent=2) + '\n')
-    os.replace(partial, folder / FINAL_FILE)
+    write_file(folder / FINAL_FILE, (json.dumps(found, indent=2) + '\n').encode())
 
 
 def read_final(folder: Path) -> dict[str, Any]:

@@ -8,11 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from msgs_spec.command_line import CommandError
-from policy_node.training.benchmark.final import FINAL_FILE, measure_final
+from policy_node.training.benchmark.final import FINAL_FILE
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.config_values import config_from_dict
-from policy_node.training.learning.run import RunTakenError, train_run
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.training_state import read_state
@@ -28,14 +26,6 @@ _MAY_DIFFER = (
     'device',
     'init_from',
 )
-
-
-class JobError(RuntimeError):
-    """A job failed; the message names it and its folder."""
-
-
-class JobTakenError(RuntimeError):
-    """Another process works on the job."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,26 +142,3 @@ class Job:
             raise ValueError(
                 f'{self.folder} holds a run with {"; ".join(differing)}: choose another --output'
             )
-
-
-def run_job(job: Job, command: str) -> bool:
-    """Starts or continues a job in this process; False if a signal ended it early.
-
-    Args:
-        job: The job.
-        command: Command line of the benchmark, for the record.
-
-    Raises:
-        JobTakenError: If another process works on it.
-        JobError: If training failed.
-    """
-    try:
-        if not job.is_trained:
-            train_run(job.config, job.folder, resume=job.has_checkpoint, command=command)
-        if job.is_trained and job.final_episodes:
-            measure_final(job.config, job.folder, job.final_episodes)
-    except RunTakenError:
-        raise JobTakenError(f'{job.name} is being run by another process') from None
-    except CommandError as error:
-        raise JobError(f'{job.name}: {error}') from None
-    return job.is_finished

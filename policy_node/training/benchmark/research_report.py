@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import (
     GOOD_SUCCESS,
@@ -20,13 +19,13 @@ from policy_node.training.benchmark.measures import (
 )
 from policy_node.training.benchmark.research import STEP_COUNTS, Study
 from policy_node.training.benchmark.results import (
-    Curve,
     aggregate,
+    by_arm,
     draw,
     machine,
+    source_revisions,
     write_curves,
 )
-from policy_node.training.learning.run_folder import LATEST_FILE
 
 # The page of a study keeps its table between these lines.
 BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'
@@ -48,18 +47,12 @@ def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -
     output.mkdir(parents=True, exist_ok=True)
     found = [curve_of(job) for job in jobs]
     runs = [measure_run(job, curve) for job, curve in zip(jobs, found, strict=True)]
-    groups: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    curves: dict[str, dict[str, list[Curve]]] = {}
-    for job, run, curve in zip(jobs, runs, found, strict=True):
-        groups.setdefault(job.config.task, {}).setdefault(job.arm.name, []).append(run)
-        curves.setdefault(job.config.task, {}).setdefault(job.arm.name, []).append(curve)
+    groups, curves = by_arm(jobs, runs), by_arm(jobs, found)
     order = [arm.name for arm in study.arms]
     arms = [sum_up(groups[task][name]) for task in groups for name in order if name in groups[task]]
     _write_csv(runs, output / 'runs.csv')
     _write_csv(arms, output / 'arms.csv')
-    names = [(job.config.task, job.arm.name, job.config.seed) for job in jobs]
-    named = [(*name, curve) for name, curve in zip(names, found, strict=True)]
-    write_curves(named, output / 'curves.csv')
+    write_curves(jobs, found, output / 'curves.csv')
     (output / 'study.json').write_text(json.dumps(_about(study, jobs, command), indent=2) + '\n')
     labels = {arm.name: arm.label for arm in study.arms}
     bands = {
@@ -117,13 +110,12 @@ def _quartiles(row: Mapping[str, Any], name: str) -> str:
 
 
 def _about(study: Study, jobs: Sequence[Job], command: str) -> dict[str, Any]:
-    revisions = {read_info(job.folder / LATEST_FILE).source_revision for job in jobs}
     return {
         'study': study.name,
         'request': study.request,
         'question': study.question,
         'command': command,
-        'source_revisions': sorted(revisions),
+        'source_revisions': source_revisions(jobs),
         'machine': machine(),
         'settings': _shared_settings(study, jobs),
         'arms': {arm.name: dict(arm.changes) for arm in study.arms},

@@ -7,10 +7,10 @@ import io
 import json
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ FAST_SUCCESS = 0.95
 _ARMS = {**ARMS, BEST_ARM.name: BEST_ARM}
 
 Array = NDArray[np.float64]
+_Value = TypeVar('_Value')
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,20 @@ def summarize(task: str, arm: str, curves: Sequence[Curve]) -> dict[str, Any]:
     }
 
 
-def write_report(jobs: Iterable[Job], output: Path, command: str) -> None:
+def by_arm(jobs: Sequence[Job], values: Sequence[_Value]) -> dict[str, dict[str, list[_Value]]]:
+    """What belongs to jobs, by task and arm, in the order of the jobs."""
+    groups: dict[str, dict[str, list[_Value]]] = {}
+    for job, value in zip(jobs, values, strict=True):
+        groups.setdefault(job.config.task, {}).setdefault(job.arm.name, []).append(value)
+    return groups
+
+
+def source_revisions(jobs: Sequence[Job]) -> list[str]:
+    """Revisions of the source that trained the jobs, each once."""
+    return sorted({read_info(job.folder / LATEST_FILE).source_revision for job in jobs})
+
+
+def write_report(jobs: Sequence[Job], output: Path, command: str) -> None:
     """Writes figure (PNG), curves (CSV) and table (text, CSV, JSON), and prints the table.
 
     Args:
@@ -123,22 +137,16 @@ def write_report(jobs: Iterable[Job], output: Path, command: str) -> None:
         output: Folder.
         command: Command line, for the record.
     """
-    groups: dict[str, dict[str, list[Curve]]] = {}
-    rows: list[tuple[str, str, int, Curve]] = []
-    revisions: set[str] = set()
-    for job in jobs:
-        revisions.add(read_info(job.folder / LATEST_FILE).source_revision)
-        curve, task, arm = read_curve(job.folder / PROGRESS_FILE), job.config.task, job.arm.name
-        groups.setdefault(task, {}).setdefault(arm, []).append(curve)
-        rows.append((task, arm, job.config.seed, curve))
+    found = [read_curve(job.folder / PROGRESS_FILE) for job in jobs]
+    revisions, groups = source_revisions(jobs), by_arm(jobs, found)
     table = [summarize(t, a, curves) for t, arms in groups.items() for a, curves in arms.items()]
     output.mkdir(parents=True, exist_ok=True)
-    write_curves(rows, output / 'benchmark_curves.csv')
+    write_curves(jobs, found, output / 'benchmark_curves.csv')
     with (output / 'benchmark.csv').open('w', newline='') as file:
         writer = csv.DictWriter(file, list(table[0]))
         writer.writeheader()
         writer.writerows(table)
-    about = {'command': command, 'source_revisions': sorted(revisions), 'machine': machine()}
+    about = {'command': command, 'source_revisions': revisions, 'machine': machine()}
     (output / 'benchmark.json').write_text(json.dumps({**about, 'results': table}, indent=2) + '\n')
     bands = {t: {a: aggregate(curves) for a, curves in arms.items()} for t, arms in groups.items()}
     draw(bands, {arm.name: arm.label for arm in _ARMS.values()}, output / 'benchmark.png')
@@ -194,13 +202,11 @@ def draw(
         path: PNG file to write.
         paper_epochs: Whether the epochs of the paper are marked on a second axis.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = min(len(bands), 4)
     rows = -(-len(bands) // columns)
     figure = Figure(figsize=(4.6 * columns + 0.8, 3.9 * rows), layout='constrained')
-    FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels[len(bands) :]:
         axes.set_visible(False)
@@ -226,11 +232,12 @@ def _label(axes: Any, task: str, paper_epochs: bool) -> None:
     epochs.set_xlabel("the paper's epochs")
 
 
-def write_curves(rows: Iterable[tuple[str, str, int, Curve]], path: Path) -> None:
-    """Writes every evaluation of (task, arm, seed, curve) as CSV."""
+def write_curves(jobs: Sequence[Job], curves: Sequence[Curve], path: Path) -> None:
+    """Writes every evaluation of jobs as CSV."""
     with path.open('w', newline='') as file:
         writer = csv.writer(file)
         writer.writerow(['task', 'arm', 'seed', 'env_steps', 'success'])
-        for task, arm, seed, curve in rows:
+        for job, curve in zip(jobs, curves, strict=True):
+            name = (job.config.task, job.arm.name, job.config.seed)
             for steps, success in zip(curve.env_steps, curve.success, strict=True):
-                writer.writerow([task, arm, seed, int(steps), f'{success:.6g}'])
+                writer.writerow([*name, int(steps), f'{success:.6g}'])

@@ -16,8 +16,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol, Self
 
-from msgs_spec.command_line import EXIT_FAILURE, EXIT_SUCCESS, complain
-from policy_node.training.benchmark.jobs import Job, JobError, JobTakenError, run_job
+from msgs_spec.command_line import EXIT_FAILURE, EXIT_SUCCESS, CommandError, complain
+from policy_node.training.benchmark.final import measure_final
+from policy_node.training.benchmark.jobs import Job
+from policy_node.training.learning.run import RunTakenError, train_run
 
 LOG_FILE = 'log.txt'
 _SET_PARENT_DEATH_SIGNAL = 1
@@ -89,15 +91,24 @@ def run_jobs(
 
 
 def attempt(job: Job, command: str) -> Outcome:
-    """Runs a job in this process and says what goes wrong."""
+    """Starts or continues a job in this process and says what goes wrong.
+
+    Args:
+        job: The job.
+        command: Command line of the benchmark, for the record.
+    """
     try:
-        return Outcome.FINISHED if run_job(job, command) else Outcome.STOPPED
-    except JobTakenError as error:
-        print(error, flush=True)
+        if not job.is_trained:
+            train_run(job.config, job.folder, resume=job.has_checkpoint, command=command)
+        if job.is_trained and job.final_episodes:
+            measure_final(job.config, job.folder, job.final_episodes)
+    except RunTakenError:
+        print(f'{job.name} is being run by another process', flush=True)
         return Outcome.TAKEN
-    except JobError as error:
-        complain('benchmark', error)
+    except CommandError as error:
+        complain('benchmark', f'{job.name}: {error}')
         return Outcome.FAILED
+    return Outcome.FINISHED if job.is_finished else Outcome.STOPPED
 
 
 class ThisProcess:

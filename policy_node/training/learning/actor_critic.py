@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -12,10 +13,22 @@ from policy_node.policies.actor import MLP, Actor
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.subgoals import Proposer
+from policy_node.training.learning.transitions import Transitions
+
+
+@dataclass(frozen=True, slots=True)
+class Losses:
+    """Scalars of one update, tensors on the device so that nothing waits for them."""
+
+    critic: Tensor
+    actor: Tensor
+    value: Tensor
 
 
 class ActorCritic:
-    """An actor, its critic, and how both are improved.
+    """What learns: an actor, its critic, and how both are improved.
+
+    Subclasses say how an update improves them.
 
     Args:
         actor: The actor.
@@ -59,6 +72,10 @@ class ActorCritic:
     def _adam(self, parameters: list[nn.Parameter]) -> torch.optim.Adam:
         return torch.optim.Adam(parameters, lr=self.config.learning_rate, fused=True)
 
+    def update(self, batch: Transitions) -> Losses:
+        """Improves the networks on a batch."""
+        raise NotImplementedError
+
     def step(
         self, optimizer: torch.optim.Adam, loss: Tensor, parameters: Sequence[nn.Parameter]
     ) -> None:
@@ -81,7 +98,7 @@ class ActorCritic:
         return self.plain(self.actor.network)
 
     def proposer(self, averaged: bool = False) -> Proposer | None:
-        """Who gives the actor subgoals while it collects: nobody."""
+        """Who gives the actor subgoals; None where nobody does. Averaged as in evaluations."""
         del averaged
         return None
 
@@ -96,11 +113,11 @@ class ActorCritic:
         return actor.cpu().eval()
 
     def modules(self) -> dict[str, nn.Module]:
-        """What a training state holds, by name."""
+        """What a training state holds, by name; an actor may come without what is no actor."""
         return {'actor': self.actor, 'critic': self.critic, 'average_actor': self.average_actor}
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:
-        """The optimisers, by name."""
+        """The optimisers, by name, whose states a training state holds."""
         return {
             'actor_optimizer': self.actor_optimizer,
             'critic_optimizer': self.critic_optimizer,

@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.policy import Policy
-from policy_node.training.learning.exploration import ActionNoise, ParameterNoise, actor_of
+from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.exploration import ActionNoise, ParameterNoise
 from policy_node.training.learning.frame_skip import Holder
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.subgoals import Guide, Proposer, subgoal_columns
@@ -24,48 +25,34 @@ class Collector:
     Args:
         simulation: The simulations.
         seeds: One seed per simulation for its resets; the first also seeds exploration.
-        noise_std: Standard deviation of the Gaussian noise on actions.
-        random_epsilon: Probability of a uniformly random action instead.
-        noise_spread: The first simulation has 1 - spread times both, the last 1 + spread.
-        noise_ticks: For how many ticks noise and random actions hold.
-        parameter_noise: Whether weights are moved, and by them actions by `noise_std`, instead of
-            actions themselves.
-        longest_hold: Most ticks for which actions may hold; above 1 they say how long.
-        subgoal_every: Ticks for which a subgoal holds, which then follows the actions; 0 has none.
+        config: Says how to explore. With `longest_hold` above 1 actions say how long they hold,
+            with `subgoal_every` above 0 subgoals follow them.
 
     Attributes:
         exploration: Share of `noise_std` and `random_epsilon` that is in force.
         proposer: Who proposes subgoals; None lets the goal itself be pursued.
     """
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        seeds: list[int],
-        noise_std: float,
-        random_epsilon: float,
-        noise_spread: float = 0.0,
-        *,
-        noise_ticks: int = 1,
-        parameter_noise: bool = False,
-        longest_hold: int = 1,
-        subgoal_every: int = 0,
-    ) -> None:
+    def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:
         self.simulation = simulation
         self.exploration = 1.0
         self.proposer: Proposer | None = None
         generator = np.random.default_rng(seeds[0])
-        self._holder = Holder(longest_hold) if longest_hold > 1 else None
-        self._shape = (simulation.num_envs, simulation.spec.robot.action_size + (longest_hold > 1))
-        std = 0.0 if parameter_noise else noise_std
+        longest, every, spec = config.longest_hold, config.subgoal_every, simulation.spec
+        std, epsilon = config.noise_std, config.random_epsilon
+        size = spec.robot.action_size + (longest > 1)
+        self._columns = size + subgoal_columns(every, spec.goal.size)
+        self._holder = Holder(longest) if longest > 1 else None
+        self._parameters = ParameterNoise(generator, std) if config.parameter_noise else None
         self._noise = ActionNoise(
-            generator, self._shape, std, random_epsilon, noise_spread, noise_ticks
+            generator,
+            (simulation.num_envs, size),
+            0.0 if config.parameter_noise else std,
+            epsilon,
+            config.noise_spread,
+            config.noise_ticks,
         )
-        self._parameters = ParameterNoise(generator, noise_std) if parameter_noise else None
-        self._guide: Guide | None = None
-        if subgoal_every:
-            self._guide = Guide(subgoal_every, generator, noise_std, random_epsilon)
-        self._columns = self._shape[1] + subgoal_columns(subgoal_every, simulation.spec.goal.size)
+        self._guide = Guide(every, generator, std, epsilon) if every else None
         self._seeds: list[int] | None = seeds
 
     def collect(self, policy: Policy, random: bool = False) -> tuple[Episodes, float]:
@@ -117,7 +104,7 @@ class Collector:
         if self._parameters is None:
             return policy
         self._parameters.share = self.exploration
-        return self._parameters.perturb(actor_of(policy))
+        return self._parameters.perturb(policy)
 
     def _adapt(self, policy: Policy, acting: Policy, episodes: Episodes) -> None:
         if self._parameters is not None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -25,30 +24,6 @@ Goals = NDArray[np.float64]
 SMALLEST_THRESHOLD, LARGEST_THRESHOLD = 0.5, 8.0
 
 
-class Condition(Protocol):
-    """What a value is conditioned on, beside state, action and goal."""
-
-    def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-        """Draws the values (count,) that transitions are learnt from under."""
-        ...
-
-    def inputs(self, drawn: NDArray[np.float64]) -> Array:
-        """What the networks see of them, (count, 1)."""
-        ...
-
-    def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
-        """Reward (count,) of goals under them."""
-        ...
-
-    def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Their values one step later, (count,)."""
-        ...
-
-    def goes_on(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether anything after this step counts, (count,)."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Threshold:
     """The success threshold, a multiple of the task's own, log-uniform.
@@ -62,16 +37,16 @@ class Threshold:
     metric: GoalMetric
 
     def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-        """Draws multiples of the threshold."""
+        """Draws the values (count,) that transitions are learnt from under: multiples of it."""
         low, high = np.log(SMALLEST_THRESHOLD), np.log(LARGEST_THRESHOLD)
         return np.asarray(np.exp(generator.uniform(low, high, count)))
 
     def inputs(self, drawn: NDArray[np.float64]) -> Array:
-        """Their logarithms."""
+        """What the networks see of them, (count, 1): their logarithms."""
         return np.log(drawn).astype(np.float32)[:, None]
 
     def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
-        """0 within that multiple of the threshold, else -1."""
+        """Reward (count,) of goals under them: 0 within that multiple, else -1."""
         distance, rotation = self.metric.distances(achieved, desired)
         spec = self.metric.spec
         reached = distance < drawn * spec.distance_threshold
@@ -80,11 +55,11 @@ class Threshold:
         return reached.astype(np.float64) - 1.0
 
     def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same."""
+        """Their values one step later, (count,): the same."""
         return drawn
 
     def goes_on(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Always."""
+        """Whether anything after this step counts, (count,): always."""
         return np.ones(len(drawn), np.bool_)
 
 
@@ -121,6 +96,9 @@ class Horizon:
         """Whether a step is left after this one."""
         return drawn > 1.0
 
+
+Condition = Threshold | Horizon
+"""What a value is conditioned on, beside state, action and goal."""
 
 # The input at which an actor acts: the threshold of the task itself; a whole episode left.
 ACTING_INPUT = {'threshold': 0.0, 'horizon': 1.0}

@@ -48,9 +48,9 @@ def add_field_options(parser: argparse.ArgumentParser, without: tuple[str, ...])
 
 def given_fields(options: argparse.Namespace, without: tuple[str, ...]) -> dict[str, Any]:
     """The fields that a command line has options for and that were given."""
-    names = [name for name in typing.get_type_hints(TrainConfig) if name not in without]
-    values = {name: getattr(options, name) for name in names}
-    return {name: value for name, value in values.items() if value is not None}
+    fields = typing.get_type_hints(TrainConfig).keys() - set(without)
+    given = vars(options).items()
+    return {name: value for name, value in given if name in fields and value is not None}
 
 
 def field_docstrings(kind: type) -> dict[str, str]:

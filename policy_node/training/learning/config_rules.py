@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from collections.abc import Iterator
 
 from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, TaskSpec, task_spec
 from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
@@ -14,40 +15,21 @@ from policy_node.training.learning.multi_step import CORRECTIONS
 RECIPES = ('paper', 'best')
 # Tasks that ignore their gripper action.
 GAMBLE_TASKS = ('FetchReach', 'FetchPush')
-_PLAIN_NETWORKS: dict[str, Any] = {
-    'algorithm': 'ddpg',
-    'critics': 1,
-    'norm': 'none',
-    'condition': 'none',
-    'longest_hold': 1,
-    'advantage': False,
-    'subgoal_every': 0,
-}
-"""Fields that decide what kind of networks there are, as most runs have them."""
-_ON_POLICY: dict[str, Any] = {
+_DEFAULTS = {field.name: field.default for field in dataclasses.fields(ConfigFields)}
+_OF_NETWORKS = 'algorithm critics norm condition longest_hold advantage subgoal_every'.split()
+"""Fields that decide what kind of networks there are; most runs have their defaults."""
+_ON_POLICY = {
     'overlap': False,
     'random_epsilon': 0.0,
-    'noise_spread': 0.0,
-    'final_exploration': 1.0,
-    'random_steps': 0,
-    'moved_share': 0.0,
-    'ticks_after_drop': -1,
-    'first_distance': 1.0,
-    'first_rotation': 1.0,
-    'narrow_above': 0.0,
-    'goal_choice': 'uniform',
-    'condition': 'none',
-    'n_step': 1,
-    'discount': 'tick',
-    'advantage': False,
-    'noise_seconds': 0.0,
-    'parameter_noise': False,
-    'longest_hold': 1,
-    'subgoal_every': 0,
-    'subgoal_prior': 0.0,
-    'critics': 1,
-    'norm': 'none',
-    'target': 'polyak',
+    **{
+        name: _DEFAULTS[name]
+        for name in (
+            'noise_spread final_exploration random_steps moved_share ticks_after_drop '
+            'first_distance first_rotation narrow_above goal_choice condition n_step discount '
+            'advantage noise_seconds parameter_noise longest_hold subgoal_every subgoal_prior '
+            'critics norm target'
+        ).split()
+    },
 }
 """Fields that `ppo` has no choice of: it learns from what its own noise did, and from values of
 states."""
@@ -138,15 +120,18 @@ def require_allowed(config: ConfigFields) -> None:
         if not lowest <= value <= highest:
             raise ValueError(f'{name} {value}; allowed: {lowest:.6g} ... {highest:.6g}')
     goal_features(config.goal_features, spec)
-    _refuse_what_has_no_effect(config, spec)
+    if config.goals:
+        parse_mixture(config.goals)
+    for reason in _contradictions(config, spec):
+        raise ValueError(reason)
     if not config.hidden_sizes or min(config.hidden_sizes) < 1:
         raise ValueError(f'hidden_sizes {config.hidden_sizes}; allowed: one or more widths >= 1')
 
 
 def unusual_networks(config: ConfigFields) -> list[str]:
     """Fields, `name value`, by which a run has networks that few others could start from."""
-    found = {name: getattr(config, name) for name in _PLAIN_NETWORKS}
-    return [f'{name} {value}' for name, value in found.items() if value != _PLAIN_NETWORKS[name]]
+    found = {name: getattr(config, name) for name in _OF_NETWORKS}
+    return [f'{name} {value}' for name, value in found.items() if value != _DEFAULTS[name]]
 
 
 def require_idle_gripper(task: str) -> None:
@@ -160,189 +145,129 @@ def require_idle_gripper(task: str) -> None:
         raise ValueError(f'gamble: {task} uses its gripper; allowed: {allowed}')
 
 
-def _refuse_what_has_no_effect(config: ConfigFields, spec: TaskSpec) -> None:
-    if config.goals:
-        parse_mixture(config.goals)
-        if config.strategy == 'none':
-            raise ValueError(f'goals {config.goals!r} excludes strategy none')
-    for wrong, reason in _contradictions(config):
-        if wrong:
-            raise ValueError(reason)
-    if config.gamble:
-        require_idle_gripper(config.task)
-    if config.ticks_after_drop >= 0 and spec.goal is not GoalKind.POSE:
-        raise ValueError(f'ticks_after_drop: {config.task} has no palm to drop an object from')
-    if config.drop_is_lost and (config.ticks_after_drop < 0 or config.reward_type != 'sparse'):
-        raise ValueError('drop_is_lost needs ticks_after_drop of 0 or more and sparse rewards')
-    _require_rotation(config, spec)
+def _contradictions(config: ConfigFields, spec: TaskSpec) -> Iterator[str]:
+    """Why fields exclude each other, or why nothing would look at them."""
+    if config.goals and config.strategy == 'none':
+        yield f'goals {config.goals!r} excludes strategy none'
+    yield from _contradictions_of_rates(config)
+    yield from _contradictions_of_subgoals(config)
+    yield from _contradictions_of_values(config)
+    yield from _contradictions_of_goals(config)
+    yield from _contradictions_of_algorithm(config)
+    yield from _contradictions_of_task(config, spec)
 
 
-def _require_rotation(config: ConfigFields, spec: TaskSpec) -> None:
-    for name in ('reward_rotation', 'first_rotation'):
-        if spec.rotation_threshold is None and getattr(config, name) != 1.0:
-            raise ValueError(f'{name}: goals of {config.task} have no rotation')
+def _contradictions_of_rates(config: ConfigFields) -> Iterator[str]:
+    """The same of what is for other rates than 25 Hz."""
+    holds, several = config.longest_hold > 1, config.n_step > 1
+    chosen, weighted = config.goal_choice != 'uniform', config.importance != 'none'
+    if 0.0 < config.noise_seconds * config.control_hz < 1.0 - 1e-6:
+        tick = 1.0 / config.control_hz
+        yield f'noise_seconds {config.noise_seconds:g} is less than a tick of {tick:g} s'
+    if config.parameter_noise and config.noise_spread > 0.0:
+        yield 'parameter_noise excludes noise_spread: its copies are alike'
+    if holds and (several or config.noise_seconds > 0.0 or config.parameter_noise):
+        yield 'longest_hold above 1 excludes n_step above 1, noise_seconds and parameter_noise'
+    if holds and (config.condition == 'horizon' or weighted or chosen):
+        yield 'longest_hold above 1 excludes condition horizon, importance and goal_choice'
+    if holds and config.gamble:
+        yield 'longest_hold above 1 excludes gamble'
+    if config.advantage and config.discount != 'time':
+        yield 'advantage needs discount time: it is per 40 ms'
+    if config.advantage and (config.critics > 1 or config.norm == 'batch'):
+        yield 'advantage excludes critics above 1 and norm batch'
+    if config.advantage and (several or holds):
+        yield 'advantage is of one tick: it excludes n_step and longest_hold above 1'
+    if config.advantage and (weighted or chosen):
+        yield 'advantage excludes importance and goal_choice'
 
 
-def _contradictions(config: ConfigFields) -> list[tuple[bool, str]]:
-    """Fields that exclude each other, or that nothing would look at, and why."""
+def _contradictions_of_subgoals(config: ConfigFields) -> Iterator[str]:
+    """The same of a high level."""
+    every, guided, imagined = (
+        config.subgoal_every,
+        config.subgoal_every > 0,
+        config.subgoal_prior > 0,
+    )
+    conditioned, chosen = config.condition != 'none', config.goal_choice != 'uniform'
+    if every > task_spec(config.task, control_hz=config.control_hz).episode_ticks:
+        yield f'subgoal_every {every} is longer than an episode'
+    if guided and (config.n_step > 1 or config.longest_hold > 1 or config.parameter_noise):
+        yield 'subgoal_every excludes n_step and longest_hold above 1 and parameter_noise'
+    if guided and (conditioned or chosen or config.importance != 'none' or config.advantage):
+        yield 'subgoal_every excludes condition, goal_choice, importance and advantage'
+    if guided and config.ticks_after_drop >= 0:
+        yield 'subgoal_every excludes ticks_after_drop'
+    if guided and config.reward_type != 'sparse':
+        yield 'subgoal_every needs reward_type sparse: a subgoal is reached or missed'
+    if imagined and (guided or conditioned or config.advantage):
+        yield 'subgoal_prior excludes subgoal_every, condition and advantage'
+    if imagined and config.longest_hold > 1:
+        yield 'subgoal_prior excludes longest_hold above 1'
+
+
+def _contradictions_of_values(config: ConfigFields) -> Iterator[str]:
+    """The same of how values are learnt."""
+    if config.correction != 'none' and config.n_step == 1:
+        yield f'correction {config.correction} needs n_step above 1'
+    if config.aggregate != 'mean' and config.critics == 1:
+        yield f'aggregate {config.aggregate} needs critics above 1'
+    if config.norm != 'none' and config.layer_norm:
+        yield f'norm {config.norm} excludes layer_norm, which is for the critic too'
+    if config.norm == 'batch' and config.target != 'none':
+        yield 'norm batch needs target none: both values come from one pass'
+
+
+def _contradictions_of_goals(config: ConfigFields) -> Iterator[str]:
+    """The same of goals, and of how near is near enough."""
     sources = config.goals or config.strategy
     replays_later = 'future' in sources or 'near' in sources
     conditioned, chosen = config.condition != 'none', config.goal_choice != 'uniform'
+    if chosen and not replays_later:
+        yield f'goal_choice {config.goal_choice} needs future or near goals'
+    if config.goal_choice == 'uncertain' and config.critics == 1:
+        yield 'goal_choice uncertain needs critics above 1'
+    if conditioned and (chosen or config.importance != 'none'):
+        yield f'condition {config.condition} excludes goal_choice and importance'
+    if config.condition == 'horizon' and config.n_step > 1:
+        yield 'condition horizon excludes n_step above 1'
+    if config.condition == 'threshold' and config.reward_type == 'dense':
+        yield 'condition threshold needs reward_type sparse'
+    if config.narrows and (conditioned or config.reward_type == 'dense'):
+        yield 'first_distance and first_rotation need reward_type sparse and condition none'
+    if config.narrow_above > 0 and not config.narrows:
+        yield 'narrow_above needs first_distance or first_rotation above 1'
+    if config.narrows and config.subgoal_every > 0:
+        yield 'first_distance and first_rotation exclude subgoal_every'
+
+
+def _contradictions_of_algorithm(config: ConfigFields) -> Iterator[str]:
+    """The same of importance weights, of `ppo`, and of what others could not start from."""
     weighted, on_policy = config.importance != 'none', config.algorithm == 'ppo'
-    others = _set_for_ddpg(config) if on_policy else []
-    unusual = unusual_networks(config)
-    return [
-        *_contradictions_of_rates(config),
-        *_contradictions_of_subgoals(config),
-        (
-            config.correction != 'none' and config.n_step == 1,
-            f'correction {config.correction} needs n_step above 1',
-        ),
-        (
-            config.aggregate != 'mean' and config.critics == 1,
-            f'aggregate {config.aggregate} needs critics above 1',
-        ),
-        (
-            config.norm != 'none' and config.layer_norm,
-            f'norm {config.norm} excludes layer_norm, which is for the critic too',
-        ),
-        (
-            config.norm == 'batch' and config.target != 'none',
-            'norm batch needs target none: both values come from one pass',
-        ),
-        (
-            chosen and not replays_later,
-            f'goal_choice {config.goal_choice} needs future or near goals',
-        ),
-        (
-            config.goal_choice == 'uncertain' and config.critics == 1,
-            'goal_choice uncertain needs critics above 1',
-        ),
-        (
-            conditioned and (chosen or weighted),
-            f'condition {config.condition} excludes goal_choice and importance',
-        ),
-        (
-            config.condition == 'horizon' and config.n_step > 1,
-            'condition horizon excludes n_step above 1',
-        ),
-        (
-            config.condition == 'threshold' and config.reward_type == 'dense',
-            'condition threshold needs reward_type sparse',
-        ),
-        (
-            config.narrows and (conditioned or config.reward_type == 'dense'),
-            'first_distance and first_rotation need reward_type sparse and condition none',
-        ),
-        (
-            config.narrow_above > 0 and not config.narrows,
-            'narrow_above needs first_distance or first_rotation above 1',
-        ),
-        (
-            config.narrows and config.subgoal_every > 0,
-            'first_distance and first_rotation exclude subgoal_every',
-        ),
-        (weighted and config.n_step > 1, f'importance {config.importance} excludes n_step above 1'),
-        (
-            weighted and config.strategy == 'none' and not config.goals,
-            f'importance {config.importance} needs goals chosen in hindsight',
-        ),
-        (
-            weighted and on_policy != (config.importance == 'decision'),
-            f'importance {config.importance} excludes algorithm {config.algorithm}',
-        ),
-        (on_policy and config.noise_std == 0.0, 'algorithm ppo needs noise_std above 0'),
-        (bool(others), f'algorithm ppo needs {", ".join(others)}'),
-        (bool(config.init_from and unusual), f'init_from excludes {", ".join(unusual)}'),
-    ]
+    if weighted and config.n_step > 1:
+        yield f'importance {config.importance} excludes n_step above 1'
+    if weighted and config.strategy == 'none' and not config.goals:
+        yield f'importance {config.importance} needs goals chosen in hindsight'
+    if weighted and on_policy != (config.importance == 'decision'):
+        yield f'importance {config.importance} excludes algorithm {config.algorithm}'
+    if on_policy and config.noise_std == 0.0:
+        yield 'algorithm ppo needs noise_std above 0'
+    needed = {name: value for name, value in _ON_POLICY.items() if getattr(config, name) != value}
+    if on_policy and needed:
+        others = (f'{name}={str(value).lower()}' for name, value in needed.items())
+        yield f'algorithm ppo needs {", ".join(others)}'
+    if config.init_from and (unusual := unusual_networks(config)):
+        yield f'init_from excludes {", ".join(unusual)}'
 
 
-def _set_for_ddpg(config: ConfigFields) -> list[str]:
-    """What `ppo` would not look at, as it has to be: `name=value`."""
-    return [
-        f'{name}={str(value).lower()}'
-        for name, value in _ON_POLICY.items()
-        if getattr(config, name) != value
-    ]
-
-
-def _contradictions_of_rates(config: ConfigFields) -> list[tuple[bool, str]]:
-    """The same of what is for other rates than 25 Hz."""
-    holds, several = config.longest_hold > 1, config.n_step > 1
-    chosen = config.goal_choice != 'uniform'
-    weighted = config.importance != 'none'
-    return [
-        (
-            0.0 < config.noise_seconds * config.control_hz < 1.0 - 1e-6,
-            f'noise_seconds {config.noise_seconds:g} is less than a tick of '
-            f'{1.0 / config.control_hz:g} s',
-        ),
-        (
-            config.parameter_noise and config.noise_spread > 0.0,
-            'parameter_noise excludes noise_spread: its copies are alike',
-        ),
-        (
-            holds and (several or config.noise_seconds > 0.0 or config.parameter_noise),
-            'longest_hold above 1 excludes n_step above 1, noise_seconds and parameter_noise',
-        ),
-        (
-            holds and (config.condition == 'horizon' or weighted or chosen),
-            'longest_hold above 1 excludes condition horizon, importance and goal_choice',
-        ),
-        (
-            holds and config.gamble,
-            'longest_hold above 1 excludes gamble',
-        ),
-        (
-            config.advantage and config.discount != 'time',
-            'advantage needs discount time: it is per 40 ms',
-        ),
-        (
-            config.advantage and (config.critics > 1 or config.norm == 'batch'),
-            'advantage excludes critics above 1 and norm batch',
-        ),
-        (
-            config.advantage and (several or holds),
-            'advantage is of one tick: it excludes n_step and longest_hold above 1',
-        ),
-        (
-            config.advantage and (weighted or chosen),
-            'advantage excludes importance and goal_choice',
-        ),
-    ]
-
-
-def _contradictions_of_subgoals(config: ConfigFields) -> list[tuple[bool, str]]:
-    """The same of a high level."""
-    guided, every = config.subgoal_every > 0, config.subgoal_every
-    conditioned, chosen = config.condition != 'none', config.goal_choice != 'uniform'
-    return [
-        (
-            guided and every > task_spec(config.task, control_hz=config.control_hz).episode_ticks,
-            f'subgoal_every {every} is longer than an episode',
-        ),
-        (
-            guided and (config.n_step > 1 or config.longest_hold > 1 or config.parameter_noise),
-            'subgoal_every excludes n_step and longest_hold above 1 and parameter_noise',
-        ),
-        (
-            guided and (conditioned or chosen or config.importance != 'none' or config.advantage),
-            'subgoal_every excludes condition, goal_choice, importance and advantage',
-        ),
-        (
-            guided and config.ticks_after_drop >= 0,
-            'subgoal_every excludes ticks_after_drop',
-        ),
-        (
-            guided and config.reward_type != 'sparse',
-            'subgoal_every needs reward_type sparse: a subgoal is reached or missed',
-        ),
-        (
-            config.subgoal_prior > 0.0 and (guided or conditioned or config.advantage),
-            'subgoal_prior excludes subgoal_every, condition and advantage',
-        ),
-        (
-            config.subgoal_prior > 0.0 and config.longest_hold > 1,
-            'subgoal_prior excludes longest_hold above 1',
-        ),
-    ]
+def _contradictions_of_task(config: ConfigFields, spec: TaskSpec) -> Iterator[str]:
+    """The same of what only some tasks have."""
+    if config.gamble:
+        require_idle_gripper(config.task)
+    if config.ticks_after_drop >= 0 and spec.goal is not GoalKind.POSE:
+        yield f'ticks_after_drop: {config.task} has no palm to drop an object from'
+    if config.drop_is_lost and (config.ticks_after_drop < 0 or config.reward_type != 'sparse'):
+        yield 'drop_is_lost needs ticks_after_drop of 0 or more and sparse rewards'
+    for name in ('reward_rotation', 'first_rotation'):
+        if spec.rotation_threshold is None and getattr(config, name) != 1.0:
+            yield f'{name}: goals of {config.task} have no rotation'

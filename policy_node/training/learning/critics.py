@@ -1,4 +1,4 @@
-"""Critics: one or an ensemble, their normalisation, and what an ensemble says as one."""
+"""Critics: one, an ensemble and what it says as one, or values and advantages apart."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.config import TrainConfig
 
 # Share of the running statistics that one batch replaces (CrossQ, arXiv 1902.05605: 0.01).
 _MOMENTUM = 0.01
@@ -68,11 +69,53 @@ class Ensemble(nn.Module):
         return torch.stack([member(features, action) for member in self.members])
 
 
-def make_critic(inputs: int, shape: NetworkShape, norm: str, count: int) -> nn.Module:
-    """Returns a critic, or an ensemble of `count` with a leading axis in its values."""
-    if count == 1:
-        return Critic(inputs, shape, norm)
-    return Ensemble([Critic(inputs, shape, norm) for _ in range(count)])
+class AdvantageCritic(nn.Module):
+    """Value of a state and advantage of an action, two networks (DAU, arXiv 1901.09732).
+
+    The more frequent actions are, the less a single one of them matters: action values become
+    values of states, and what an actor is to climb vanishes. Here Q(s, a) = V(s) + dt (A(s, a) -
+    A(s, pi(s))), so that A keeps its size whatever dt is and the actor climbs A. dt is 1 for a tick
+    of 40 ms.
+
+    Args:
+        features: Length of the features, a condition included.
+        shape: Of the actor; hidden layers are the same.
+        norm: What normalises them: `none` or `layer`.
+        duration: Of a tick, in units of 40 ms.
+    """
+
+    def __init__(self, features: int, shape: NetworkShape, norm: str, duration: float) -> None:
+        super().__init__()
+        self._duration = duration
+        self.state_value = Critic(features, shape, norm)
+        self.advantage = Critic(features + shape.action_size, shape, norm)
+
+    def value(self, features: Tensor) -> Tensor:
+        """Values (batch,) of states."""
+        nothing = features.new_zeros((len(features), 0))
+        value: Tensor = self.state_value(features, nothing)
+        return value
+
+    def forward(self, features: Tensor, action: Tensor, own: Tensor) -> Tensor:
+        """Values (batch,) of actions, of which `own` has the value of its state."""
+        gain: Tensor = self.advantage(features, action) - self.advantage(features, own)
+        return self.value(features) + self._duration * gain
+
+
+def make_critic(config: TrainConfig, features: int, shape: NetworkShape) -> nn.Module:
+    """Returns what a configuration asks for; values of an ensemble have a leading axis.
+
+    Args:
+        config: The configuration.
+        features: Length of the features, a condition included.
+        shape: Of the actor; hidden layers are the same.
+    """
+    if config.advantage:
+        return AdvantageCritic(features, shape, config.norm, config.tick_share)
+    inputs = features + shape.action_size
+    if config.critics == 1:
+        return Critic(inputs, shape, config.norm)
+    return Ensemble([Critic(inputs, shape, config.norm) for _ in range(config.critics)])
 
 
 def _add_batch_norm(network: MLP) -> None:

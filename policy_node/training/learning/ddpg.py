@@ -12,16 +12,14 @@ from torch import Tensor, nn
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.actor_critic import ActorCritic
-from policy_node.training.learning.advantage import AdvantageCritic
+from policy_node.training.learning.actor_critic import ActorCritic, Losses
 from policy_node.training.learning.conditions import ACTING_INPUT, fold
 from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.critics import AGGREGATES, make_critic
+from policy_node.training.learning.critics import AGGREGATES, AdvantageCritic, make_critic
 from policy_node.training.learning.density_ratio import DensityRatio, GoalView
 from policy_node.training.learning.devices import uses_bfloat16
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.frame_skip import plain_actor
-from policy_node.training.learning.learner import Losses
 from policy_node.training.learning.replay import Array
 from policy_node.training.learning.transitions import Transitions
 
@@ -61,8 +59,7 @@ class DDPG(ActorCritic):
         actor = Actor(shape)
         if conditioned:
             actor.network = MLP(inputs, shape.action_size, shape)
-        inputs += shape.action_size
-        critic = self._make_critic(config, inputs, shape)
+        critic = make_critic(config, inputs, shape)
         # A batch normalisation learns its statistics where values are learnt, nowhere else.
         super().__init__(actor, critic.eval(), config, device, workers)
         self.target_actor, self.target_critic = self.actor.network, self.critic
@@ -76,13 +73,6 @@ class DDPG(ActorCritic):
             self._achieved_start = task_spec(config.task).achieved_goal_start
         self._action_size = shape.action_size - (config.longest_hold > 1)
         self._bfloat16 = uses_bfloat16(config.precision, device)
-
-    @staticmethod
-    def _make_critic(config: TrainConfig, inputs: int, shape: NetworkShape) -> nn.Module:
-        if config.advantage:
-            features = inputs - shape.action_size
-            return AdvantageCritic(features, shape, config.norm, config.tick_share)
-        return make_critic(inputs, shape, config.norm, config.critics)
 
     def update(self, batch: Transitions) -> Losses:
         """Improves critic and actor on a batch and, when due, moves the targets."""

@@ -50,11 +50,9 @@ class Workers:
             return
         flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
         mean = self.sum(flat) / self.world_size
-        start = 0
-        for gradient in gradients:
-            part = mean[start : start + gradient.numel()]
+        parts = torch.split(mean, [gradient.numel() for gradient in gradients])
+        for gradient, part in zip(gradients, parts, strict=True):
             gradient.copy_(part.view_as(gradient))
-            start += gradient.numel()
 
     def broadcast(self, tensors: Sequence[Tensor]) -> None:
         """Gives every worker the values of worker 0."""

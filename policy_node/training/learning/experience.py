@@ -47,6 +47,7 @@ class Experience:
         generator: np.random.Generator,
     ) -> None:
         self.config = config
+        self._spec = spec
         self._workers = workers
         self._sampler = self._first_sampler = sampler
         self.judge: Judge | None = None
@@ -69,12 +70,11 @@ class Experience:
             episode_weights(config.episode_weights, spec, config.control_hz),
             self._count_ticks,
         )
-        self._ticks = spec.episode_ticks
 
     @property
     def transitions(self) -> int:
         """Transitions held."""
-        return len(self.replay) * self._ticks
+        return len(self.replay) * self._spec.episode_ticks
 
     def normalize(self, episodes: Episodes, actor: Actor, env_steps: int) -> None:
         """Adds episodes to the statistics and gives these to the actor; all workers together.

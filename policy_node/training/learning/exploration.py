@@ -67,17 +67,6 @@ class ActionNoise:
         return np.where(self._replaced[:, None], self._uniform, noisy)
 
 
-def actor_of(policy: Policy) -> Actor:
-    """A policy whose weights can be moved.
-
-    Raises:
-        TypeError: If it has none.
-    """
-    if not isinstance(policy, Actor):
-        raise TypeError(f'parameter noise needs an actor, not a {type(policy).__name__}')
-    return policy
-
-
 # Perturbed copies that collect side by side, each in its share of the simulations.
 _COPIES = 8
 # States at which the distance of copies is measured.
@@ -107,8 +96,14 @@ class ParameterNoise:
         self.share = 1.0
         self.scale = _FIRST_SCALE
 
-    def perturb(self, actor: Actor) -> PerturbedActors:
-        """Copies of an actor with other weights each."""
+    def perturb(self, actor: Policy) -> PerturbedActors:
+        """Copies of an actor with other weights each.
+
+        Raises:
+            TypeError: If it has no weights that can be moved.
+        """
+        if not isinstance(actor, Actor):
+            raise TypeError(f'parameter noise needs an actor, not a {type(actor).__name__}')
         return PerturbedActors([self._copy(actor) for _ in range(_COPIES)])
 
     @torch.no_grad()

@@ -38,8 +38,3 @@ GOAL_CHOICES: dict[str, Score] = {
     'uncertain': lambda judge, batch: judge.disagreement(batch),
 }
 """What is greatest of the goal to choose; `uniform` takes any."""
-
-
-def best_of(scores: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Index (batch,) of the best of the candidates, (candidates, batch); the first of equals."""
-    return np.asarray(scores.argmax(axis=0))

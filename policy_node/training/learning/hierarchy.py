@@ -17,11 +17,11 @@ from torch import nn
 from msgs_spec.tasks import GoalKind, task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
+from policy_node.training.learning.actor_critic import Losses
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.ddpg import DDPG, Known
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.hindsight_actions import HierarchicalTransitions
-from policy_node.training.learning.learner import Losses
 from policy_node.training.learning.subgoals import Proposer
 from policy_node.training.learning.transitions import Transitions
 

@@ -14,18 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.tasks import TaskSpec
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
-from policy_node.training.learning.hindsight import (
-    RewardFunction,
-    draw_sources,
-    goals_of,
-    with_subgoals,
-)
-from policy_node.training.learning.multi_step import discounted_rewards
-from policy_node.training.learning.replay import Array, Episodes
+from policy_node.training.learning.hindsight import draw_sources, goals_of, with_subgoals
+from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.sampling import TransitionSampler
 from policy_node.training.learning.subgoals import subgoals_of, tested
 from policy_node.training.learning.transitions import Starts, Transitions
@@ -51,17 +42,13 @@ class SubgoalSampler:
     """How transitions of the high level are made from episodes.
 
     Attributes:
+        sampler: Knows rewards and the discount of one tick.
         every: Ticks for which a subgoal holds.
-        compute_reward: (achieved_goal, desired_goal) -> reward, batched.
-        gamma: Discount of one tick.
-        reward_scale: What rewards are multiplied by.
         missed_value: Value of a tested subgoal that was missed.
     """
 
+    sampler: TransitionSampler
     every: int
-    compute_reward: RewardFunction
-    gamma: float
-    reward_scale: float
     missed_value: float
 
     def sample(
@@ -82,23 +69,9 @@ class SubgoalSampler:
         starts = Starts(episodes, row, self._ticks(episodes, len(row), generator))
         source = draw_sources(mixture, len(row), generator)
         goal = goals_of(starts, source, list(mixture), generator)
-        end = row, starts.tick + self.every
-
-        def reward_after(achieved: Array, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-            pairs = achieved.astype(np.float64), goal[chosen].astype(np.float64)
-            return np.asarray(self.compute_reward(*pairs))
-
-        steps = np.full(len(row), self.every)
-        reward = discounted_rewards(starts, steps, reward_after, self.gamma) * self.reward_scale
-        batch = Transitions(
-            observation=episodes.observation[row, starts.tick],
-            next_observation=episodes.observation[end],
-            goal=goal,
-            action=episodes.achieved_goal[end],
-            reward=reward.astype(np.float32),
-            discount=np.full(len(row), self.gamma**self.every, np.float32),
-        )
-        return self._with_tests(starts, batch)
+        batch = self.sampler.several(starts, np.full(len(row), self.every), goal, generator)
+        achieved = episodes.achieved_goal[row, starts.tick + self.every]
+        return self._with_tests(starts, replace(batch, action=achieved))
 
     def _ticks(
         self, episodes: Episodes, count: int, generator: np.random.Generator
@@ -112,7 +85,8 @@ class SubgoalSampler:
     def _with_tests(self, starts: Starts, batch: Transitions) -> Transitions:
         """The same where tested subgoals were missed: they lead nowhere, whatever the goal is."""
         subgoal = subgoals_of(starts)
-        reward = self.compute_reward(batch.action.astype(np.float64), subgoal.astype(np.float64))
+        pairs = batch.action.astype(np.float64), subgoal.astype(np.float64)
+        reward = self.sampler.compute_reward(*pairs)
         missed = tested(starts) & (starts.tick % self.every == 0) & (reward < 0.0)
         return replace(
             batch,
@@ -123,40 +97,15 @@ class SubgoalSampler:
 
 
 class HierarchicalExperience(Experience):
-    """Batches of both levels from one replay.
-
-    Args:
-        config: The configuration.
-        spec: The task.
-        workers: This worker among all.
-        sampler: Makes transitions of the actor.
-        generator: Source of all randomness.
-    """
-
-    def __init__(
-        self,
-        config: TrainConfig,
-        spec: TaskSpec,
-        workers: Workers,
-        sampler: TransitionSampler,
-        generator: np.random.Generator,
-    ) -> None:
-        super().__init__(config, spec, workers, sampler, generator)
-        self._action_size = spec.robot.action_size
-        self._subgoals = SubgoalSampler(
-            config.subgoal_every,
-            sampler.compute_reward,
-            sampler.gamma,
-            sampler.reward_scale,
-            config.lowest_value,
-        )
+    """Batches of both levels from one replay; arguments as `Experience` has them."""
 
     def batch(self, env_steps: int) -> HierarchicalTransitions:
         """Draws the transitions of one update of both levels."""
-        mixture = self.mixture(env_steps)
+        config, mixture = self.config, self.mixture(env_steps)
         low = self._draw(with_subgoals(mixture))
         rows = self._draw_rows()
-        high = self._subgoals.sample(self.replay.episodes, rows, mixture, self.generator)
+        subgoals = SubgoalSampler(self._sampler, config.subgoal_every, config.lowest_value)
+        high = subgoals.sample(self.replay.episodes, rows, mixture, self.generator)
         values = {name: getattr(low, name) for name in Transitions.__slots__}
-        values['action'] = low.action[:, : self._action_size]
+        values['action'] = low.action[:, : self._spec.robot.action_size]
         return HierarchicalTransitions(**values, high=high)

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from msgs_spec.tasks import TaskSpec
+from policy_node.training.learning.actor_critic import ActorCritic
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.distributed import Workers
@@ -14,7 +15,6 @@ from policy_node.training.learning.hierarchy import HierarchicalDDPG
 from policy_node.training.learning.hindsight_actions import HierarchicalExperience
 from policy_node.training.learning.imagined import ImaginingDDPG
 from policy_node.training.learning.initial_networks import network_shape
-from policy_node.training.learning.learner import Learner
 from policy_node.training.learning.on_policy import OnPolicyExperience
 from policy_node.training.learning.ppo import PPO
 from policy_node.training.learning.sampling import TransitionSampler
@@ -27,7 +27,7 @@ def make_learner(
     workers: Workers,
     sampler: TransitionSampler,
     generator: np.random.Generator,
-) -> tuple[Learner, Experience]:
+) -> tuple[ActorCritic, Experience]:
     """Returns a learner and its experience.
 
     Args:

@@ -14,10 +14,9 @@ from torch import Tensor
 
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.actor_critic import ActorCritic
+from policy_node.training.learning.actor_critic import ActorCritic, Losses
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.learner import Losses
 from policy_node.training.learning.replay import Array
 from policy_node.training.learning.rollouts import RolloutTransitions
 from policy_node.training.learning.transitions import Transitions

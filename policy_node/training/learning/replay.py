@@ -41,16 +41,11 @@ class Episodes:
 
     def last(self, count: int) -> Episodes:
         """Returns the last `count` episodes, or all if there are fewer."""
-        return Episodes(*(getattr(self, name)[-count:] for name in Episodes.__slots__))
+        return self.select(slice(-count, None))
 
-    def select(self, rows: NDArray[np.bool_]) -> Episodes:
-        """Returns the episodes whose row is True."""
-        return Episodes(
-            self.observation[rows],
-            self.achieved_goal[rows],
-            self.desired_goal[rows],
-            self.action[rows],
-        )
+    def select(self, rows: NDArray[np.bool_ | np.int64] | slice) -> Episodes:
+        """Returns the episodes at these rows, or those whose row is True; views of a slice."""
+        return Episodes(*(getattr(self, name)[rows] for name in Episodes.__slots__))
 
 
 class EpisodeReplay:
@@ -104,13 +99,7 @@ class EpisodeReplay:
     @property
     def episodes(self) -> Episodes:
         """Views of the episodes held, in no particular order."""
-        ring, size = self._ring, self._size
-        return Episodes(
-            ring.observation[:size],
-            ring.achieved_goal[:size],
-            ring.desired_goal[:size],
-            ring.action[:size],
-        )
+        return self._ring.select(slice(self._size))
 
     @property
     def ticks(self) -> int:
@@ -119,9 +108,8 @@ class EpisodeReplay:
 
     def newest(self, count: int) -> Episodes:
         """Copies of the newest episodes, the newest last; all if there are fewer than `count`."""
-        ring, number = self._ring, min(count, self._size)
-        rows = (self._next - number + np.arange(number)) % self.capacity
-        return Episodes(*(getattr(ring, name)[rows] for name in Episodes.__slots__))
+        number = min(count, self._size)
+        return self._ring.select((self._next - number + np.arange(number)) % self.capacity)
 
     def add(self, episodes: Episodes) -> None:
         """Adds episodes, the oldest ones making room.
@@ -136,10 +124,8 @@ class EpisodeReplay:
         if len(episodes) > self.capacity:
             raise ValueError(f'{len(episodes)} episodes exceed the capacity of {self.capacity}')
         rows = (self._next + np.arange(len(episodes))) % self.capacity
-        self._ring.observation[rows] = episodes.observation
-        self._ring.achieved_goal[rows] = episodes.achieved_goal
-        self._ring.desired_goal[rows] = episodes.desired_goal
-        self._ring.action[rows] = episodes.action
+        for name in Episodes.__slots__:
+            getattr(self._ring, name)[rows] = getattr(episodes, name)
         self._weights[rows] = self._weigh(episodes)
         if self._count_ticks is not None:
             self._valid[rows] = self._count_ticks(episodes)

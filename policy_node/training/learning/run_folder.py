@@ -11,9 +11,9 @@ from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo
+from policy_node.training.learning.actor_critic import ActorCritic
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.frame_skip import plain_actor
-from policy_node.training.learning.learner import Learner
 from policy_node.training.learning.normalizer import RunningStatistics
 from policy_node.training.learning.training_state import Counters, save_state
 
@@ -84,7 +84,7 @@ class RunFolder:
         return self.path / (REPLAY_FILE if rank == 0 else f'{rank}.{REPLAY_FILE}')
 
     def save_state(
-        self, learner: Learner, statistics: dict[str, RunningStatistics], counters: Counters
+        self, learner: ActorCritic, statistics: dict[str, RunningStatistics], counters: Counters
     ) -> None:
         """Writes everything that a resumed run needs but the replay."""
         config = dataclasses.asdict(self.config)

@@ -154,11 +154,9 @@ def read_progress(path: str | Path) -> list[dict[str, float]]:
 
 def draw_curve(rows: Sequence[dict[str, float]], title: str, path: str | Path) -> None:
     """Draws success against environment steps as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 4.0), layout='constrained')
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     evaluated = [row for row in rows if 'eval_success' in row]
     axes.plot(

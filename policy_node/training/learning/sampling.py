@@ -12,7 +12,7 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from policy_node.training.learning.conditions import Condition, make_condition
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.frame_skip import HeldSteps
-from policy_node.training.learning.goal_choice import CANDIDATES, GOAL_CHOICES, Judge, best_of
+from policy_node.training.learning.goal_choice import CANDIDATES, GOAL_CHOICES, Judge
 from policy_node.training.learning.hindsight import RewardFunction, draw_sources, flat, goals_of
 from policy_node.training.learning.multi_step import StepCounter, discounted_rewards
 from policy_node.training.learning.replay import Array, Episodes
@@ -96,7 +96,7 @@ class TransitionSampler:
             if self.steps is not None:
                 act = None if judge is None else judge.act
                 steps = self.steps.count(starts, goal, generator, act)
-            batch = self._several(starts, steps, goal, generator)
+            batch = self.several(starts, steps, goal, generator)
         if self.lost_value is None:
             return batch
         return _with_losses(starts, steps, batch, self.lost_value)
@@ -117,14 +117,21 @@ class TransitionSampler:
             discount=np.full(len(row), self.gamma, np.float32),
         )
 
-    def _several(
+    def several(
         self,
         starts: Starts,
         steps: NDArray[np.int64],
         goal: Array,
         generator: np.random.Generator,
     ) -> Transitions:
-        """Transitions of several steps, or under a condition."""
+        """Transitions of several steps, or under a condition.
+
+        Args:
+            starts: Where they begin.
+            steps: How many steps each has, (batch,).
+            goal: (batch, goal_size).
+            generator: Source of randomness for conditions.
+        """
         episodes, row, tick = starts.episodes, starts.row, starts.tick
         condition = self.condition
         drawn = None if condition is None else condition.draw(len(row), generator)
@@ -169,7 +176,8 @@ class TransitionSampler:
         repeated = starts.select(np.tile(np.arange(len(names)), CANDIDATES))
         batch = self._single(repeated, np.concatenate(candidates))
         score = GOAL_CHOICES[self.goal_choice](judge, batch)
-        best = best_of(score.reshape(CANDIDATES, -1))
+        # The first of equals.
+        best: NDArray[np.intp] = score.reshape(CANDIDATES, -1).argmax(axis=0)
         return np.stack(candidates)[best, np.arange(len(names))]
 
 

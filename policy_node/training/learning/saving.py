@@ -8,10 +8,9 @@ from msgs_spec.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
 from policy_node.training.evaluation.evaluator import success_rate
-from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.actor_critic import ActorCritic
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
-from policy_node.training.learning.learner import Learner
 from policy_node.training.learning.replay_file import save_replay
 from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE, RunFolder
 from policy_node.training.learning.training_state import Counters
@@ -26,16 +25,15 @@ class Saver:
 
     Args:
         folder: Where they go.
-        config: Configuration of the run.
         workers: This worker among all.
 
     Attributes:
         folder: Where they go.
     """
 
-    def __init__(self, folder: RunFolder, config: TrainConfig, workers: Workers) -> None:
+    def __init__(self, folder: RunFolder, workers: Workers) -> None:
         self.folder = folder
-        self._config = config
+        self._config = folder.config
         self._workers = workers
         self._last_checkpoint = self._last_replay = time.monotonic()
 
@@ -51,7 +49,9 @@ class Saver:
                 measured |= diagnose(outcomes)
                 self.folder.save_actor(BEST_FILE, actor, counters.env_steps, measured)
 
-    def save_when_due(self, learner: Learner, experience: Experience, counters: Counters) -> None:
+    def save_when_due(
+        self, learner: ActorCritic, experience: Experience, counters: Counters
+    ) -> None:
         """Writes a checkpoint now and then, the replay more seldom; a full disk may empty."""
         now = time.monotonic()
         if now - self._last_checkpoint < self._config.checkpoint_seconds:
@@ -64,7 +64,7 @@ class Saver:
 
     def save(
         self,
-        learner: Learner,
+        learner: ActorCritic,
         experience: Experience,
         counters: Counters,
         with_replay: bool = True,

@@ -16,14 +16,14 @@ from msgs_spec.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator, success_rate
+from policy_node.training.learning.actor_critic import Losses
 from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.devices import choose_device
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.initial_networks import CRITIC_FIRST, InitialNetworks
-from policy_node.training.learning.learner import Losses
 from policy_node.training.learning.learners import make_learner
-from policy_node.training.learning.progress_row import Speed, progress_row
+from policy_node.training.learning.progress_row import progress_row
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.replay_file import load_replay
 from policy_node.training.learning.run_folder import RunFolder
@@ -78,7 +78,7 @@ class Trainer:
         self.workers = workers
         origin = {} if init_from is None else init_from.origin
         folder = RunFolder(output, config, command, source_revision, origin)
-        self._saver = Saver(folder, config, workers)
+        self._saver = Saver(folder, workers)
         self.device = choose_device(config.device)
         self._simulation_threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
@@ -107,17 +107,8 @@ class Trainer:
         collector_seeds, sampler_seed = seeds.spawn(2)
         # Below the seeds of evaluation, whose episodes must stay unseen.
         resets = collector_seeds.generate_state(self.simulation.num_envs) >> 2
-        self.collector = Collector(
-            self.simulation,
-            [int(seed) % EVALUATION_SEED for seed in resets],
-            config.noise_std,
-            config.random_epsilon,
-            config.noise_spread,
-            noise_ticks=config.noise_ticks,
-            parameter_noise=config.parameter_noise,
-            longest_hold=config.longest_hold,
-            subgoal_every=config.subgoal_every,
-        )
+        starts = [int(seed) % EVALUATION_SEED for seed in resets]
+        self.collector = Collector(self.simulation, starts, config)
         return np.random.default_rng(sampler_seed)
 
     def _build_learner(self) -> None:
@@ -338,10 +329,11 @@ class Trainer:
     ) -> dict[str, float | None]:
         workers, batch = self.workers.world_size, self.experience.batch_size
         steps = self.simulation.num_envs * self.spec.episode_ticks * workers
-        speed = Speed(seconds, steps, len(losses) * batch * workers)
         success, outcomes = collected.train_success, collected.evaluation
         rule = self.config.success_rule
-        row = progress_row(self.counters, success, outcomes, rule, losses, speed)
+        row = progress_row(self.counters, success, outcomes, rule, losses)
+        row['steps_per_second'] = steps / seconds
+        row['samples_per_second'] = len(losses) * batch * workers / seconds
         if collected.guided is not None:
             row['eval_guided'] = success_rate(collected.guided, rule)
         return row

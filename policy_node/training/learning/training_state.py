@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from policy_node.policies.tensor_file import read_tensors, write_tensors
-from policy_node.training.learning.learner import Learner
+from policy_node.training.learning.actor_critic import ActorCritic
 from policy_node.training.learning.normalizer import RunningStatistics
 
 FORMAT = 'fetch_hand_training'
@@ -62,7 +62,7 @@ class TrainingState:
 
 def save_state(
     path: Path,
-    learner: Learner,
+    learner: ActorCritic,
     statistics: dict[str, RunningStatistics],
     counters: Counters,
     extra: dict[str, Any],
@@ -122,7 +122,7 @@ def read_state(path: Path) -> TrainingState:
 
 
 def load_state(
-    path: Path, learner: Learner, statistics: dict[str, RunningStatistics]
+    path: Path, learner: ActorCritic, statistics: dict[str, RunningStatistics]
 ) -> TrainingState:
     """Fills learner and normalisers from a file and returns what it holds.
 
@@ -143,7 +143,7 @@ def load_state(
 
 
 def load_networks(
-    tensors: dict[str, Tensor], learner: Learner, statistics: dict[str, RunningStatistics]
+    tensors: dict[str, Tensor], learner: ActorCritic, statistics: dict[str, RunningStatistics]
 ) -> None:
     """Fills networks and normalisers; without a critic the learner keeps its own.
 

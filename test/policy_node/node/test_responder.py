@@ -188,7 +188,7 @@ def test_report_says_what_is_wrong(case, episode):
     responder, _, ticks = case
     health = Health('/policy_node')
     assert health.report(7.0, 0).message == 'waits for a robot'
-    health.start(resting(), responder, episode[0])
+    health.start(responder, episode[0])
     feed(responder, ticks[0])
     health.report(7.0, 1)
     feed(responder, ticks[1])
@@ -214,7 +214,7 @@ def diagnostics(*reports):
 def test_a_paused_robot_is_not_called_silent(case, episode):
     responder, _, ticks = case
     health = Health('/arm/policy_node')
-    health.start(resting(), responder, episode[0])
+    health.start(responder, episode[0])
     feed(responder, ticks[0])
     message = diagnostics(Report('/arm/sim_node', 'FetchReach', {'paused': 'True'}, 'is paused'))
     assert read_pause(message, '/arm') is True

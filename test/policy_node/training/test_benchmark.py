@@ -229,7 +229,7 @@ def test_another_budget_in_the_same_folder_is_refused(
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        (['--set', 'gama=1'], "'gama=1' is not name=value; names: "),
+        (['--set', 'gama=1'], "'gama=1' is not name=value; did you mean 'gamma'?; names: "),
         (['--set', 'seed=1'], '--set seed is not possible: jobs differ in it'),
         (['--set', 'strategy=none'], '--set strategy=none is not possible: choose --arms'),
         (['--seeds', '-1'], 'seed -1; allowed: 0 ... '),

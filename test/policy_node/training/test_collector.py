@@ -13,6 +13,7 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.policy import RestingPolicy
 from policy_node.training.learning.collector import Collector
+from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.replay import Episodes
 
 torch.set_num_threads(1)
@@ -20,7 +21,8 @@ torch.set_num_threads(1)
 
 def make_collector(noise_std: float = 0.2, random_epsilon: float = 0.3, envs: int = 4) -> Collector:
     simulation = Simulation('FetchReach', num_envs=envs, num_threads=1)
-    return Collector(simulation, [10 * i for i in range(envs)], noise_std, random_epsilon)
+    config = TrainConfig('FetchReach', noise_std=noise_std, random_epsilon=random_epsilon)
+    return Collector(simulation, [10 * i for i in range(envs)], config)
 
 
 def make_actor() -> Actor:
@@ -78,7 +80,8 @@ def test_noise_has_the_spread_and_the_share_asked_for(epsilon: float) -> None:
 
 def test_exploration_may_differ_between_simulations() -> None:
     simulation = Simulation('FetchReach', num_envs=5, num_threads=1)
-    collector = Collector(simulation, list(range(5)), 0.1, 0.0, noise_spread=1.0)
+    config = TrainConfig('FetchReach', noise_std=0.1, random_epsilon=0.0, noise_spread=1.0)
+    collector = Collector(simulation, list(range(5)), config)
     collector.exploration = 0.5
     spread = [collector.collect(RestingPolicy(4))[0].action.std(axis=(1, 2)) for _ in range(4)]
     expected = 0.05 * np.array([0.0, 0.5, 1.0, 1.5, 2.0])

@@ -10,10 +10,17 @@ from pathlib import Path
 
 import pytest
 
+from msgs_spec.command_line import CommandParser
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.learning import config_fields
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.config_fields import ConfigFields
+from policy_node.training.learning.config_options import (
+    add_field_options,
+    field_docstrings,
+    given_fields,
+)
 from policy_node.training.learning.config_rules import RECIPES
 from policy_node.training.learning.config_values import config_from_dict, parse_assignment
 from policy_node.training.learning.recipes import recipe_config
@@ -91,8 +98,8 @@ def test_assignments_take_the_type_of_the_field(text: str, expected: tuple[str, 
 @pytest.mark.parametrize(
     ('text', 'match'),
     [
-        ('gamma', 'is not name=value; names: task, '),
-        ('speed=1', 'is not name=value; names: task, '),
+        ('gamma', "is not name=value; did you mean 'gamma'\\?; names: task, "),
+        ('zzz=1', 'is not name=value; names: task, '),
         ('gamma=high', "gamma 'high' is not of type float"),
         ('layer_norm=maybe', "layer_norm 'maybe' is not of type bool"),
         ('num_envs=1.5', "num_envs '1.5' is not of type int"),
@@ -142,3 +149,58 @@ def test_threads_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     assert split_threads(dataclasses.replace(small, simulation_threads=2)) == (2, 1)
     monkeypatch.setenv('LOCAL_WORLD_SIZE', '16')
     assert split_threads(small) == (1, 1)
+
+
+def options_of(*arguments: str) -> dict[str, object]:
+    parser = CommandParser(prog='train_her')
+    add_field_options(parser, without=('task', 'recipe'))
+    return given_fields(parser.parse_args(arguments), without=('task', 'recipe'))
+
+
+def test_every_field_is_an_option_that_says_what_it_means(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit):
+        options_of('--help')
+    said = ' '.join(capsys.readouterr().out.split())
+    for name, meaning in field_docstrings(ConfigFields).items():
+        option = f'--{name.replace("_", "-")}'
+        assert (f' {option}' in said) == (name not in ('task', 'recipe')), name
+        # A terminal breaks lines also at hyphens.
+        if option in said:
+            assert meaning.replace(' ', '') in said.replace(' ', ''), name
+
+
+def test_options_become_fields_of_their_types_and_nothing_else_is_set() -> None:
+    assert options_of() == {}
+    given = options_of(
+        *('--learning-rate', '1e-4', '--steps', '2_000', '--no-overlap', '--layer-norm'),
+        *('--hidden-sizes', '64,32', '--goals', 'future=.4,actual=.4', '--threads', '2'),
+    )
+    assert given == {
+        'learning_rate': 1e-4,
+        'total_steps': 2000,
+        'overlap': False,
+        'layer_norm': True,
+        'hidden_sizes': (64, 32),
+        'goals': 'future=.4,actual=.4',
+        'simulation_threads': 2,
+    }
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--learning-rte', '1'], "--learning-rte 1; did you mean '--learning-rate'?"),
+        (['--gamma', 'high'], "gamma 'high' is not of type float"),
+        (['--nosuchthing'], 'unrecognized arguments: --nosuchthing'),
+    ],
+)
+def test_what_was_mistyped_is_answered_in_a_line(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        options_of(*arguments)
+    error = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert message in error and error.count('\n') == 1

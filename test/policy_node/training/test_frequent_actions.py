@@ -102,12 +102,13 @@ def collected(**options: object) -> Episodes:
     simulation = Simulation('FetchReach', num_envs=8, num_threads=1, control_hz=250.0)
     actor = Actor(NetworkShape(10, 3, 4, (8,))).eval()
     torch.nn.init.zeros_(actor.network.output.weight)
-    return Collector(simulation, list(range(8)), 0.2, 0.0, **options).collect(actor)[0]
+    config = config_at(250.0, noise_std=0.2, random_epsilon=0.0, **options)
+    return Collector(simulation, list(range(8)), config).collect(actor)[0]
 
 
 def test_noise_that_holds_for_40_ms_moves_the_gripper_as_at_25_hz() -> None:
     """Of n independent steps the sum is sqrt(n) of one: held for 10, sqrt(10) times as far."""
-    free, held = collected(), collected(noise_ticks=10)
+    free, held = collected(), collected(noise_seconds=0.04)
     assert held.action.shape == (8, TICKS, 4)
     blocks = held.action.reshape(8, TICKS // 10, 10, 4)
     assert (blocks == blocks[:, :, :1]).all()

@@ -70,7 +70,7 @@ def proposals(tested: float, updates: int) -> np.ndarray:
     config, generator = configured(gamma=0.95), make_generator()
     learner = HierarchicalDDPG(SHAPE, config, CPU, Workers())
     learner.actor.goal_normalizer.std.fill_(1.0 / NORMALIZED_CLIP)
-    sampler = SubgoalSampler(10, reached, 0.95, 1.0, config.lowest_value)
+    sampler = SubgoalSampler(TransitionSampler(reached, 0.95), 10, config.lowest_value)
     episodes = walks(2_000, tested, generator)
     mixture = {'near': 0.6, 'future': 0.2, 'actual': 0.2}
     for _ in range(updates):
@@ -123,11 +123,12 @@ def test_both_levels_learn_a_line_together() -> None:
     """Collected through subgoals; reached with and without them at the end."""
     torch.manual_seed(0)
     changes = {'num_envs': 32, 'batch_size': 256, 'gamma': 0.95, 'goal_features': 'plain'}
+    changes |= {'noise_std': 0.2, 'random_epsilon': 0.3}
     config, line, generator = configured(**changes), Line(32), make_generator()
     learner = HierarchicalDDPG(SHAPE, config, CPU, Workers())
     sampler = TransitionSampler(reached, config.tick_gamma)
     experience = HierarchicalExperience(config, line.spec, Workers(), sampler, generator)
-    collector = Collector(line, [0] * 32, 0.2, 0.3, subgoal_every=10)
+    collector = Collector(line, [0] * 32, config)
     for cycle in range(20):
         collector.proposer = learner.proposer()
         assert (collector.proposer is None) == (cycle == 0), 'nothing is proposed at first'

@@ -12,9 +12,11 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.collector import Collector
+from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.hindsight import with_subgoals
 from policy_node.training.learning.hindsight_actions import SubgoalSampler
 from policy_node.training.learning.replay import Episodes
+from policy_node.training.learning.sampling import TransitionSampler
 from policy_node.training.learning.subgoals import TESTED, GuidedPolicy, Proposer
 from policy_node.training.train_her import main
 from support.refusals import assert_refused
@@ -35,7 +37,9 @@ class Constant:
 
 def collected(proposer: Proposer | None, noise: tuple[float, float], actor: object) -> Episodes:
     simulation = Simulation('FetchReach', num_envs=80, num_threads=1)
-    collector = Collector(simulation, list(range(80)), *noise, subgoal_every=20)
+    std, epsilon = noise
+    config = TrainConfig('FetchReach', noise_std=std, random_epsilon=epsilon, subgoal_every=20)
+    collector = Collector(simulation, list(range(80)), config)
     collector.proposer = proposer
     return collector.collect(actor)[0]
 
@@ -112,7 +116,8 @@ def test_what_was_achieved_was_proposed_unless_a_test_was_missed(
 
     The second proposal of 3 is missed, at 6.
     """
-    sampler = SubgoalSampler(3, lambda a, g: -1.0 * (a != g)[..., 0], 0.5, 1.0, missed_value=-2.0)
+    rewards = TransitionSampler(lambda a, g: -1.0 * (a != g)[..., 0], 0.5)
+    sampler = SubgoalSampler(rewards, 3, missed_value=-2.0)
     row = np.zeros(300, np.int64)
     episodes = walk(subgoal, tested)
     batch = sampler.sample(episodes, row, {'real': 1.0}, np.random.default_rng(0))

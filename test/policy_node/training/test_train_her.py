@@ -427,7 +427,10 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
     ('arguments', 'message'),
     [
         ([], '--task is missing; allowed: FetchReach, '),
-        (['--task', 'FetchReach', '--set', 'gama=1'], "'gama=1' is not name=value; names: "),
+        (
+            ['--task', 'FetchReach', '--set', 'gama=1'],
+            "'gama=1' is not name=value; did you mean 'gamma'?",
+        ),
         (['--task', 'FetchReach', '--no-her', '--strategy', 'final'], '--no-her excludes'),
         (['--task', 'FetchReach', '--strategy', 'past'], "strategy 'past'; allowed: "),
         (['--resume', 'nowhere'], 'nowhere/training_state.safetensors is no file'),
