@@ -8,11 +8,10 @@ from pathlib import Path
 
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.summary import expand_episodes
-from fetch_hand_sim.view.announce import announce
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.player import Player
 from fetch_hand_sim.view.session import Requests, Session
-from fetch_hand_sim.view.web import open_page
+from fetch_hand_sim.view.web import announce, open_page
 from msgs_spec.command_line import EXIT_SUCCESS, UsageError
 from msgs_spec.ros import StopSignals
 

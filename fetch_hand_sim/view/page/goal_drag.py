@@ -44,12 +44,8 @@ def handles(spec: TaskSpec, goal: Array) -> list[Handle]:
 
 def find_handle(spec: TaskSpec, goal: Array, ray: Ray) -> Handle | None:
     """Returns the handle under the mouse, the nearest of several, or None."""
-    near = [
-        (ray.distance_to(each.position), number, each)
-        for number, each in enumerate(handles(spec, goal))
-    ]
-    distance, _, handle = min(near)
-    return handle if distance < _REACH[spec.goal] else None
+    nearest = min(handles(spec, goal), key=lambda each: ray.distance_to(each.position))
+    return nearest if ray.distance_to(nearest.position) < _REACH[spec.goal] else None
 
 
 def moved_goal(
