@@ -53,11 +53,8 @@ class View:
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE.value
         camera.fixedcamid = camera.trackbodyid = -1
         camera.lookat[:] = self.lookat
-        camera.distance, camera.azimuth, camera.elevation = (
-            self.distance,
-            self.azimuth,
-            self.elevation,
-        )
+        camera.distance = self.distance
+        camera.azimuth, camera.elevation = self.azimuth, self.elevation
 
 
 _FETCH_VIEW = View((1.2, 0.75, 0.58), 1.75, 140.0, -18.0)

@@ -190,11 +190,9 @@ class Simulation:
         """
         selected = self._select(ids)
         self._seed(selected, seed)
-        generators = [self._generator(i) for i in selected.tolist()]
         if selected.size:
-            self.goals[selected] = self._task.reset(selected, generators)
-            self._warnings = self._count_warnings()
-        return self._observe()
+            self._start(selected)
+        return self.observe()
 
     def step(self, actions: ArrayLike) -> StepResult:
         """Advances every simulation by one tick.
@@ -308,7 +306,7 @@ class Simulation:
 
     def observe(self) -> Observation:
         """The observation as it is now, fresh arrays."""
-        return self._observe()
+        return self._observation(*self._task.observe())
 
     def __getstate__(self) -> dict[str, Any]:
         """Arguments and everything that decides the future, for `pickle` and `copy.deepcopy`."""
@@ -363,7 +361,7 @@ class Simulation:
         return diverged
 
     def _result(self, diverged: NDArray[np.bool_]) -> StepResult:
-        observation = self._observe()
+        observation = self.observe()
         reward, success = self.metric.evaluate(observation['achieved_goal'], self.goals)
         return StepResult(observation, reward, success, diverged)
 
@@ -386,11 +384,12 @@ class Simulation:
             self.spec.name,
             ids.tolist(),
         )
+        self._start(ids)
+
+    def _start(self, ids: NDArray[np.intp]) -> None:
+        """Begins episodes; what MuJoCo warned of before counts no more."""
         self.goals[ids] = self._task.reset(ids, [self._generator(i) for i in ids.tolist()])
         self._warnings = self._count_warnings()
-
-    def _observe(self) -> Observation:
-        return self._observation(*self._task.observe())
 
     def _observation(self, observation: Array, achieved_goal: Array) -> Observation:
         return {

@@ -20,7 +20,6 @@ from fetch_hand_sim.simulation.tasks import task_asset
 from fetch_hand_sim.simulation.urdf_shapes import add_origin, add_shapes, numbers
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.rotations import (
-    quaternion_conjugate,
     quaternion_from_axis_angle,
     quaternion_multiply,
     quaternion_to_matrix,
@@ -48,11 +47,6 @@ class Pose:
         rotated = quaternion_to_matrix(self.quaternion) @ other.position
         turned = quaternion_multiply(self.quaternion, other.quaternion)
         return Pose(self.position + rotated, turned / np.linalg.norm(turned))
-
-    def inverse(self) -> Pose:
-        """The pose of the other frame in this one."""
-        back = quaternion_conjugate(self.quaternion)
-        return Pose(-quaternion_to_matrix(back) @ self.position, back)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,17 +157,17 @@ class RobotDescription:
         first = int(model.body_jntadr[body])
         moving = range(first, first + int(model.body_jntnum[body])) if first >= 0 else range(0)
         for index in moving:
-            anchor = Pose(model.jnt_pos[index].copy(), _IDENTITY)
             # Only a hinge turns about its anchor; what slides may as well start from the origin.
             is_hinge = int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_HINGE.value
-            start = origin @ anchor if is_hinge else origin
-            is_last = index == moving[-1] and not (is_hinge and anchor.position.any())
+            anchor = model.jnt_pos[index] if is_hinge else np.zeros(3)
+            start = origin @ Pose(anchor, _IDENTITY)
+            is_last = index == moving[-1] and not anchor.any()
             child = name if is_last else f'{model.joint(index).name}/moved'
             yield self._moving_joint(index, parent, child, start)
             if is_last:
                 return
             parent = child
-            origin = anchor.inverse() if is_hinge else Pose(np.zeros(3), _IDENTITY)
+            origin = Pose(-anchor, _IDENTITY)
         yield UrdfJoint(f'{name}/fixed', 'fixed', parent, name, origin, np.zeros(3))
 
     def _moving_joint(self, index: int, parent: str, child: str, start: Pose) -> UrdfJoint:
