@@ -106,7 +106,7 @@ class EpisodeRecorder:
     def record(self, tick: Tick, messages: Messages) -> None:
         """Logs a tick: a reset begins a file, a finished episode completes it."""
         if tick.status.phase == 'reset':
-            self.interrupt('reset before the end')
+            self._end('reset before the end')
             if not self.has_failed:
                 self._put(partial(self._files.begin, tick.status))
                 self._status = tick.status
@@ -122,18 +122,15 @@ class EpisodeRecorder:
         if self._status is not None:
             self._put(partial(self._files.write_received, topic, data, is_refused))
 
-    def interrupt(self, reason: str) -> None:
-        """Completes the running episode, if there is one, marked as cut short."""
-        self._end(reason)
-
     def close(self, reason: str) -> None:
         """Completes everything, also what is still being completed."""
-        self.interrupt(reason)
+        self._end(reason)
         self._backlog.close()
         self._thread.join(_LAST_CHANCE if self.has_failed else None)
         self._files.close()
 
     def _end(self, reason: str | None) -> None:
+        """Completes the running episode, if there is one; with a reason, marked as cut short."""
         status, self._status = self._status, None
         if status is not None:
             self._put(partial(self._files.end, status, reason))

@@ -104,7 +104,16 @@ def load_recordings(path: Path, count: int) -> list[Recording]:
     Raises:
         EpisodeReadError: If there is none, or one cannot be read.
     """
-    paths = expand_episodes(path)[:count]
+    return [load_recording(each) for each in find_playable(path)[:count]]
+
+
+def find_playable(path: Path) -> list[Path]:
+    """Returns the episodes of a path, by name; nothing is read.
+
+    Raises:
+        EpisodeReadError: If there are none.
+    """
+    paths = expand_episodes(path)
     if not paths:
         raise EpisodeReadError(f'{path}: no episodes')
-    return [load_recording(each) for each in paths]
+    return paths

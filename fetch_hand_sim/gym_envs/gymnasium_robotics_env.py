@@ -291,11 +291,8 @@ def make_env(task: str, **arguments: Any) -> RobotEnv:
     spec = task_spec(task)
     if task in FETCH_CONFIGS:
         return FetchEnv(task, **arguments)
-    return (
-        HandReachEnv(task, **arguments)
-        if spec.goal is GoalKind.FINGERTIPS
-        else (ManipulateEnv(task, **arguments))
-    )
+    is_reach = spec.goal is GoalKind.FINGERTIPS
+    return (HandReachEnv if is_reach else ManipulateEnv)(task, **arguments)
 
 
 def _goal_kind(task: str) -> tuple[str, str]:

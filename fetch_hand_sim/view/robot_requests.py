@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -114,14 +115,12 @@ class RobotRequests:
         self._sim.call('step', 'std_srvs/srv/Trigger')
 
     def _reset(self, request: Reset) -> None:
-        seed = request.seed
-        if seed is None:
-            self._sim.call('reset', 'std_srvs/srv/Trigger')
+        reset = partial(self._sim.call, 'reset', 'std_srvs/srv/Trigger')
+        if request.seed is None:
+            reset()
         else:
             # The seed holds for the next episode, so it has to be there first.
-            self._sim.set_parameter(
-                'seed', seed, lambda: self._sim.call('reset', 'std_srvs/srv/Trigger')
-            )
+            self._sim.set_parameter('seed', request.seed, reset)
 
     def _set_speed(self, request: SetSpeed) -> None:
         self._sim.set_parameter('real_time_factor', float(request.factor))

@@ -67,12 +67,10 @@ class Transforms:
     def _goal(self, goal: Array) -> list[Transform]:
         if self._spec.goal is GoalKind.POSE:
             return [self._pose('goal', goal)]
-        if self._spec.goal is GoalKind.POINT:
-            return [self._pose('goal', np.concatenate([goal, _IDENTITY]))]
-        points = zip(FINGERTIPS, goal.reshape(-1, 3), strict=True)
-        return [
-            self._pose(f'goal_{name}', np.concatenate([point, _IDENTITY])) for name, point in points
-        ]
+        is_point = self._spec.goal is GoalKind.POINT
+        names = ['goal'] if is_point else [f'goal_{name}' for name in FINGERTIPS]
+        points = zip(names, goal.reshape(-1, 3), strict=True)
+        return [self._pose(name, np.concatenate([point, _IDENTITY])) for name, point in points]
 
     def _pose(self, name: str, pose: Array) -> Transform:
         return self._between(ROOT, name, Pose(pose[:3], pose[3:]))
