@@ -111,16 +111,14 @@ class Simulation:
             raise ValueError(f'timing {timing!r}; allowed: {", ".join(TIMINGS)}')
         if num_threads < 0:
             raise ValueError(f'num_threads must be 0 (all processors) or more, not {num_threads}')
-        self._task = make_task(
-            task,
-            num_envs=num_envs,
-            num_threads=num_threads,
-            control_hz=control_hz,
-            keeps_data=keeps_data,
-            timing=timing,
-        )
-        self._num_threads = num_threads
-        self._keeps_data = keeps_data
+        self._arguments: dict[str, Any] = {
+            'num_envs': num_envs,
+            'num_threads': num_threads,
+            'control_hz': control_hz,
+            'keeps_data': keeps_data,
+            'timing': timing,
+        }
+        self._task = make_task(task, **self._arguments)
         self._model_may_change = False
         self.spec = self._task.spec
         self.num_envs = num_envs
@@ -311,14 +309,7 @@ class Simulation:
     def __getstate__(self) -> dict[str, Any]:
         """Arguments and everything that decides the future, for `pickle` and `copy.deepcopy`."""
         return {
-            'arguments': {
-                'task': self.spec.name,
-                'num_envs': self.num_envs,
-                'num_threads': self._num_threads,
-                'control_hz': self.control_hz,
-                'keeps_data': self._keeps_data,
-                'timing': self.timing,
-            },
+            'arguments': {'task': self.spec.name, **self._arguments},
             'model': self.model if self._model_may_change else None,
             'metric': self.metric,
             'physics': self._task.physics_state(),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import mujoco
@@ -176,18 +176,14 @@ class RobotDescription:
         axis = np.array(model.jnt_axis[index])
         zero = float(model.qpos0[model.jnt_qposadr[index]])
         is_hinge = int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_HINGE.value
-        back = (
-            Pose(np.zeros(3), quaternion_from_axis_angle(axis, -zero))
-            if is_hinge
-            else Pose(-zero * axis, _IDENTITY)
-        )
         lower, upper = model.jnt_range[index] if model.jnt_limited[index] else (-_FAR, _FAR)
         kind: JointType = 'revolute' if is_hinge else 'prismatic'
         if is_hinge and not model.jnt_limited[index]:
             kind = 'continuous'
-        return UrdfJoint(
-            joint.name, kind, parent, child, start @ back, axis, float(lower), float(upper)
-        )
+        limits = float(lower), float(upper)
+        moving = UrdfJoint(joint.name, kind, parent, child, start, axis, *limits)
+        # The model as it is compiled stands at `zero`, not at 0.
+        return replace(moving, origin=moving.pose(-zero))
 
     def _fill_link(self, link: ElementTree.Element, body: int) -> None:
         model = self._model

@@ -167,7 +167,5 @@ class Page(plugin.ViewerPlugin):
             self._send(SetGoal(goal, is_kept=self._panels.keeps_goal))
 
     def _ray(self, place: MousePlace) -> Ray:
-        camera = self.viewer.camera
-        view = (np.array(camera.lookat), camera.distance, camera.azimuth, camera.elevation)
         fovy = float(self.viewer.model.vis.global_.fovy)
-        return mouse_ray(view, fovy, (place.x, place.y), place.aspect)
+        return mouse_ray(self.viewer.camera, fovy, place)
