@@ -21,8 +21,9 @@ from fetch_hand_sim.episodes.context import source_revision
 from fetch_hand_sim.episodes.goals import accept_goal
 from fetch_hand_sim.episodes.perturbations import accept_perturbation
 from fetch_hand_sim.episodes.recorder import episode_result
-from fetch_hand_sim.episodes.runner import Array, EpisodeRunner
+from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode
 from msgs_spec.command_line import printable
 from msgs_spec.schemas import deserialize

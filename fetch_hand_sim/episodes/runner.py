@@ -7,14 +7,12 @@ lockstep and a Python loop give the same ticks for the same commands.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.episodes.robot_episode import RobotEpisode, sense
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tick import EpisodeStatus, Tick
-
-Array = NDArray[np.float64]
 
 # Simulated time of the first tick. Not 0, because ROS takes a time of 0 for "no time yet".
 FIRST_STAMP_NS = 1_000_000_000

@@ -12,7 +12,6 @@ from fetch_hand_sim.films.recording import Recording
 from fetch_hand_sim.simulation.rendering import SceneRenderer
 from fetch_hand_sim.simulation.scene import Scene, tracked_position
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 _TRAIL_TICKS = 40

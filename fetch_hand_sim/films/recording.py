@@ -5,20 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode
 from fetch_hand_sim.episode_log.messages import read_messages
 from fetch_hand_sim.episode_log.summary import expand_episodes
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
+from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.tasks import GoalKind, TaskSpec
 from msgs_spec.topics import topic
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,7 @@ from fetch_hand_sim.simulation.tasks.hand_manipulate import (
     HandManipulateTask,
 )
 from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
+from msgs_spec.arrays import Array
 from msgs_spec.tasks import GoalKind, RewardType, task_spec
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 else:
     GoalEnv = import_goal_env()
 
-Array = NDArray[np.float64]
 
 # Pixels, and the cameras of `fetch_env.py` and `hand_env.py`.
 _SIZE = 480

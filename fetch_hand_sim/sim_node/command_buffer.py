@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from msgs_spec.actions import clip_command, command_limits
+from msgs_spec.arrays import Array
 from msgs_spec.robots import RobotSpec
 
-Array = NDArray[np.float64]
 # Characters of a received name that an error line repeats.
 _NAME_SHOWN = 40
 # A value this many times the width of its range beyond a limit is no overshoot of a controller.

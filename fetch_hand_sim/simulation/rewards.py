@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msgs_spec.arrays import Array
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler, rotation_angle
 from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, RewardType, SuccessRule, TaskSpec
-
-Array = NDArray[np.float64]
 
 
 def _norm(difference: Array) -> Array:

@@ -12,13 +12,12 @@ from itertools import pairwise
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.tasks import task_asset
+from msgs_spec.arrays import Array
 from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
 
-Array = NDArray[np.float64]
 Color = tuple[float, float, float, float]
 
 REACHED: Color = (0.15, 0.75, 0.25, 0.65)

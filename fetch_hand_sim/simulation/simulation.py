@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.actions import command_from_action
+from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
@@ -32,7 +33,6 @@ from msgs_spec.tasks import (
     Timing,
 )
 
-Array = NDArray[np.float64]
 Observation = dict[str, Array]
 Seed = int | np.random.Generator | None
 Seeds = int | Sequence[Seed] | None

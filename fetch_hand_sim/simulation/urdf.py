@@ -13,11 +13,11 @@ from typing import Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.tasks import task_asset
 from fetch_hand_sim.simulation.urdf_shapes import add_origin, add_shapes, numbers
+from msgs_spec.arrays import Array
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.rotations import (
     quaternion_from_axis_angle,
@@ -26,7 +26,6 @@ from msgs_spec.rotations import (
 )
 from msgs_spec.tasks import task_spec
 
-Array = NDArray[np.float64]
 JointType = Literal['fixed', 'revolute', 'continuous', 'prismatic']
 
 ROOT = 'world'

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.films.recording import load_recording
@@ -24,8 +23,6 @@ from fetch_hand_sim.view.requests import (
     SetSpeed,
     StepOnce,
 )
-
-Array = NDArray[np.float64]
 
 # Seconds the last frame stays before the episode starts again.
 _PAUSE_AT_END = 1.0

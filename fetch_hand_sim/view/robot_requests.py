@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 
 from fetch_hand_sim.episodes.perturbations import bounded_wrench
@@ -27,14 +26,13 @@ from fetch_hand_sim.view.requests import (
     SetSpeed,
     StepOnce,
 )
+from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_message
 from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
-
-Array = NDArray[np.float64]
 
 # Seconds a goal is shown before the robot confirms it.
 _GOAL_PATIENCE = 0.5

@@ -10,11 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 
 from fetch_hand_sim.simulation.scene import Frame
+from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode_status
 from msgs_spec.robots import JOINT_PREFIX
@@ -22,8 +21,6 @@ from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import QosSpec, TopicSpec, topic
-
-Array = NDArray[np.float64]
 
 # Nothing is sent twice for a viewer.
 WATCHING = QosSpec(depth=5, reliability='best_effort', durability='volatile')

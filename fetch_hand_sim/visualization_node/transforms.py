@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.scene import Frame, View
 from fetch_hand_sim.simulation.urdf import ROOT, Pose, RobotDescription
+from msgs_spec.arrays import Array
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import GoalKind, task_spec
-
-Array = NDArray[np.float64]
 
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 

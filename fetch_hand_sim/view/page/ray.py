@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.scene import View
-
-Array = NDArray[np.float64]
+from msgs_spec.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
