@@ -38,6 +38,7 @@ class EpisodeRunner:
         simulation: As given.
         spec: Its task, with the joint names of the network.
         episode: Index of the running or next episode, from 0.
+        current: The running or last episode; before the first one that one, waiting.
         stamp_ns: Simulated time of the last tick; one period before the first if there is none.
         is_between_episodes: Whether the next tick is a reset.
 
@@ -69,7 +70,7 @@ class EpisodeRunner:
         self._series_seed = first_seed
         self._new_first_seed: int | None = None
         self.is_between_episodes = True
-        self._current = self._make_episode(first_stamp_ns)
+        self.current = self._make_episode(first_stamp_ns)
 
     @property
     def is_done(self) -> bool:
@@ -82,21 +83,6 @@ class EpisodeRunner:
         if self.is_between_episodes and self._new_first_seed is not None:
             return self._new_first_seed + self.episode
         return self._first_seed + self.episode
-
-    @property
-    def tick(self) -> int:
-        """Steps of the running or last episode so far."""
-        return self._current.tick
-
-    @property
-    def has_diverged(self) -> bool:
-        """Whether MuJoCo gave the running or last episode up."""
-        return self._current.has_diverged
-
-    @property
-    def reset_stamp_ns(self) -> int:
-        """Simulated time of tick 0 of the running or last episode."""
-        return self._current.first_stamp_ns
 
     @property
     def has_started(self) -> bool:
@@ -160,14 +146,14 @@ class EpisodeRunner:
             self._first_seed, self._new_first_seed = self._new_first_seed, None
         self.is_between_episodes = False
         self.simulation.reset(seed=self.seed)
-        self._current = self._make_episode(stamp_ns)
-        return self._current.start(sense(self.simulation), 0)
+        self.current = self._make_episode(stamp_ns)
+        return self.current.start(sense(self.simulation), 0)
 
     def _step(self, command: Array) -> Tick:
         (diverged,) = self.simulation.advance(command[None])
         sensed = sense(self.simulation)
-        tick = self._current.step(sensed, 0, command.copy(), bool(diverged))
-        if self._current.is_finished:
+        tick = self.current.step(sensed, 0, command.copy(), bool(diverged))
+        if self.current.is_finished:
             self._finish()
         return tick
 

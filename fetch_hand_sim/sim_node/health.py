@@ -179,7 +179,7 @@ def lasting_problems(robot: Robot, surroundings: Surroundings) -> list[tuple[Lev
 def waiting_line(robot: Robot, surroundings: Surroundings) -> str:
     """What a robot that needs a command waits for."""
     runner = robot.runner
-    what = f'tick {runner.tick + 1} of episode {runner.episode}'
+    what = f'tick {runner.current.tick + 1} of episode {runner.episode}'
     if runner.is_between_episodes:
         what = f'the start of episode {runner.episode}'
     text = f'{what} waits for a valid command; {_who_commands(surroundings)}'
