@@ -14,17 +14,21 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
-from fetch_hand_sim.episode_log import EpisodeReadError, EpisodeRecord, read_episode
+from fetch_hand_sim.episode_log import (
+    Episode,
+    EpisodeOutcome,
+    EpisodeReadError,
+    EpisodeRecord,
+    read_episode,
+)
 from msgs_spec.codecs import decode_status
 from msgs_spec.command_line import (
     EXIT_FAILURE,
@@ -49,42 +53,6 @@ _START_TIMEOUT = 60.0
 # What shells add to the number of the signal that ended a command.
 _SIGNALLED = 128
 _COLUMNS = '{:>7}  {:>5}  {:>5}  {:>7}  {:<7}  {}'
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One logged episode, as its file tells it."""
-
-    episode: int
-    seed: int
-    steps: int
-    episode_return: float
-    is_success: bool
-    path: Path
-
-    @classmethod
-    def from_directory(cls, path: Path) -> Row:
-        """Reads the metadata of a bag.
-
-        Raises:
-            EpisodeReadError: If it is not a complete episode.
-        """
-        episode = read_episode(path)
-        record, outcome = EpisodeRecord.parse(episode.metadata), episode.outcome
-        return cls(
-            episode=record.episode,
-            seed=record.seed,
-            steps=outcome.steps or 0,
-            episode_return=outcome.episode_return or 0.0,
-            is_success=outcome.is_success is True,
-            path=path,
-        )
-
-    def __str__(self) -> str:
-        success = 'yes' if self.is_success else 'no'
-        return _COLUMNS.format(
-            self.episode, self.seed, self.steps, f'{self.episode_return:g}', success, self.path
-        )
 
 
 class Watcher:
@@ -141,7 +109,7 @@ class Demo:
         self._spec = task_spec(options.task)
         self._directory = Path(options.episode_dir)
         self._known = set(self._episodes())
-        self._rows: list[Row] = []
+        self._outcomes: list[EpisodeOutcome] = []
 
     def run(self, stop: StopSignals) -> int:
         """Runs the demo and returns the exit code."""
@@ -156,7 +124,8 @@ class Demo:
     def _play(self, commander: str, watcher: Watcher, stop: StopSignals) -> int:
         """Runs the nodes, prints what they did and returns the exit code."""
         began = time.monotonic()
-        with _logs() as logs:
+        # What the nodes print is shown if something goes wrong.
+        with tempfile.NamedTemporaryFile('w+', prefix='demo_', suffix='.log') as logs:
             policy = start_node('policy_node', [f'policy:={commander}'], logs)
             sim = start_node('sim_node', self._sim_parameters(), logs)
             try:
@@ -166,7 +135,7 @@ class Demo:
             finally:
                 codes = [stop_node(process) for process in (sim, policy)]
             self._print_new_rows()
-            if any(codes) or (len(self._rows) < self._options.episodes and not stop):
+            if any(codes) or (len(self._outcomes) < self._options.episodes and not stop):
                 self._console.print(Path(logs.name).read_text(), markup=False, highlight=False)
                 self._console.print(f'the nodes ended with exit codes {codes}')
                 return EXIT_FAILURE
@@ -218,19 +187,19 @@ class Demo:
         for path in sorted(set(self._episodes()) - self._known):
             self._known.add(path)
             try:
-                row = Row.from_directory(path)
+                episode = read_episode(path)
             except EpisodeReadError:
                 continue
-            self._rows.append(row)
+            self._outcomes.append(episode.outcome)
             (console or self._console).print(
-                printable(str(row)), markup=False, highlight=False, soft_wrap=True
+                printable(_row(episode, path)), markup=False, highlight=False, soft_wrap=True
             )
 
     def _print_summary(self, seconds: float) -> None:
-        count = len(self._rows)
-        successes = sum(row.is_success for row in self._rows)
-        steps = sum(row.steps for row in self._rows)
-        mean = sum(row.episode_return for row in self._rows) / count if count else 0.0
+        count = len(self._outcomes)
+        successes = sum(outcome.is_success is True for outcome in self._outcomes)
+        steps = sum(outcome.steps or 0 for outcome in self._outcomes)
+        mean = sum(outcome.episode_return or 0.0 for outcome in self._outcomes) / max(count, 1)
         self._console.print(
             f'{self._spec.name}: {successes} of {count} episodes succeeded, mean return '
             f'{mean:.2f}, {steps} steps, {seconds:.1f} s with start-up. Episodes are in '
@@ -238,6 +207,14 @@ class Demo:
             highlight=False,
             soft_wrap=True,
         )
+
+
+def _row(episode: Episode, path: Path) -> str:
+    """The line of a logged episode, as its file tells it."""
+    record, outcome = EpisodeRecord.parse(episode.metadata), episode.outcome
+    success = 'yes' if outcome.is_success else 'no'
+    total = f'{outcome.episode_return or 0.0:g}'
+    return _COLUMNS.format(record.episode, record.seed, outcome.steps or 0, total, success, path)
 
 
 def _show(progress: Progress, bar: TaskID, watcher: Watcher) -> None:
@@ -248,13 +225,6 @@ def _show(progress: Progress, bar: TaskID, watcher: Watcher) -> None:
     ticks = task_spec(status.task, control_hz=status.control_hz).episode_ticks
     description = f'episode {status.episode}'
     progress.update(bar, description=description, completed=watcher.ticks, total=ticks, note=note)
-
-
-@contextmanager
-def _logs() -> Iterator[IO[str]]:
-    """A file for what the nodes print, shown if something goes wrong."""
-    with tempfile.NamedTemporaryFile('w+', prefix='demo_', suffix='.log') as file:
-        yield file
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -9,7 +9,6 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,30 +41,6 @@ _COLUMNS = ('episode', 'task', 'seed', 'steps', 'return', 'success', 'seconds', 
 _NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB'})
 # A pipe has no width to fit into; this one fits every column.
 _PIPE_WIDTH = 200
-
-
-@dataclass(frozen=True, slots=True)
-class Filter:
-    """Which episodes to show; None shows both.
-
-    Attributes:
-        task: Name of the task.
-        success: Whether the goal was reached at the end.
-        complete: Whether the episode ran to its end.
-    """
-
-    task: str | None = None
-    success: bool | None = None
-    complete: bool | None = None
-
-    def accepts(self, episode: EpisodeSummary) -> bool:
-        """Whether an episode is to be shown."""
-        outcome = episode.outcome
-        return (
-            self.task in (None, episode.metadata.get('task'))
-            and self.success in (None, outcome.is_success is True)
-            and self.complete in (None, outcome.is_complete)
-        )
 
 
 def read_summaries(directory: Path) -> tuple[list[EpisodeSummary], list[EpisodeReadError]]:
@@ -144,8 +119,7 @@ def _run(options: argparse.Namespace) -> int:
         leftovers = find_leftovers(options.directory)
     except (EpisodeReadError, EpisodeLogError) as error:
         raise UsageError(str(error)) from None
-    wanted = Filter(options.task, options.success, options.complete)
-    shown = [episode for episode in episodes if wanted.accepts(episode)]
+    shown = [episode for episode in episodes if _is_wanted(episode, options)]
     if options.json:
         print(json.dumps([_as_json(episode) for episode in shown], indent=2))
     else:
@@ -159,6 +133,16 @@ def _run(options: argparse.Namespace) -> int:
     for skipped in errors:
         complain(_NAME, f'skipped {skipped}')
     return EXIT_FAILURE if errors else EXIT_SUCCESS
+
+
+def _is_wanted(episode: EpisodeSummary, options: argparse.Namespace) -> bool:
+    """Whether an episode is to be shown; an option that was not given is None."""
+    outcome = episode.outcome
+    return (
+        options.task in (None, episode.metadata.get('task'))
+        and options.success in (None, outcome.is_success is True)
+        and options.complete in (None, outcome.is_complete)
+    )
 
 
 def _print_table(episodes: Sequence[EpisodeSummary]) -> None:

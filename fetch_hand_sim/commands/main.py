@@ -73,8 +73,7 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command named by the first words with the rest; returns its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    path, rest = _split(given)
-    command = _find(path)
+    command, path, rest = _split(given)
     if command is None or command.commands:
         # Help, the version, or an error: the parser says it and exits.
         make_parser().parse_args(given if rest else [*path, '--help'])
@@ -83,23 +82,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(_NAME, lambda: _start(command, path[-1]))
 
 
-def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Returns the words that name a command, and those that follow."""
-    commands, path = COMMANDS, []
+def _split(words: Sequence[str]) -> tuple[Command | None, list[str], list[str]]:
+    """Returns the command that the first words name, these words, and those that follow."""
+    commands, command, path = COMMANDS, None, []
     for word in words:
         if word not in commands:
             break
         path.append(word)
-        commands = commands[word].commands
-    return path, list(words[len(path) :])
-
-
-def _find(path: Sequence[str]) -> Command | None:
-    commands, command = COMMANDS, None
-    for word in path:
         command = commands[word]
         commands = command.commands
-    return command
+    return command, path, list(words[len(path) :])
 
 
 def ros_arguments(words: Sequence[str]) -> list[str]:
@@ -132,8 +124,7 @@ class _Parser(CommandParser):
         super().error(message)
 
     def _names(self) -> list[str]:
-        words = self.prog.split()[1:]
-        command = _find(words)
+        command = _split(self.prog.split()[1:])[0]
         return list(command.commands if command else COMMANDS)
 
 

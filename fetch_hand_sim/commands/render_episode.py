@@ -63,15 +63,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from fetch_hand_sim.episode_log import EpisodeReadError
     from fetch_hand_sim.films.film import check_kind
 
     check_kind(options.out)
     try:
         _render(options)
-    except EpisodeReadError as error:
-        raise UsageError(str(error)) from None
     except ValueError as error:
+        # Unreadable episodes too.
         raise UsageError(str(error)) from None
     except RuntimeError as error:
         raise CommandError(str(error)) from None

@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.episode_record import EpisodeOutcome, EpisodeRecord, HasOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.messages import MessageFile, MessageRows, read_messages
+from fetch_hand_sim.episode_log.reader import episode_records
 from fetch_hand_sim.episode_log.summary import expand_episodes
 from msgs_spec.actions import action_from_command
+from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.topics import topic
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
@@ -99,11 +99,9 @@ def load_episodes(
 def load_episode(path: Path) -> EpisodeArrays:
     """Loads one episode; see `load_episodes`."""
     file = read_messages(path)
-    for name in (EPISODE, EPISODE_RESULT):
-        if name not in file.metadata:
-            raise EpisodeReadError(f'{file.path}: no episode, there is no metadata record {name!r}')
+    metadata, result = episode_records(file.path, file.metadata)
     try:
-        return _Decoder(file).decode()
+        return _Decoder(file, metadata).decode(result)
     except EpisodeReadError:
         raise
     except (ValueError, KeyError) as error:
@@ -123,15 +121,15 @@ def _assembler(task: TaskSpec, control_hz: float) -> ObservationAssembler:
 class _Decoder:
     """Decodes the topics of one file and joins them by tick."""
 
-    def __init__(self, file: MessageFile) -> None:
+    def __init__(self, file: MessageFile, metadata: dict[str, str]) -> None:
         self._file = file
-        self._record = EpisodeRecord.parse(file.metadata[EPISODE])
+        self._metadata = metadata
+        self._record = EpisodeRecord.parse(metadata)
         self._task = self._record.task
         self._assembler = _assembler(self._task, self._record.control_hz)
         self._resolved = {name.rpartition('/')[2]: name for name in file.offsets}
 
-    def decode(self) -> EpisodeArrays:
-        metadata, result = self._file.metadata[EPISODE], self._file.metadata[EPISODE_RESULT]
+    def decode(self, result: dict[str, str]) -> EpisodeArrays:
         states = {spec.name: self._rows(spec.name) for spec in self._assembler.topics}
         success = self._rows('is_success')
         # Of an episode that was cut off, the last tick may be there in part.
@@ -155,7 +153,7 @@ class _Decoder:
             truncated=np.arange(steps) == steps - 1,
             success=self._decoded('is_success', success, stamps, first=0)[:, 0] != 0.0,
             stamps=stamps,
-            metadata=metadata,
+            metadata=self._metadata,
             record=self._record,
             result=result,
         )

@@ -12,7 +12,7 @@ from typing import BinaryIO, Literal
 
 from mcap.writer import CompressionType, IndexType, Writer
 
-from fetch_hand_sim.episode_log.bag_metadata import BagInfo, ChannelInfo
+from fetch_hand_sim.episode_log.bag_metadata import BagInfo, ChannelSpec
 from fetch_hand_sim.episode_log.limits import (
     MAX_CHUNKS,
     MAX_MESSAGE_BYTES,
@@ -20,7 +20,6 @@ from fetch_hand_sim.episode_log.limits import (
     MAX_TOPICS,
     MAX_UNPACKED_BYTES,
 )
-from fetch_hand_sim.episode_log.offered_qos import OfferedQos
 
 Compression = Literal['none', 'lz4', 'zstd']
 COMPRESSIONS = {
@@ -32,25 +31,6 @@ _ALL_BUT_ATTACHMENTS = IndexType.ALL & ~IndexType.ATTACHMENT
 # Bytes in a chunk beside the data of a message, and at most for the first message of a topic.
 _MESSAGE_BYTES = 1 + 8 + 2 + 4 + 8 + 8
 _TOPIC_BYTES = 2**16
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelSpec:
-    """What readers are told about a topic.
-
-    Attributes:
-        topic: Resolved name, with a leading slash.
-        type_name: ROS name of the message type.
-        schema_text: `ros2msg` definition of the type and of all types it is made of.
-        qos: What its publishers offer.
-        type_hash: RIHS01 hash of the type.
-    """
-
-    topic: str
-    type_name: str
-    schema_text: str
-    qos: OfferedQos
-    type_hash: str
 
 
 def _topic_bytes(spec: ChannelSpec) -> int:
@@ -75,6 +55,9 @@ class BagFile:
         chunk_size: Bytes of messages after which a chunk is compressed and written.
         compression: Of the chunks.
         has_attachments: Whether there will be any; validators reject an empty index of them.
+
+    Attributes:
+        has_unflushed: Whether there are messages that the operating system does not have yet.
     """
 
     def __init__(
@@ -99,7 +82,7 @@ class BagFile:
         self._end_ns = -1
         self._chunk_size = chunk_size
         self._messages = self._bytes = self._chunks = self._chunk_bytes = 0
-        self._has_unflushed = False
+        self.has_unflushed = False
         self._writer.start(profile='ros2')
 
     def write(self, spec: ChannelSpec, data: bytes, log_time_ns: int) -> None:
@@ -135,18 +118,13 @@ class BagFile:
         self._end_ns = log_time_ns
         channel.count += 1
         self._messages += 1
-        self._has_unflushed = True
+        self.has_unflushed = True
         self._count_bytes(_MESSAGE_BYTES + len(data))
 
     @property
     def chunks(self) -> int:
         """Chunks so far, the one in progress counted."""
         return self._chunks + (self._chunk_bytes > 0)
-
-    @property
-    def has_unflushed(self) -> bool:
-        """Whether there are messages that the operating system does not have yet."""
-        return self._has_unflushed
 
     def takes(self, size: int) -> bool:
         """Whether readers take the file with one more message of `size` bytes."""
@@ -200,7 +178,7 @@ class BagFile:
     def flush(self) -> None:
         """Ends the chunk in progress and hands everything to the operating system."""
         self._end_chunk()
-        self._has_unflushed = False
+        self.has_unflushed = False
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def finish(self) -> None:
@@ -214,14 +192,5 @@ class BagFile:
             file_name=self._file_name,
             start_ns=self._start_ns,
             end_ns=max(self._end_ns, 0),
-            channels=[
-                ChannelInfo(
-                    topic=channel.spec.topic,
-                    type_name=channel.spec.type_name,
-                    qos=channel.spec.qos,
-                    type_hash=channel.spec.type_hash,
-                    message_count=channel.count,
-                )
-                for channel in self._channels.values()
-            ],
+            channels=[(channel.spec, channel.count) for channel in self._channels.values()],
         )

@@ -18,22 +18,22 @@ _SafeDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
 @dataclass(frozen=True, slots=True)
-class ChannelInfo:
-    """One topic of a bag.
+class ChannelSpec:
+    """What readers are told about a topic.
 
     Attributes:
         topic: Resolved name, with a leading slash.
         type_name: ROS name of the message type.
-        qos: What its publishers offered.
+        schema_text: `ros2msg` definition of the type and of all types it is made of.
+        qos: What its publishers offer.
         type_hash: RIHS01 hash of the type.
-        message_count: Messages of this topic in the bag.
     """
 
     topic: str
     type_name: str
+    schema_text: str
     qos: OfferedQos
     type_hash: str
-    message_count: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,21 +44,21 @@ class BagInfo:
         file_name: Name of the file in the bag directory.
         start_ns: Log time of the first message, 0 if there is none.
         end_ns: Log time of the last message, 0 if there is none.
-        channels: The topics, in order of their first message.
+        channels: The topics with their number of messages, in order of their first message.
     """
 
     file_name: str
     start_ns: int
     end_ns: int
-    channels: Sequence[ChannelInfo]
+    channels: Sequence[tuple[ChannelSpec, int]]
 
     @property
     def message_count(self) -> int:
         """Messages in the bag."""
-        return sum(channel.message_count for channel in self.channels)
+        return sum(count for _, count in self.channels)
 
 
-def _topic_entry(channel: ChannelInfo) -> dict[str, Any]:
+def _topic_entry(channel: ChannelSpec, message_count: int) -> dict[str, Any]:
     return {
         'topic_metadata': {
             'name': channel.topic,
@@ -67,7 +67,7 @@ def _topic_entry(channel: ChannelInfo) -> dict[str, Any]:
             'offered_qos_profiles': list(channel.qos.profiles),
             'type_description_hash': channel.type_hash,
         },
-        'message_count': channel.message_count,
+        'message_count': message_count,
     }
 
 
@@ -82,7 +82,7 @@ def bag_metadata(info: BagInfo, custom_data: Mapping[str, str]) -> dict[str, Any
         'version': VERSION,
         'storage_identifier': 'mcap',
         **span,
-        'topics_with_message_count': [_topic_entry(channel) for channel in info.channels],
+        'topics_with_message_count': [_topic_entry(*each) for each in info.channels],
         'compression_format': '',
         'compression_mode': '',
         'relative_file_paths': [info.file_name],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -104,16 +104,8 @@ def read_episode(path: Path | str) -> Episode:
         for record in read_records(stream):
             contents.take(record)
         check_summary(stream, contents.summary_start, contents.summary_crc)
-    for name in (EPISODE, EPISODE_RESULT):
-        if name not in contents.metadata:
-            raise EpisodeReadError(f'{file}: no episode, there is no metadata record {name!r}')
-    return Episode(
-        path=file,
-        topics=contents.topics,
-        metadata=contents.metadata[EPISODE],
-        result=contents.metadata[EPISODE_RESULT],
-        attachments=contents.attachments,
-    )
+    metadata, result = episode_records(file, contents.metadata)
+    return Episode(file, contents.topics, metadata, result, contents.attachments)
 
 
 class _Contents:
@@ -148,6 +140,20 @@ class _Contents:
                     qos_yaml=record.metadata.get('offered_qos_profiles', ''),
                     type_hash=record.metadata.get('topic_type_hash', ''),
                 )
+
+
+def episode_records(
+    file: Path, records: Mapping[str, dict[str, str]]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Returns what makes a file an episode: its records `episode` and `episode_result`.
+
+    Raises:
+        EpisodeReadError: If one is missing.
+    """
+    for name in (EPISODE, EPISODE_RESULT):
+        if name not in records:
+            raise EpisodeReadError(f'{file}: no episode, there is no metadata record {name!r}')
+    return records[EPISODE], records[EPISODE_RESULT]
 
 
 def check_summary(stream: BinaryIO, start: int, expected_crc: int) -> None:

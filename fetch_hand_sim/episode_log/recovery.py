@@ -12,7 +12,7 @@ from mcap.exceptions import EndOfFile
 from mcap.writer import MCAP0_MAGIC
 
 from fetch_hand_sim.episode_log import durable
-from fetch_hand_sim.episode_log.bag_file import ChannelSpec
+from fetch_hand_sim.episode_log.bag_metadata import ChannelSpec
 from fetch_hand_sim.episode_log.episode_bag import (
     EPISODE,
     EPISODE_RESULT,

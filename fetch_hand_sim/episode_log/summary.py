@@ -14,10 +14,14 @@ from mcap.records import Footer, McapRecord, Metadata, MetadataIndex, Statistics
 from mcap.stream_reader import read_magic
 
 from fetch_hand_sim.episode_log import durable
-from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.episode_record import HasOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
-from fetch_hand_sim.episode_log.reader import check_summary, mcap_file, one_line_errors
+from fetch_hand_sim.episode_log.reader import (
+    check_summary,
+    episode_records,
+    mcap_file,
+    one_line_errors,
+)
 from fetch_hand_sim.episode_log.untrusted import BoundedStream, Records
 
 _MAGIC_BYTES = 8
@@ -68,13 +72,11 @@ def read_summary(path: Path | str) -> EpisodeSummary:
         indexes = [r for r in records if isinstance(r, MetadataIndex)][:_MAX_METADATA_RECORDS]
         found = {index.name: _metadata_at(stream, index) for index in indexes}
         size = file.stat().st_size
-    for name in (EPISODE, EPISODE_RESULT):
-        if name not in found:
-            raise EpisodeReadError(f'{file}: no episode, there is no metadata record {name!r}')
+    metadata, result = episode_records(file, found)
     return EpisodeSummary(
         path=file,
-        metadata=found[EPISODE],
-        result=found[EPISODE_RESULT],
+        metadata=metadata,
+        result=result,
         message_count=statistics.message_count,
         duration_s=(statistics.message_end_time - statistics.message_start_time) / 1e9,
         size_bytes=size,

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from fetch_hand_sim.episode_log import durable
-from fetch_hand_sim.episode_log.bag_file import ChannelSpec
+from fetch_hand_sim.episode_log.bag_metadata import ChannelSpec
 from fetch_hand_sim.episode_log.episode_bag import begin_bag, checked_strings, end_bag, store_bag
 from fetch_hand_sim.episode_log.errors import EpisodeLogError
 from fetch_hand_sim.episode_log.limits import (

@@ -16,13 +16,14 @@ from fetch_hand_sim.episode_log.episode_record import EpisodeRecord
 from fetch_hand_sim.episode_log.errors import one_line
 from fetch_hand_sim.episode_log.model import model_sha256
 from fetch_hand_sim.episode_log.reader import DAMAGED
-from fetch_hand_sim.episode_log.ticks import LoggedTick, TickMessage, split_ticks
+from fetch_hand_sim.episode_log.ticks import LoggedTick, split_ticks
 from fetch_hand_sim.episodes.context import source_revision
 from fetch_hand_sim.episodes.goals import accept_goal
 from fetch_hand_sim.episodes.perturbations import accept_perturbation
 from fetch_hand_sim.episodes.recorder import episode_result
-from fetch_hand_sim.episodes.runner import Array, EpisodeRunner
+from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode
 from msgs_spec.command_line import printable
 from msgs_spec.schemas import deserialize
@@ -107,7 +108,13 @@ class EpisodeChecker:
         try:
             record = EpisodeRecord.parse(episode.metadata)
             _require_goals(episode)
-            runner = self._runner(record, ticks)
+            runner = EpisodeRunner(
+                self._simulation_of(record),
+                first_seed=record.seed - record.episode,
+                first_episode=record.episode,
+                first_stamp_ns=ticks[0].stamp_ns,
+                joint_prefix=record.joint_prefix,
+            )
             result = CheckResult(episode.path, changed=self._changes(episode, runner))
             _compare(runner, ticks, episode, record, result)
         except DAMAGED as error:
@@ -115,15 +122,6 @@ class EpisodeChecker:
                 f'{episode.path}: cannot be run again ({one_line(error)})'
             ) from error
         return result
-
-    def _runner(self, record: EpisodeRecord, ticks: list[LoggedTick]) -> EpisodeRunner:
-        return EpisodeRunner(
-            self._simulation_of(record),
-            first_seed=record.seed - record.episode,
-            first_episode=record.episode,
-            first_stamp_ns=ticks[0].stamp_ns,
-            joint_prefix=record.joint_prefix,
-        )
 
     def _simulation_of(self, record: EpisodeRecord) -> Simulation:
         rules = (record.reward_type, record.success_rule, record.timing)
@@ -232,10 +230,8 @@ def _result_difference(
 
 def _applied_command(logged: LoggedTick) -> Array | None:
     message = logged.find('applied_command')
-    return None if message is None else _decoded(message)
-
-
-def _decoded(message: TickMessage) -> Array:
+    if message is None:
+        return None
     return decode(message.topic, deserialize(message.topic.type_name, message.data))
 
 

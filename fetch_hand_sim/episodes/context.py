@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -71,12 +72,10 @@ def source_revision() -> str:
     describe = ('describe', '--always', '--dirty', '--abbrev=40', '--exclude=*')
     # Only its own: an installed copy may lie in somebody else's repository.
     if (root / '.git').exists():
-        try:
+        with suppress(OSError, subprocess.SubprocessError):
             command = ['git', '-C', str(root), *describe]
             found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5.0)
             return found.stdout.strip()
-        except (OSError, subprocess.SubprocessError):
-            pass
     try:
         return f'fetch_hand_sim {version("fetch_hand_sim")}'
     except PackageNotFoundError:

@@ -92,29 +92,23 @@ def _step_table(pyarrow: Any, index: int, episode: EpisodeArrays) -> Any:
         'episode_index': pyarrow.array(np.full(rows, index)),
         'step': pyarrow.array(np.arange(rows)),
         'timestamp': pyarrow.array(seconds),
-        **{name: _vectors(pyarrow, episode.observations[name], rows) for name in _OBSERVATIONS},
-        'action': _vectors(pyarrow, episode.actions, rows),
-        'command': _vectors(pyarrow, episode.commands, rows),
+        **{name: _column(pyarrow, episode.observations[name], rows) for name in _OBSERVATIONS},
+        'action': _column(pyarrow, episode.actions, rows),
+        'command': _column(pyarrow, episode.commands, rows),
+        'reward': _column(pyarrow, episode.rewards, rows),
+        'terminated': _column(pyarrow, episode.terminated, rows),
+        'truncated': _column(pyarrow, episode.truncated, rows),
+        'next_success': _column(pyarrow, episode.success[1:], rows),
     }
-    steps = {
-        'reward': episode.rewards,
-        'terminated': episode.terminated,
-        'truncated': episode.truncated,
-        'next_success': episode.success[1:],
-    }
-    for name, values in steps.items():
-        columns[name] = pyarrow.concat_arrays(
-            [pyarrow.array(values), pyarrow.nulls(1, pyarrow.array(values).type)]
-        )
     return pyarrow.table(columns)
 
 
-def _vectors(pyarrow: Any, values: NDArray[np.float64], rows: int) -> Any:
-    """A column of vectors of fixed size, filled up with nulls to `rows`."""
-    size = values.shape[1]
-    column = pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(values.ravel()), size)
-    missing = rows - len(values)
-    return pyarrow.concat_arrays([column, pyarrow.nulls(missing, column.type)])
+def _column(pyarrow: Any, values: NDArray[Any], rows: int) -> Any:
+    """A column of numbers, or of vectors of fixed size, filled up with nulls to `rows`."""
+    column = pyarrow.array(values.ravel())
+    if values.ndim == 2:
+        column = pyarrow.FixedSizeListArray.from_arrays(column, values.shape[1])
+    return pyarrow.concat_arrays([column, pyarrow.nulls(rows - len(values), column.type)])
 
 
 def _episode_row(index: int, episode: EpisodeArrays) -> dict[str, Any]:

@@ -23,11 +23,11 @@ from fetch_hand_sim.episodes.robot_episode import RobotEpisode, sense
 from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS
 from fetch_hand_sim.simulation import Observation, Simulation
 from msgs_spec.actions import clip_command, command_from_action
+from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import topic
 
-Array = NDArray[np.float64]
 Act = Callable[[Observation], NDArray[Any]]
 
 # Completing a file waits for the disk several times; so many files wait at once.

@@ -48,7 +48,7 @@ def _check_frame(topic: TopicSpec, frame: str) -> None:
 
 def _check_stamp(runner: EpisodeRunner, stamp_ns: int) -> None:
     """A goal of another episode comes too late, one of the future too early."""
-    first, last = runner.reset_stamp_ns, runner.stamp_ns
+    first, last = runner.current.first_stamp_ns, runner.stamp_ns
     if stamp_ns and not first <= stamp_ns <= last:
         raise ValueError(
             f'stamp {stamp_ns / 1e9:.3f} s given; allowed: 0, or simulated time of the running '

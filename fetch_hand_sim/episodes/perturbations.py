@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
+from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode
 from msgs_spec.topics import TopicSpec
 
 # Newton metres of torque for each newton of force: fingers are about as long, in metres.
 _LEVER = 0.1
 _WITHIN = 1.0 - 1e-9
-Array = NDArray[np.float64]
 
 
 def bounded_wrench(wrench: Array, limit: float) -> Array:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from threading import Semaphore, Thread
 
@@ -55,35 +56,6 @@ class LoggedEpisode:
     is_complete: bool
 
 
-@dataclass(frozen=True, slots=True)
-class _Begin:
-    status: EpisodeStatus
-
-
-@dataclass(frozen=True, slots=True)
-class _TickMessages:
-    stamp_ns: int
-    messages: Messages
-
-
-@dataclass(frozen=True, slots=True)
-class _Received:
-    topic: TopicSpec
-    data: bytes
-    is_refused: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _End:
-    """The end of an episode; a reason if it was cut short."""
-
-    status: EpisodeStatus
-    reason: str | None
-
-
-_Entry = _Begin | _TickMessages | _Received | _End
-
-
 class EpisodeRecorder:
     """Writes each episode of a robot to a bag of its own.
 
@@ -119,7 +91,8 @@ class EpisodeRecorder:
         self._on_slow = on_slow
         self._waited_said_s = self._say_after = 0.0
         self._status: EpisodeStatus | None = None
-        self._backlog: Backlog[_Entry] = Backlog()
+        # What the writing thread is to do, in order.
+        self._backlog: Backlog[Callable[[], None]] = Backlog()
         self._files = _EpisodeFiles(
             EpisodeDirectory(directory, namespace=namespace),
             attachments,
@@ -133,13 +106,13 @@ class EpisodeRecorder:
     def record(self, tick: Tick, messages: Messages) -> None:
         """Logs a tick: a reset begins a file, a finished episode completes it."""
         if tick.status.phase == 'reset':
-            self.interrupt('reset before the end')
+            self._end('reset before the end')
             if not self.has_failed:
-                self._put(_Begin(tick.status))
+                self._put(partial(self._files.begin, tick.status))
                 self._status = tick.status
         if self._status is None:
             return
-        self._put(_TickMessages(tick.stamp_ns, messages))
+        self._put(partial(self._files.write_tick, tick.stamp_ns, messages))
         self._status = tick.status
         if tick.status.phase == 'finished':
             self._end(None)
@@ -147,30 +120,27 @@ class EpisodeRecorder:
     def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> None:
         """Logs a message received since the last tick; between episodes there is no file."""
         if self._status is not None:
-            self._put(_Received(topic, data, is_refused))
-
-    def interrupt(self, reason: str) -> None:
-        """Completes the running episode, if there is one, marked as cut short."""
-        self._end(reason)
+            self._put(partial(self._files.write_received, topic, data, is_refused))
 
     def close(self, reason: str) -> None:
         """Completes everything, also what is still being completed."""
-        self.interrupt(reason)
+        self._end(reason)
         self._backlog.close()
         self._thread.join(_LAST_CHANCE if self.has_failed else None)
         self._files.close()
 
     def _end(self, reason: str | None) -> None:
+        """Completes the running episode, if there is one; with a reason, marked as cut short."""
         status, self._status = self._status, None
         if status is not None:
-            self._put(_End(status, reason))
+            self._put(partial(self._files.end, status, reason))
 
-    def _put(self, entry: _Entry) -> None:
-        """Queues an entry; a robot that is faster than its disk waits here."""
+    def _put(self, write: Callable[[], None]) -> None:
+        """Queues what is to be written; a robot that is faster than its disk waits here."""
         if self.has_failed:
             return
         try:
-            waited = self._backlog.put(entry)
+            waited = self._backlog.put(write)
         except StalledError as error:
             self._fail(f'episode log stopped: {error}')
             return
@@ -198,27 +168,27 @@ class EpisodeRecorder:
         """Writes what is queued until the recorder is closed; runs in a thread of its own."""
         try:
             while not self._backlog.is_done:
-                entry = self._backlog.take(_FLUSH_AFTER)
+                write = self._backlog.take(_FLUSH_AFTER) or self._files.flush
                 if not self.has_failed:
-                    self._write_entry(entry)
+                    self._try(write)
                 if not self._files.has_unflushed:
                     self._backlog.note_saved()
         except BaseException:
             self._fail('episode log stopped: an error in the program')
             raise
 
-    def _write_entry(self, entry: _Entry | None) -> None:
+    def _try(self, write: Callable[[], None]) -> None:
         try:
-            if entry is None:
-                self._files.flush()
-            else:
-                self._files.write(entry)
+            write()
         except EpisodeLogError as error:
             self._fail(str(error))
 
 
 class _EpisodeFiles:
-    """The file in progress, and those that wait for the disk; used by one thread."""
+    """The file in progress, and those that wait for the disk; used by one thread.
+
+    Methods that write raise `EpisodeLogError` at the first error of the disk.
+    """
 
     def __init__(
         self,
@@ -247,26 +217,29 @@ class _EpisodeFiles:
         if self._writer is not None:
             self._writer.flush()
 
-    def write(self, entry: _Entry) -> None:
-        """Does what an entry says.
+    def begin(self, status: EpisodeStatus) -> None:
+        """Begins the file of an episode with this first status."""
+        self._room.acquire()
+        self._writer = self._episodes.begin(
+            status.task, status.seed, self._metadata(status), self._attachments
+        )
 
-        Raises:
-            EpisodeLogError: At the first error of the disk.
-        """
-        match entry:
-            case _Begin(status):
-                self._room.acquire()
-                self._writer = self._episodes.begin(
-                    status.task, status.seed, self._metadata(status), self._attachments
-                )
-            case _TickMessages(stamp_ns, messages) if self._writer is not None:
-                self._writer.write_tick(stamp_ns, messages)
-            case _Received(topic, data, is_refused) if self._writer is not None:
-                self._writer.write_received(topic, data, is_refused=is_refused)
-            case _End(status, reason) if self._writer is not None:
-                writer, self._writer = self._writer, None
-                writer.end(episode_result(status), reason)
-                self._storing.submit(self._store, writer, status, reason is None)
+    def write_tick(self, stamp_ns: int, messages: Messages) -> None:
+        """Writes the messages of a tick."""
+        if self._writer is not None:
+            self._writer.write_tick(stamp_ns, messages)
+
+    def write_received(self, topic: TopicSpec, data: bytes, is_refused: bool) -> None:
+        """Writes a message that the robot received."""
+        if self._writer is not None:
+            self._writer.write_received(topic, data, is_refused=is_refused)
+
+    def end(self, status: EpisodeStatus, reason: str | None) -> None:
+        """Ends the file of an episode with this last status; a reason if it was cut short."""
+        if self._writer is not None:
+            writer, self._writer = self._writer, None
+            writer.end(episode_result(status), reason)
+            self._storing.submit(self._store, writer, status, reason is None)
 
     def close(self) -> None:
         """Waits until all files are on the disk."""

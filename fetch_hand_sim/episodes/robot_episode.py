@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings, achieved_goal
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tick import EpisodeStatus, Phase, Tick
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,14 +7,12 @@ lockstep and a Python loop give the same ticks for the same commands.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.episodes.robot_episode import RobotEpisode, sense
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tick import EpisodeStatus, Tick
-
-Array = NDArray[np.float64]
 
 # Simulated time of the first tick. Not 0, because ROS takes a time of 0 for "no time yet".
 FIRST_STAMP_NS = 1_000_000_000
@@ -35,6 +33,14 @@ class EpisodeRunner:
             run an episode from the middle of a series again.
         first_stamp_ns: Simulated time of the first tick, likewise.
         joint_prefix: What the names of joints begin with on the network.
+
+    Attributes:
+        simulation: As given.
+        spec: Its task, with the joint names of the network.
+        episode: Index of the running or next episode, from 0.
+        current: The running or last episode; before the first one that one, waiting.
+        stamp_ns: Simulated time of the last tick; one period before the first if there is none.
+        is_between_episodes: Whether the next tick is a reset.
 
     Raises:
         ValueError: If the simulation holds more than one robot.
@@ -59,58 +65,33 @@ class EpisodeRunner:
         self._episodes = episodes
         self._period_ns = round(simulation.tick_duration * 1e9)
         self._first_stamp_ns = first_stamp_ns
-        self._stamp_ns = first_stamp_ns - self._period_ns
-        self._first_episode = self._episode = first_episode
+        self.stamp_ns = first_stamp_ns - self._period_ns
+        self._first_episode = self.episode = first_episode
         self._series_seed = first_seed
         self._new_first_seed: int | None = None
         self.is_between_episodes = True
-        self._current = self._make_episode(first_stamp_ns)
+        self.current = self._make_episode(first_stamp_ns)
 
     @property
     def is_done(self) -> bool:
         """Whether all episodes asked for are finished."""
-        return 0 < self._episodes <= self._episode
-
-    @property
-    def episode(self) -> int:
-        """Index of the running or next episode, from 0."""
-        return self._episode
+        return 0 < self._episodes <= self.episode
 
     @property
     def seed(self) -> int:
         """Seed of the running or next episode."""
         if self.is_between_episodes and self._new_first_seed is not None:
-            return self._new_first_seed + self._episode
-        return self._first_seed + self._episode
-
-    @property
-    def tick(self) -> int:
-        """Steps of the running or last episode so far."""
-        return self._current.tick
-
-    @property
-    def has_diverged(self) -> bool:
-        """Whether MuJoCo gave the running or last episode up."""
-        return self._current.has_diverged
-
-    @property
-    def stamp_ns(self) -> int:
-        """Simulated time of the last tick; one period before the first if there is none."""
-        return self._stamp_ns
-
-    @property
-    def reset_stamp_ns(self) -> int:
-        """Simulated time of tick 0 of the running or last episode."""
-        return self._current.first_stamp_ns
+            return self._new_first_seed + self.episode
+        return self._first_seed + self.episode
 
     @property
     def has_started(self) -> bool:
         """Whether there has been a tick."""
-        return self._stamp_ns >= self._first_stamp_ns
+        return self.stamp_ns >= self._first_stamp_ns
 
     def waiting_status(self) -> EpisodeStatus:
         """What to say of the first episode before it starts."""
-        return self._make_episode(self._stamp_ns).status
+        return self._make_episode(self.stamp_ns).status
 
     def resting_command(self) -> Array:
         """The command (action size,) that leaves the robot as it is."""
@@ -119,7 +100,7 @@ class EpisodeRunner:
 
     def set_next_seed(self, seed: int) -> None:
         """Gives the next episode to start a seed, and those after it the seeds that follow."""
-        following = self._episode if self.is_between_episodes else self._episode + 1
+        following = self.episode if self.is_between_episodes else self.episode + 1
         self._new_first_seed = seed - following
 
     def set_goal(self, goal: Array) -> None:
@@ -146,7 +127,7 @@ class EpisodeRunner:
     def start_over(self) -> None:
         """Gives the series up: the next tick starts its first episode again, and time goes on."""
         self.is_between_episodes = True
-        self._episode = self._first_episode
+        self.episode = self._first_episode
         self._first_seed, self._new_first_seed = self._series_seed, None
 
     def advance(self, command: Array) -> Tick:
@@ -155,9 +136,9 @@ class EpisodeRunner:
         Args:
             command: (action size,) in command units and within limits; a reset ignores it.
         """
-        if self.is_between_episodes:
-            return self._reset()
-        return self._step(command)
+        tick = self._reset() if self.is_between_episodes else self._step(command)
+        self.stamp_ns = tick.stamp_ns
+        return tick
 
     def _reset(self) -> Tick:
         stamp_ns = self.stamp_ns + self._period_ns
@@ -165,24 +146,20 @@ class EpisodeRunner:
             self._first_seed, self._new_first_seed = self._new_first_seed, None
         self.is_between_episodes = False
         self.simulation.reset(seed=self.seed)
-        self._current = self._make_episode(stamp_ns)
-        return self._emitted(self._current.start(sense(self.simulation), 0))
+        self.current = self._make_episode(stamp_ns)
+        return self.current.start(sense(self.simulation), 0)
 
     def _step(self, command: Array) -> Tick:
         (diverged,) = self.simulation.advance(command[None])
         sensed = sense(self.simulation)
-        tick = self._current.step(sensed, 0, command.copy(), bool(diverged))
-        if self._current.is_finished:
+        tick = self.current.step(sensed, 0, command.copy(), bool(diverged))
+        if self.current.is_finished:
             self._finish()
-        return self._emitted(tick)
+        return tick
 
     def _finish(self) -> None:
         self.is_between_episodes = True
-        self._episode += 1
-
-    def _emitted(self, tick: Tick) -> Tick:
-        self._stamp_ns = tick.stamp_ns
-        return tick
+        self.episode += 1
 
     def _make_episode(self, stamp_ns: int) -> RobotEpisode:
-        return RobotEpisode(self.simulation, self._episode, self.seed, stamp_ns, self._joint_prefix)
+        return RobotEpisode(self.simulation, self.episode, self.seed, stamp_ns, self._joint_prefix)

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,27 +72,17 @@ def _write_animation(path: Path, pictures: Iterable[Picture], fps: float) -> Non
     from PIL import Image
 
     images = [Image.fromarray(picture) for picture in pictures]
+    options: dict[str, Any] = {'quality': _QUALITY, 'method': 4}
+    if path.suffix == '.gif':
+        # One palette for all, or colours flicker; made of some, because goals change their colour.
+        some = images[:: max(1, len(images) // _SAMPLES)]
+        samples = Image.fromarray(np.concatenate([np.asarray(image) for image in some]))
+        palette = samples.quantize(_COLORS)
+        images = [image.quantize(palette=palette) for image in images]
+        options = {'optimize': True}
     first, *rest = images
-    milliseconds = round(1000.0 / fps)
-    if path.suffix == '.webp':
-        first.save(
-            path,
-            save_all=True,
-            append_images=rest,
-            duration=milliseconds,
-            loop=0,
-            quality=_QUALITY,
-            method=4,
-        )
-        return
-    # One palette for all, or colours flicker; made of some, because goals change their colour.
-    some = images[:: max(1, len(images) // _SAMPLES)]
-    samples = Image.fromarray(np.concatenate([np.asarray(image) for image in some]))
-    palette = samples.quantize(_COLORS)
-    frames = [image.quantize(palette=palette) for image in images]
-    frames[0].save(
-        path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, optimize=True
-    )
+    duration = round(1000.0 / fps)
+    first.save(path, save_all=True, append_images=rest, duration=duration, loop=0, **options)
 
 
 def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:

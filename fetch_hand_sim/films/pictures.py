@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 
@@ -13,7 +12,6 @@ from fetch_hand_sim.films.recording import Recording
 from fetch_hand_sim.simulation.rendering import SceneRenderer
 from fetch_hand_sim.simulation.scene import Scene, tracked_position
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 _TRAIL_TICKS = 40
@@ -44,11 +42,8 @@ class Studio:
             ValueError: If the model has no such camera.
             RuntimeError: If there is no OpenGL.
         """
-        renderer = self._renderer(recording.spec.name)
-        trail: deque[Array] = deque(maxlen=_TRAIL_TICKS)
-        for frame in recording.frames:
-            trail.append(tracked_position(frame))
-            yield renderer.render(frame, trail)
+        for index in range(len(recording.frames)):
+            yield self.picture(recording, index)
 
     def picture(self, recording: Recording, index: int) -> Picture:
         """Returns the picture of one frame; negative indices count from the end."""

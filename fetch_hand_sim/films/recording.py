@@ -5,20 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode
 from fetch_hand_sim.episode_log.messages import read_messages
 from fetch_hand_sim.episode_log.summary import expand_episodes
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
+from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.tasks import GoalKind, TaskSpec
 from msgs_spec.topics import topic
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +100,16 @@ def load_recordings(path: Path, count: int) -> list[Recording]:
     Raises:
         EpisodeReadError: If there is none, or one cannot be read.
     """
-    paths = expand_episodes(path)[:count]
+    return [load_recording(each) for each in find_playable(path)[:count]]
+
+
+def find_playable(path: Path) -> list[Path]:
+    """Returns the episodes of a path, by name; nothing is read.
+
+    Raises:
+        EpisodeReadError: If there are none.
+    """
+    paths = expand_episodes(path)
     if not paths:
         raise EpisodeReadError(f'{path}: no episodes')
-    return [load_recording(each) for each in paths]
+    return paths

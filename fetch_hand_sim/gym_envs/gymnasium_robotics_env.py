@@ -26,6 +26,7 @@ from fetch_hand_sim.simulation.tasks.hand_manipulate import (
     HandManipulateTask,
 )
 from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
+from msgs_spec.arrays import Array
 from msgs_spec.tasks import GoalKind, RewardType, task_spec
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 else:
     GoalEnv = import_goal_env()
 
-Array = NDArray[np.float64]
 
 # Pixels, and the cameras of `fetch_env.py` and `hand_env.py`.
 _SIZE = 480
@@ -291,11 +291,8 @@ def make_env(task: str, **arguments: Any) -> RobotEnv:
     spec = task_spec(task)
     if task in FETCH_CONFIGS:
         return FetchEnv(task, **arguments)
-    return (
-        HandReachEnv(task, **arguments)
-        if spec.goal is GoalKind.FINGERTIPS
-        else (ManipulateEnv(task, **arguments))
-    )
+    is_reach = spec.goal is GoalKind.FINGERTIPS
+    return (HandReachEnv if is_reach else ManipulateEnv)(task, **arguments)
 
 
 def _goal_kind(task: str) -> tuple[str, str]:

@@ -14,6 +14,7 @@ from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS, task_spec
 
 NAMESPACE = 'fetch_hand_sim'
 VERSION = 0
+_ENV = 'fetch_hand_sim.gym_envs.env:FetchHandEnv'
 
 
 def environment_id(task: str) -> str:
@@ -23,16 +24,20 @@ def environment_id(task: str) -> str:
 
 def register_environments() -> None:
     """Registers what is not registered yet; imports nothing that is slow, such as MuJoCo."""
-    for task, spec in TASKS.items():
-        if environment_id(task) in gymnasium.registry:
-            continue
-        gymnasium.register(
-            environment_id(task),
-            entry_point='fetch_hand_sim.gym_envs.env:FetchHandEnv',
-            vector_entry_point='fetch_hand_sim.gym_envs.vector_env:FetchHandVectorEnv',
-            max_episode_steps=spec.episode_ticks,
-            kwargs={'task': task},
-        )
+    for task in TASKS:
+        if environment_id(task) not in gymnasium.registry:
+            _register(environment_id(task), _ENV, task=task)
+
+
+def _register(name: str, entry_point: str, **arguments: str) -> None:
+    """Registers an environment of a task, single and as a batch, with arguments for both."""
+    gymnasium.register(
+        name,
+        entry_point=entry_point,
+        vector_entry_point='fetch_hand_sim.gym_envs.vector_env:FetchHandVectorEnv',
+        max_episode_steps=TASKS[arguments['task']].episode_ticks,
+        kwargs=arguments,
+    )
 
 
 def make(name: str, **arguments: Any) -> gymnasium.Env[Any, Any]:
@@ -138,13 +143,7 @@ def register_gymnasium_robotics(override: bool = False) -> None:
         )
     for name, (task, reward_type) in ids.items():
         gymnasium.registry.pop(name, None)
-        gymnasium.register(
-            name,
-            entry_point=_REFERENCE_ENV,
-            vector_entry_point='fetch_hand_sim.gym_envs.vector_env:FetchHandVectorEnv',
-            max_episode_steps=TASKS[task].episode_ticks,
-            kwargs={'task': task, 'reward_type': reward_type},
-        )
+        _register(name, _REFERENCE_ENV, task=task, reward_type=reward_type)
     for name, without in _touch_ids(ids).items():
         if name not in gymnasium.registry:
             kwargs = {'name': name, 'without': without}

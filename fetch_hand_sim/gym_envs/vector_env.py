@@ -17,9 +17,9 @@ from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observati
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
 from fetch_hand_sim.simulation import Observation, Simulation
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
+from msgs_spec.arrays import Array
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 # A window shows one environment.

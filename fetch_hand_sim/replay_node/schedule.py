@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,10 +77,7 @@ class ReplaySchedule:
 
     def index_at(self, time_ns: int) -> int:
         """Index of the first message at or after a time."""
-        return next(
-            (i for i, message in enumerate(self.messages) if message.time_ns >= time_ns),
-            len(self.messages),
-        )
+        return bisect_left(self.messages, time_ns, key=lambda message: message.time_ns)
 
     def latched_at(self, time_ns: int) -> list[ReplayMessage]:
         """What late subscribers of the latched topics get at a time.

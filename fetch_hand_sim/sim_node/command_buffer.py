@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from msgs_spec.actions import clip_command, command_limits
+from msgs_spec.arrays import Array
 from msgs_spec.robots import RobotSpec
 
-Array = NDArray[np.float64]
 # Characters of a received name that an error line repeats.
 _NAME_SHOWN = 40
 # A value this many times the width of its range beyond a limit is no overshoot of a controller.
@@ -41,6 +41,7 @@ class CommandBuffer:
         rejected: Other commands, by reason.
         last_far_out: What was said of the last command that was far out of range.
         last_rejection: Why the last command was rejected; empty if it was not.
+        has_fresh_command: Whether a command came since the last `take` or `start_episode`.
     """
 
     def __init__(
@@ -60,12 +61,7 @@ class CommandBuffer:
         self._resting = np.zeros(robot.action_size)
         self._command: Array | None = None
         self._received_at: float | None = None
-        self._is_fresh = False
-
-    @property
-    def has_fresh_command(self) -> bool:
-        """Whether a command came since the last `take` or `start_episode`."""
-        return self._is_fresh
+        self.has_fresh_command = False
 
     def age(self) -> float | None:
         """Seconds since the last valid command of any episode, or None if none ever came."""
@@ -80,7 +76,7 @@ class CommandBuffer:
         """
         self._resting = np.array(resting_command, dtype=np.float64)
         self._command = None
-        self._is_fresh = False
+        self.has_fresh_command = False
 
     def accept(self, values: ArrayLike) -> None:
         """Takes a whole command, in order.
@@ -133,7 +129,7 @@ class CommandBuffer:
 
         What came since the last tick answers it and is never too old, however slow the ticks are.
         """
-        is_fresh, self._is_fresh = self._is_fresh, False
+        is_fresh, self.has_fresh_command = self.has_fresh_command, False
         if self._command is None:
             return self._resting
         is_late = not is_fresh and 0.0 < self.timeout < (self.age() or 0.0)
@@ -155,7 +151,7 @@ class CommandBuffer:
         if not np.array_equal(command, self._command):
             self._count_clipping(command)
         self._received_at = self._clock()
-        self._is_fresh = True
+        self.has_fresh_command = True
         self.accepted += 1
         self.last_rejection = ''
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from fetch_hand_sim.sim_node.robot import Robot
 from msgs_spec.diagnostics import Increase, Level, Report
@@ -37,17 +38,6 @@ class Surroundings:
     has_log_failed: bool = False
 
 
-@dataclass(slots=True)
-class _Growth:
-    ticks: Increase = field(default_factory=Increase)
-    simulated: Increase = field(default_factory=Increase)
-    missed: Increase = field(default_factory=Increase)
-    rejected: Increase = field(default_factory=Increase)
-    far_out: Increase = field(default_factory=Increase)
-    goals_rejected: Increase = field(default_factory=Increase)
-    diverged: Increase = field(default_factory=Increase)
-
-
 class Health:
     """Turns a robot's counters into reports; rates are over the time between two of them.
 
@@ -64,8 +54,9 @@ class Health:
         self._robot = robot
         self._name = name
         self._then = now
-        self._growth = _Growth()
-        self._growth.simulated.since(robot.runner.stamp_ns)
+        # How much each counter has grown since the last report, by its name.
+        self._growth: defaultdict[str, Increase] = defaultdict(Increase)
+        self._growth['simulated'].since(robot.runner.stamp_ns)
         self._asked_before: float | None = None
         self.real_time_factor = 0.0
 
@@ -78,8 +69,8 @@ class Health:
         """
         robot, growth = self._robot, self._growth
         seconds, self._then = max(now - self._then, 1e-9), now
-        rate = growth.ticks.since(robot.counters.ticks) / seconds
-        simulated = growth.simulated.since(robot.runner.stamp_ns) * 1e-9
+        rate = growth['ticks'].since(robot.counters.ticks) / seconds
+        simulated = growth['simulated'].since(robot.runner.stamp_ns) * 1e-9
         self.real_time_factor = simulated / seconds
         task = robot.runner.spec.name
         report = Report(
@@ -144,10 +135,10 @@ class Health:
     def _judge_period(self, report: Report, rate: float) -> None:
         """Reports what went wrong since the last report."""
         robot, growth = self._robot, self._growth
-        diverged = growth.diverged.since(robot.runner.simulation.divergences)
+        diverged = growth['diverged'].since(robot.runner.simulation.divergences)
         if diverged:
             report.fail(f'MuJoCo lost the state {diverged:.0f} times')
-        missed = growth.missed.since(robot.schedule.pacer.missed_ticks)
+        missed = growth['missed'].since(robot.schedule.pacer.missed_ticks)
         asked = robot.schedule.asked_rate if robot.runner.has_started else None
         # Only a whole period at one pace tells.
         asked_before, self._asked_before = self._asked_before, asked
@@ -155,14 +146,14 @@ class Health:
             report.warn(f'{missed:.0f} ticks missed')
         elif asked and asked == asked_before and rate < (1.0 - _RATE_TOLERANCE) * asked:
             report.warn(f'{rate:.1f} ticks per second, not the {asked:.1f} asked for')
-        rejected = growth.rejected.since(robot.buffer.rejected.total())
+        rejected = growth['rejected'].since(robot.buffer.rejected.total())
         if rejected:
             report.warn(f'{rejected:.0f} commands rejected; {robot.buffer.last_rejection}')
-        far_out = growth.far_out.since(robot.buffer.far_out)
+        far_out = growth['far_out'].since(robot.buffer.far_out)
         if far_out:
             line = f'{far_out:.0f} commands clipped from far out of range'
             report.warn(f'{line}; {robot.buffer.last_far_out}')
-        goals_rejected = growth.goals_rejected.since(robot.counters.goals_rejected)
+        goals_rejected = growth['goals_rejected'].since(robot.counters.goals_rejected)
         if goals_rejected:
             report.warn(f'{goals_rejected:.0f} goals rejected')
 
@@ -188,7 +179,7 @@ def lasting_problems(robot: Robot, surroundings: Surroundings) -> list[tuple[Lev
 def waiting_line(robot: Robot, surroundings: Surroundings) -> str:
     """What a robot that needs a command waits for."""
     runner = robot.runner
-    what = f'tick {runner.tick + 1} of episode {runner.episode}'
+    what = f'tick {runner.current.tick + 1} of episode {runner.episode}'
     if runner.is_between_episodes:
         what = f'the start of episode {runner.episode}'
     text = f'{what} waits for a valid command; {_who_commands(surroundings)}'

@@ -269,7 +269,7 @@ class SimNode(Node):
     def _report_episode(self, status: EpisodeStatus) -> None:
         if self._recorder is None:
             self.get_logger().info(_episode_line(status))
-        if self._robot.runner.has_diverged:
+        if self._robot.runner.current.has_diverged:
             count = self._robot.runner.simulation.divergences
             self.get_logger().error(
                 f'MuJoCo reports divergence; the episode ends early (so far {count} times)'

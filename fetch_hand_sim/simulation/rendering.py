@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.opengl import ADVICE, prepare_opengl
 from fetch_hand_sim.simulation.scene import SHOWN_SITES, Frame, Scene
 from fetch_hand_sim.simulation.simulation import Simulation
-
-Array = NDArray[np.float64]
+from msgs_spec.arrays import Array
 
 WIDTH, HEIGHT = 640, 480
 LARGEST_SIDE = 4096

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msgs_spec.arrays import Array
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler, rotation_angle
 from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, RewardType, SuccessRule, TaskSpec
-
-Array = NDArray[np.float64]
 
 
 def _norm(difference: Array) -> Array:
@@ -60,15 +59,16 @@ class GoalMetric:
             raise ValueError(
                 f'achieved_goal {achieved.shape} and desired_goal {desired.shape} differ in shape'
             )
+        nothing = np.zeros(achieved.shape[:-1])
         if self.spec.goal is GoalKind.POSE:
-            return self._position_distance(achieved, desired), self._rotation(achieved, desired)
+            place = achieved[..., :3] - desired[..., :3]
+            distance = _norm(place) if self.spec.position_counts else nothing
+            return distance, self._rotation(achieved, desired)
         if self.spec.goal is GoalKind.FINGERTIPS and self.success_rule == 'paper':
             fingertips = (achieved - desired).reshape(*achieved.shape[:-1], -1, 3)
             per_fingertip = np.moveaxis(_norm(fingertips), -1, 0)
-            return np.asarray(sum(per_fingertip) / len(per_fingertip)), np.zeros(
-                achieved.shape[:-1]
-            )
-        return _norm(achieved - desired), np.zeros(achieved.shape[:-1])
+            return np.asarray(sum(per_fingertip) / len(per_fingertip)), nothing
+        return _norm(achieved - desired), nothing
 
     def success(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> NDArray[np.bool_]:
         """Whether goals (..., goal size) are reached: a boolean array (...)."""
@@ -118,11 +118,6 @@ class GoalMetric:
                 f'{values.shape}'
             )
         return values
-
-    def _position_distance(self, achieved: Array, desired: Array) -> Array:
-        if not self.spec.position_counts:
-            return np.zeros(achieved.shape[:-1])
-        return _norm(achieved[..., :3] - desired[..., :3])
 
     def _rotation(self, achieved: Array, desired: Array) -> Array:
         quaternion = achieved[..., 3:]

@@ -12,13 +12,12 @@ from itertools import pairwise
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.tasks import task_asset
+from msgs_spec.arrays import Array
 from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
 
-Array = NDArray[np.float64]
 Color = tuple[float, float, float, float]
 
 REACHED: Color = (0.15, 0.75, 0.25, 0.65)
@@ -53,11 +52,8 @@ class View:
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE.value
         camera.fixedcamid = camera.trackbodyid = -1
         camera.lookat[:] = self.lookat
-        camera.distance, camera.azimuth, camera.elevation = (
-            self.distance,
-            self.azimuth,
-            self.elevation,
-        )
+        camera.distance = self.distance
+        camera.azimuth, camera.elevation = self.azimuth, self.elevation
 
 
 _FETCH_VIEW = View((1.2, 0.75, 0.58), 1.75, 140.0, -18.0)

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.actions import command_from_action
+from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
@@ -32,7 +33,6 @@ from msgs_spec.tasks import (
     Timing,
 )
 
-Array = NDArray[np.float64]
 Observation = dict[str, Array]
 Seed = int | np.random.Generator | None
 Seeds = int | Sequence[Seed] | None
@@ -111,16 +111,14 @@ class Simulation:
             raise ValueError(f'timing {timing!r}; allowed: {", ".join(TIMINGS)}')
         if num_threads < 0:
             raise ValueError(f'num_threads must be 0 (all processors) or more, not {num_threads}')
-        self._task = make_task(
-            task,
-            num_envs=num_envs,
-            num_threads=num_threads,
-            control_hz=control_hz,
-            keeps_data=keeps_data,
-            timing=timing,
-        )
-        self._num_threads = num_threads
-        self._keeps_data = keeps_data
+        self._arguments: dict[str, Any] = {
+            'num_envs': num_envs,
+            'num_threads': num_threads,
+            'control_hz': control_hz,
+            'keeps_data': keeps_data,
+            'timing': timing,
+        }
+        self._task = make_task(task, **self._arguments)
         self._model_may_change = False
         self.spec = self._task.spec
         self.num_envs = num_envs
@@ -190,11 +188,9 @@ class Simulation:
         """
         selected = self._select(ids)
         self._seed(selected, seed)
-        generators = [self._generator(i) for i in selected.tolist()]
         if selected.size:
-            self.goals[selected] = self._task.reset(selected, generators)
-            self._warnings = self._count_warnings()
-        return self._observe()
+            self._start(selected)
+        return self.observe()
 
     def step(self, actions: ArrayLike) -> StepResult:
         """Advances every simulation by one tick.
@@ -308,19 +304,12 @@ class Simulation:
 
     def observe(self) -> Observation:
         """The observation as it is now, fresh arrays."""
-        return self._observe()
+        return self._observation(*self._task.observe())
 
     def __getstate__(self) -> dict[str, Any]:
         """Arguments and everything that decides the future, for `pickle` and `copy.deepcopy`."""
         return {
-            'arguments': {
-                'task': self.spec.name,
-                'num_envs': self.num_envs,
-                'num_threads': self._num_threads,
-                'control_hz': self.control_hz,
-                'keeps_data': self._keeps_data,
-                'timing': self.timing,
-            },
+            'arguments': {'task': self.spec.name, **self._arguments},
             'model': self.model if self._model_may_change else None,
             'metric': self.metric,
             'physics': self._task.physics_state(),
@@ -363,7 +352,7 @@ class Simulation:
         return diverged
 
     def _result(self, diverged: NDArray[np.bool_]) -> StepResult:
-        observation = self._observe()
+        observation = self.observe()
         reward, success = self.metric.evaluate(observation['achieved_goal'], self.goals)
         return StepResult(observation, reward, success, diverged)
 
@@ -386,11 +375,12 @@ class Simulation:
             self.spec.name,
             ids.tolist(),
         )
+        self._start(ids)
+
+    def _start(self, ids: NDArray[np.intp]) -> None:
+        """Begins episodes; what MuJoCo warned of before counts no more."""
         self.goals[ids] = self._task.reset(ids, [self._generator(i) for i in ids.tolist()])
         self._warnings = self._count_warnings()
-
-    def _observe(self) -> Observation:
-        return self._observation(*self._task.observe())
 
     def _observation(self, observation: Array, achieved_goal: Array) -> Observation:
         return {

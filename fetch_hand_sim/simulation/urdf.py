@@ -8,26 +8,24 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.tasks import task_asset
 from fetch_hand_sim.simulation.urdf_shapes import add_origin, add_shapes, numbers
+from msgs_spec.arrays import Array
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.rotations import (
-    quaternion_conjugate,
     quaternion_from_axis_angle,
     quaternion_multiply,
     quaternion_to_matrix,
 )
 from msgs_spec.tasks import task_spec
 
-Array = NDArray[np.float64]
 JointType = Literal['fixed', 'revolute', 'continuous', 'prismatic']
 
 ROOT = 'world'
@@ -48,11 +46,6 @@ class Pose:
         rotated = quaternion_to_matrix(self.quaternion) @ other.position
         turned = quaternion_multiply(self.quaternion, other.quaternion)
         return Pose(self.position + rotated, turned / np.linalg.norm(turned))
-
-    def inverse(self) -> Pose:
-        """The pose of the other frame in this one."""
-        back = quaternion_conjugate(self.quaternion)
-        return Pose(-quaternion_to_matrix(back) @ self.position, back)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,17 +156,17 @@ class RobotDescription:
         first = int(model.body_jntadr[body])
         moving = range(first, first + int(model.body_jntnum[body])) if first >= 0 else range(0)
         for index in moving:
-            anchor = Pose(model.jnt_pos[index].copy(), _IDENTITY)
             # Only a hinge turns about its anchor; what slides may as well start from the origin.
             is_hinge = int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_HINGE.value
-            start = origin @ anchor if is_hinge else origin
-            is_last = index == moving[-1] and not (is_hinge and anchor.position.any())
+            anchor = model.jnt_pos[index] if is_hinge else np.zeros(3)
+            start = origin @ Pose(anchor, _IDENTITY)
+            is_last = index == moving[-1] and not anchor.any()
             child = name if is_last else f'{model.joint(index).name}/moved'
             yield self._moving_joint(index, parent, child, start)
             if is_last:
                 return
             parent = child
-            origin = anchor.inverse() if is_hinge else Pose(np.zeros(3), _IDENTITY)
+            origin = Pose(-anchor, _IDENTITY)
         yield UrdfJoint(f'{name}/fixed', 'fixed', parent, name, origin, np.zeros(3))
 
     def _moving_joint(self, index: int, parent: str, child: str, start: Pose) -> UrdfJoint:
@@ -182,18 +175,14 @@ class RobotDescription:
         axis = np.array(model.jnt_axis[index])
         zero = float(model.qpos0[model.jnt_qposadr[index]])
         is_hinge = int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_HINGE.value
-        back = (
-            Pose(np.zeros(3), quaternion_from_axis_angle(axis, -zero))
-            if is_hinge
-            else Pose(-zero * axis, _IDENTITY)
-        )
         lower, upper = model.jnt_range[index] if model.jnt_limited[index] else (-_FAR, _FAR)
         kind: JointType = 'revolute' if is_hinge else 'prismatic'
         if is_hinge and not model.jnt_limited[index]:
             kind = 'continuous'
-        return UrdfJoint(
-            joint.name, kind, parent, child, start @ back, axis, float(lower), float(upper)
-        )
+        limits = float(lower), float(upper)
+        moving = UrdfJoint(joint.name, kind, parent, child, start, axis, *limits)
+        # The model as it is compiled stands at `zero`, not at 0.
+        return replace(moving, origin=moving.pose(-zero))
 
     def _fill_link(self, link: ElementTree.Element, body: int) -> None:
         model = self._model

@@ -9,11 +9,11 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from msgs_spec.arrays import Array
 from msgs_spec.rotations import quaternion_multiply, quaternion_to_matrix
 
-Array = NDArray[np.float64]
 _GEOM = mujoco.mjtGeom
 # Groups that MuJoCo draws unless told otherwise.
 _DRAWN_GROUPS = (0, 1, 2)

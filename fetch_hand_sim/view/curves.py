@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
 from fetch_hand_sim.view.picture import Graphs, Series
+from msgs_spec.arrays import Array
 from msgs_spec.tasks import TaskSpec
-
-Array = NDArray[np.float64]
 
 
 class Curves:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import argparse
 import time
-from pathlib import Path
 
 from fetch_hand_sim.episode_log import EpisodeReadError
-from fetch_hand_sim.episode_log.summary import expand_episodes
-from fetch_hand_sim.view.announce import announce
+from fetch_hand_sim.films.recording import find_playable
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.player import Player
 from fetch_hand_sim.view.session import Requests, Session
-from fetch_hand_sim.view.web import open_page
+from fetch_hand_sim.view.web import announce, open_page
 from msgs_spec.command_line import EXIT_SUCCESS, UsageError
 from msgs_spec.ros import StopSignals
 
@@ -44,15 +42,3 @@ def run_files(options: argparse.Namespace) -> int:
     finally:
         handle.close()
     return EXIT_SUCCESS
-
-
-def find_playable(path: Path) -> list[Path]:
-    """Returns the episodes of a path, the first of which can be read.
-
-    Raises:
-        EpisodeReadError: If there are none.
-    """
-    paths = list(expand_episodes(path))
-    if not paths:
-        raise EpisodeReadError(f'{path}: no episodes')
-    return paths

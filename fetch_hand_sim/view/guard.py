@@ -20,6 +20,8 @@ from websockets.http11 import Request, Response
 
 _LOOPBACK = frozenset({'localhost', '127.0.0.1', '::1'})
 _SOCKETS = frozenset({'/ui', '/state'})
+# Carries the token after the first request.
+_COOKIE = 'fetch_hand_sim_view'
 _FORBIDDEN_PATHS = frozenset({'/drop'})
 # Let other sites read the answers, or load them.
 _OPENING_HEADERS = ('Access-Control-Allow-Origin', 'Cross-Origin-Resource-Policy')
@@ -91,12 +93,7 @@ class Guard:
         """Returns the cookie for whoever came with the token in the address, or None."""
         if self.token is None or not self._matches(parse_qs(urlsplit(target).query).get('token')):
             return None
-        return f'{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict'
-
-    @property
-    def cookie(self) -> str:
-        """Name of the cookie that carries the token after the first request."""
-        return 'fetch_hand_sim_view'
+        return f'{_COOKIE}={self.token}; Path=/; HttpOnly; SameSite=Strict'
 
     def _has_token(self, target: str, headers: Headers) -> bool:
         given = parse_qs(urlsplit(target).query).get('token', [])
@@ -105,8 +102,8 @@ class Guard:
                 cookies = SimpleCookie(line)
             except CookieError:
                 continue
-            if self.cookie in cookies:
-                given.append(cookies[self.cookie].value)
+            if _COOKIE in cookies:
+                given.append(cookies[_COOKIE].value)
         return self._matches(given)
 
     def _matches(self, given: Sequence[str] | None) -> bool:

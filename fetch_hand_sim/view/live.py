@@ -6,8 +6,6 @@ import dataclasses
 from collections import deque
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
@@ -17,12 +15,11 @@ from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Graphs, Picture
 from fetch_hand_sim.view.requests import LatestRequest, Request, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RobotRequests
 from fetch_hand_sim.view.robot_watch import ANY_TASK, WATCHING, RobotWatch, SeenTick
+from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode_status
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic
-
-Array = NDArray[np.float64]
 
 
 class LiveRobot:

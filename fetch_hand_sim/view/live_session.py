@@ -17,11 +17,10 @@ from rclpy.node import Node
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
-from fetch_hand_sim.view.announce import announce
 from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests, Session
-from fetch_hand_sim.view.web import open_page
+from fetch_hand_sim.view.web import announce, open_page
 from msgs_spec.ros import EventLoop, NodeFailure, StopSignals, destroy, run_node
 
 NODE_NAME = 'view'

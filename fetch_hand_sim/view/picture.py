@@ -7,13 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 
-import numpy as np
 from mujoco.studio import messages
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.scene import Frame, Scene
-
-Array = NDArray[np.float64]
+from msgs_spec.arrays import Array
 
 # How much of the way of an object is drawn.
 TRAIL_TICKS = 40

@@ -7,10 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeReadError
-from fetch_hand_sim.films.recording import Recording, load_recording
+from fetch_hand_sim.films.recording import load_recording
 from fetch_hand_sim.simulation.scene import tracked_position
 from fetch_hand_sim.view.curves import Curves
 from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Picture, Timeline
@@ -24,8 +23,6 @@ from fetch_hand_sim.view.requests import (
     SetSpeed,
     StepOnce,
 )
-
-Array = NDArray[np.float64]
 
 # Seconds the last frame stays before the episode starts again.
 _PAUSE_AT_END = 1.0
@@ -60,11 +57,6 @@ class Player:
         times = self._recording.times
         last = int(np.searchsorted(times, self._position + 1e-9, side='right')) - 1
         return min(max(last, 0), len(times) - 1)
-
-    @property
-    def recording(self) -> Recording:
-        """What is being played."""
-        return self._recording
 
     def picture(self) -> Picture | None:
         """Moves the playhead; returns what to show if that has changed."""

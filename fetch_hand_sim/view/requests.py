@@ -7,11 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 from mujoco.studio import messages
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from msgs_spec.arrays import Array
 
 
 class Request(messages.Event):

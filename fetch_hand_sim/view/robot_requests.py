@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 
 from fetch_hand_sim.episodes.perturbations import bounded_wrench
@@ -26,14 +26,13 @@ from fetch_hand_sim.view.requests import (
     SetSpeed,
     StepOnce,
 )
+from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_message
 from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
-
-Array = NDArray[np.float64]
 
 # Seconds a goal is shown before the robot confirms it.
 _GOAL_PATIENCE = 0.5
@@ -114,14 +113,12 @@ class RobotRequests:
         self._sim.call('step', 'std_srvs/srv/Trigger')
 
     def _reset(self, request: Reset) -> None:
-        seed = request.seed
-        if seed is None:
-            self._sim.call('reset', 'std_srvs/srv/Trigger')
+        reset = partial(self._sim.call, 'reset', 'std_srvs/srv/Trigger')
+        if request.seed is None:
+            reset()
         else:
             # The seed holds for the next episode, so it has to be there first.
-            self._sim.set_parameter(
-                'seed', seed, lambda: self._sim.call('reset', 'std_srvs/srv/Trigger')
-            )
+            self._sim.set_parameter('seed', request.seed, reset)
 
     def _set_speed(self, request: SetSpeed) -> None:
         self._sim.set_parameter('real_time_factor', float(request.factor))

@@ -10,11 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 
 from fetch_hand_sim.simulation.scene import Frame
+from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode_status
 from msgs_spec.robots import JOINT_PREFIX
@@ -22,8 +21,6 @@ from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import QosSpec, TopicSpec, topic
-
-Array = NDArray[np.float64]
 
 # Nothing is sent twice for a viewer.
 WATCHING = QosSpec(depth=5, reliability='best_effort', durability='volatile')
@@ -59,6 +56,9 @@ class RobotWatch:
         node: Of this process.
         on_status: Gets what the robot says of its episode; the task may be another one.
         on_tick: Gets every tick.
+
+    Attributes:
+        status: The latest status; None until there is a robot.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class RobotWatch:
         self._node = node
         self._on_status = on_status
         self._on_tick = on_tick
-        self._status: EpisodeStatus | None = None
+        self.status: EpisodeStatus | None = None
         self._values: dict[str, Array] = {}
         self._stamp_ns = 0
         self._subscriptions: list[Any] = []
@@ -78,20 +78,15 @@ class RobotWatch:
         self.subscribe(status, status.qos, self._take_status)
 
     @property
-    def status(self) -> EpisodeStatus | None:
-        """The latest status; None until there is a robot."""
-        return self._status
-
-    @property
     def spec(self) -> TaskSpec | None:
         """The robot's task; None until there is one."""
-        status = self._status
+        status = self.status
         return task_spec(status.task, status.joint_prefix, status.control_hz) if status else None
 
     @property
     def joint_prefix(self) -> str:
         """What the names of the robot's joints begin with."""
-        return self._status.joint_prefix if self._status else JOINT_PREFIX
+        return self.status.joint_prefix if self.status else JOINT_PREFIX
 
     def subscribe(
         self, source: TopicSpec, qos: QosSpec, callback: Callable[[Any], None], raw: bool = False
@@ -109,9 +104,9 @@ class RobotWatch:
             spec = task_spec(status.task, status.joint_prefix, status.control_hz)
         except ValueError:
             return
-        if self._status is None or self._status.task != status.task:
+        if self.status is None or self.status.task != status.task:
             self._follow(spec)
-        self._status = status
+        self.status = status
         self._on_status(status)
         if status.phase == 'reset':
             self._finish_tick()

@@ -168,6 +168,15 @@ def _check_guarded(address: Address) -> None:
         return
 
 
+def announce(address: Address, wants_browser: bool) -> None:
+    """Prints the address and opens it where a browser could show itself."""
+    if address.warning:
+        print(f'Warning: {address.warning}', flush=True)
+    print(f'The page is at {address.url} (Ctrl-C ends)', flush=True)
+    if wants_browser and has_display():
+        open_browser(address.url)
+
+
 def has_display() -> bool:
     """Whether a browser could show itself."""
     if not sys.platform.startswith('linux'):

@@ -18,8 +18,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from fetch_hand_sim.simulation.scene import Marker as Shape
 from fetch_hand_sim.simulation.urdf import ROOT
 from fetch_hand_sim.visualization_node.transforms import Transform
-
-Array = NDArray[np.float64]
+from msgs_spec.arrays import Array
 
 _GEOM = mujoco.mjtGeom
 _SHAPES = {

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.scene import Frame, View
 from fetch_hand_sim.simulation.urdf import ROOT, Pose, RobotDescription
+from msgs_spec.arrays import Array
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import GoalKind, task_spec
-
-Array = NDArray[np.float64]
 
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -67,12 +65,10 @@ class Transforms:
     def _goal(self, goal: Array) -> list[Transform]:
         if self._spec.goal is GoalKind.POSE:
             return [self._pose('goal', goal)]
-        if self._spec.goal is GoalKind.POINT:
-            return [self._pose('goal', np.concatenate([goal, _IDENTITY]))]
-        points = zip(FINGERTIPS, goal.reshape(-1, 3), strict=True)
-        return [
-            self._pose(f'goal_{name}', np.concatenate([point, _IDENTITY])) for name, point in points
-        ]
+        is_point = self._spec.goal is GoalKind.POINT
+        names = ['goal'] if is_point else [f'goal_{name}' for name in FINGERTIPS]
+        points = zip(names, goal.reshape(-1, 3), strict=True)
+        return [self._pose(name, np.concatenate([point, _IDENTITY])) for name, point in points]
 
     def _pose(self, name: str, pose: Array) -> Transform:
         return self._between(ROOT, name, Pose(pose[:3], pose[3:]))

@@ -7,12 +7,10 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 from mujoco.studio import messages, ux
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.scene import GHOST
 from fetch_hand_sim.view.page.ray import Ray
-
-Array = NDArray[np.float64]
+from msgs_spec.arrays import Array
 
 _FORCES = mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
 _TRANSLATE = mujoco.mjtPertBit.mjPERT_TRANSLATE.value

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.scene import ghost_pose
 from fetch_hand_sim.view.page.ray import Ray
+from msgs_spec.arrays import Array
 from msgs_spec.rotations import quaternion_from_axis_angle, quaternion_multiply
 from msgs_spec.tasks import GoalKind, TaskSpec
-
-Array = NDArray[np.float64]
 
 # How near the mouse must be to a goal to take it, metres.
 _REACH = {GoalKind.POINT: 0.035, GoalKind.FINGERTIPS: 0.009, GoalKind.POSE: 0.045}
@@ -44,12 +42,8 @@ def handles(spec: TaskSpec, goal: Array) -> list[Handle]:
 
 def find_handle(spec: TaskSpec, goal: Array, ray: Ray) -> Handle | None:
     """Returns the handle under the mouse, the nearest of several, or None."""
-    near = [
-        (ray.distance_to(each.position), number, each)
-        for number, each in enumerate(handles(spec, goal))
-    ]
-    distance, _, handle = min(near)
-    return handle if distance < _REACH[spec.goal] else None
+    nearest = min(handles(spec, goal), key=lambda each: ray.distance_to(each.position))
+    return nearest if ray.distance_to(nearest.position) < _REACH[spec.goal] else None
 
 
 def moved_goal(

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
-from numpy.typing import NDArray
 
 from fetch_hand_sim.view.page.windows import ITEM_WIDTH, Send
 from fetch_hand_sim.view.requests import ReleaseGoal, SetGoal
+from msgs_spec.arrays import Array
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler
 from msgs_spec.tasks import GoalKind, TaskSpec
-
-Array = NDArray[np.float64]
 
 # Where goals make sense, metres: about where the tasks draw theirs.
 _FETCH_RANGES = ((1.05, 1.6), (0.4, 1.1), (0.42, 0.9))

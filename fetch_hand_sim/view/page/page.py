@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 from mujoco.studio import messages, plugin, ux
 from mujoco.studio.dear_imgui import dear_imgui as imgui
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.rendering import make_options
 from fetch_hand_sim.simulation.scene import Frame, Scene
@@ -20,8 +19,7 @@ from fetch_hand_sim.view.page.panels import Panels
 from fetch_hand_sim.view.page.ray import MousePlace, Ray, mouse_ray
 from fetch_hand_sim.view.picture import Picture, ShowScene
 from fetch_hand_sim.view.requests import LatestRequest, Request, SetGoal
-
-Array = NDArray[np.float64]
+from msgs_spec.arrays import Array
 
 
 @dataclasses.dataclass(slots=True)
@@ -167,7 +165,5 @@ class Page(plugin.ViewerPlugin):
             self._send(SetGoal(goal, is_kept=self._panels.keeps_goal))
 
     def _ray(self, place: MousePlace) -> Ray:
-        camera = self.viewer.camera
-        view = (np.array(camera.lookat), camera.distance, camera.azimuth, camera.elevation)
         fovy = float(self.viewer.model.vis.global_.fovy)
-        return mouse_ray(view, fovy, (place.x, place.y), place.aspect)
+        return mouse_ray(self.viewer.camera, fovy, place)

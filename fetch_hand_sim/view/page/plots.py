@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
-from numpy.typing import NDArray
 
 from fetch_hand_sim.view.picture import Graphs, Series
 from msgs_spec.tasks import TaskSpec
-
-Array = NDArray[np.float64]
 
 _HEIGHT = 130.0
 _SECONDS = 8.0

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from fetch_hand_sim.simulation.scene import View
+from msgs_spec.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,27 +61,21 @@ class Ray:
         return self.origin + along * self.direction if along > 0.0 else None
 
 
-def mouse_ray(
-    camera: tuple[Array, float, float, float],
-    fovy: float,
-    position: tuple[float, float],
-    aspect: float,
-) -> Ray:
+def mouse_ray(camera: View | mujoco.MjvCamera, fovy: float, mouse: MousePlace) -> Ray:
     """Returns the ray under the mouse.
 
     Args:
-        camera: Point looked at (3,) m, distance m, azimuth and elevation in degrees.
-        fovy: Vertical field of view, degrees.
-        position: Of the mouse, 0 ... 1 from the left and from the top.
-        aspect: Width of the picture divided by its height.
+        camera: A free camera.
+        fovy: Its vertical field of view, degrees.
+        mouse: Where the mouse is.
     """
-    lookat, distance, azimuth, elevation = camera
-    a, e = np.radians(azimuth), np.radians(elevation)
+    a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
     forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([np.sin(a), -np.cos(a), 0.0])
     up = np.cross(right, forward)
     half = np.tan(np.radians(fovy) / 2.0)
-    x, y = (2.0 * position[0] - 1.0) * half * aspect, (1.0 - 2.0 * position[1]) * half
+    x, y = (2.0 * mouse.x - 1.0) * half * mouse.aspect, (1.0 - 2.0 * mouse.y) * half
     direction = forward + x * right + y * up
     direction /= np.linalg.norm(direction)
-    return Ray(np.asarray(lookat) - distance * forward, direction, forward, right, up)
+    origin = np.array(camera.lookat) - camera.distance * forward
+    return Ray(origin, direction, forward, right, up)

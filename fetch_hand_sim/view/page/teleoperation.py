@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from msgs_spec.actions import resting_command
+from msgs_spec.arrays import Array
 from msgs_spec.robots import CommandPart, RobotSpec
-
-Array = NDArray[np.float64]
 
 # Seconds in which a key that is held moves a slider from end to end.
 _SWEEP = 2.0

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
-from fetch_hand_sim.simulation.simulation import Array, Seeds
+from fetch_hand_sim.simulation.simulation import Seeds
+from msgs_spec.arrays import Array
 from policy_node.training.learning.config_rules import require_idle_gripper
 
 # The idle part of the action, and the value above which it is the gamble.

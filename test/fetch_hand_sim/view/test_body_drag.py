@@ -13,7 +13,7 @@ from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rendering import make_options, simulation_frame
 from fetch_hand_sim.simulation.scene import GHOST, Scene
 from fetch_hand_sim.view.page.body_drag import BodyDrag, can_be_pulled, pulls
-from fetch_hand_sim.view.page.ray import mouse_ray
+from fetch_hand_sim.view.page.ray import MousePlace, mouse_ray
 from fetch_hand_sim.view.requests import Push
 from fetch_hand_sim.view.session import Requests
 from msgs_spec.tasks import TASKS
@@ -38,9 +38,7 @@ class Window:
         self.drag = BodyDrag(self.perturb)
 
     def ray_at(self, point):
-        view = self.scene.view
-        camera = (np.array(view.lookat), view.distance, view.azimuth, view.elevation)
-        center = mouse_ray(camera, 45.0, (0.5, 0.5), ASPECT)
+        center = mouse_ray(self.scene.view, 45.0, MousePlace(0.5, 0.5, ASPECT))
         toward = point - center.origin
         return dataclasses.replace(center, direction=toward / np.linalg.norm(toward))
 

@@ -6,19 +6,19 @@ import mujoco
 import numpy as np
 import pytest
 
-from fetch_hand_sim.simulation.scene import Scene, ghost_pose
+from fetch_hand_sim.simulation.scene import Scene, View, ghost_pose
 from fetch_hand_sim.view.page.goal_drag import find_handle, handles, moved_goal
-from fetch_hand_sim.view.page.ray import mouse_ray
+from fetch_hand_sim.view.page.ray import MousePlace, mouse_ray
 from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TASKS
 
-VIEW = (np.array([1.3, 0.75, 0.5]), 1.8, 132.0, -20.0)
+VIEW = View((1.3, 0.75, 0.5), 1.8, 132.0, -20.0)
 ASPECT = 1.5
 
 
 def project(point, fovy=45.0):
     """Where a point appears, 0 ... 1 from the left and top: the inverse of `mouse_ray`."""
-    center = mouse_ray(VIEW, fovy, (0.5, 0.5), ASPECT)
+    center = mouse_ray(VIEW, fovy, MousePlace(0.5, 0.5, ASPECT))
     offset = point - center.origin
     depth = offset @ center.forward
     half = np.tan(np.radians(fovy) / 2.0)
@@ -27,13 +27,13 @@ def project(point, fovy=45.0):
 
 
 def ray_at(point):
-    return mouse_ray(VIEW, 45.0, project(point), ASPECT)
+    return mouse_ray(VIEW, 45.0, MousePlace(*project(point), ASPECT))
 
 
 def test_rays_agree_with_the_camera_of_mujoco():
     model = Scene('FetchReach').model
     scene, camera = mujoco.MjvScene(model, 1000), mujoco.MjvCamera()
-    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = VIEW
+    VIEW.apply(camera)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     category = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -41,7 +41,7 @@ def test_rays_agree_with_the_camera_of_mujoco():
         model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), camera, category, scene
     )
     eyes = scene.camera
-    ray = mouse_ray(VIEW, 45.0, (0.5, 0.5), ASPECT)
+    ray = mouse_ray(VIEW, 45.0, MousePlace(0.5, 0.5, ASPECT))
     np.testing.assert_allclose(ray.direction, eyes[0].forward, atol=1e-6)
     np.testing.assert_allclose(ray.up, eyes[0].up, atol=1e-6)
     middle = (np.array(eyes[0].pos) + np.array(eyes[1].pos)) / 2.0

@@ -21,7 +21,7 @@ from PIL import Image
 from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.simulation.scene import Scene
-from fetch_hand_sim.view.page.ray import mouse_ray
+from fetch_hand_sim.view.page.ray import MousePlace, mouse_ray
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode
 from msgs_spec.tasks import TASKS
@@ -93,10 +93,8 @@ def wait_for(browser: Browser, condition: Callable[[np.ndarray], bool], what: st
 
 def place_of(task: str, point: np.ndarray) -> tuple[float, float]:
     """Where a point of the world is on the page, pixels."""
-    view = Scene(task).view
-    camera = (np.array(view.lookat), view.distance, view.azimuth, view.elevation)
     width, height = SIZE[0], SIZE[1] - BAR
-    ray = mouse_ray(camera, 45.0, (0.5, 0.5), width / height)
+    ray = mouse_ray(Scene(task).view, 45.0, MousePlace(0.5, 0.5, width / height))
     offset = point - ray.origin
     depth = offset @ ray.forward
     half = np.tan(np.radians(45.0) / 2.0)

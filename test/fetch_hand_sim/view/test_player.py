@@ -9,8 +9,7 @@ import pytest
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import load_episode
-from fetch_hand_sim.films.recording import load_recording
-from fetch_hand_sim.view.file_session import find_playable
+from fetch_hand_sim.films.recording import find_playable, load_recording
 from fetch_hand_sim.view.player import Player
 from fetch_hand_sim.view.requests import (
     ChangeEpisode,

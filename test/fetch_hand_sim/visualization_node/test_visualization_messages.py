@@ -17,7 +17,7 @@ from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rendering import simulation_frame
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.simulation.urdf import ROOT, Pose
-from fetch_hand_sim.view.page.ray import mouse_ray
+from fetch_hand_sim.view.page.ray import MousePlace, mouse_ray
 from fetch_hand_sim.visualization_node.camera import Camera
 from fetch_hand_sim.visualization_node.messages import (
     camera_info,
@@ -128,8 +128,7 @@ def test_the_camera_says_where_a_point_is_seen():
     pose = view_transform(view, 'camera').pose
     x, y, z = quaternion_to_matrix(pose.quaternion).T @ (point - pose.position)
     u, v = info.k[0] * x / z + info.k[2], info.k[4] * y / z + info.k[5]
-    camera = (np.array(view.lookat), view.distance, view.azimuth, view.elevation)
-    ray = mouse_ray(camera, 45.0, (u / width, v / height), width / height)
+    ray = mouse_ray(view, 45.0, MousePlace(u / width, v / height, width / height))
     assert ray.distance_to(point) < 1e-6
 
 

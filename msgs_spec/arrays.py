@@ -1,0 +1,9 @@
+"""The array that nearly everything here computes with."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Positions, commands, rewards: float64 throughout, as MuJoCo computes.
+Array = NDArray[np.float64]
