@@ -25,7 +25,6 @@ from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import (
     Episode,
     EpisodeOutcome,
-    EpisodeReadError,
     EpisodeRecord,
     read_episode,
 )
@@ -188,11 +187,13 @@ class Demo:
             self._known.add(path)
             try:
                 episode = read_episode(path)
-            except EpisodeReadError:
+                row = _row(episode, path)
+            except ValueError:
+                # Unreadable, or not of this project.
                 continue
             self._outcomes.append(episode.outcome)
             (console or self._console).print(
-                printable(_row(episode, path)), markup=False, highlight=False, soft_wrap=True
+                printable(row), markup=False, highlight=False, soft_wrap=True
             )
 
     def _print_summary(self, seconds: float) -> None:
