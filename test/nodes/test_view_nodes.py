@@ -9,6 +9,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 
@@ -242,6 +243,69 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
         assert small.shape == picture.shape and small.std() > 10.0
     node.send_signal(signal.SIGINT)
     assert node.wait(10) == 0
+
+
+def test_who_comes_while_the_robot_stands_still_sees_the_last_tick(start_process: Start) -> None:
+    from sensor_msgs.msg import Image
+    from std_srvs.srv import SetBool
+
+    robot = start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    node = start_process(*VISUALIZATION, *ros_args(camera_width=64, camera_height=48))
+    (distance, *_) = scalar_topics(REACH)
+    kinds = {
+        name: ros_message_class(type_name)
+        for name, type_name in (
+            ('goal_markers', 'visualization_msgs/msg/MarkerArray'),
+            (distance.name, distance.type_name),
+            ('/tf', 'tf2_msgs/msg/TFMessage'),
+        )
+        # PyPI has no tf2_msgs.
+        if name != '/tf' or find_spec('tf2_msgs') is not None
+    }
+    try:
+        prepare_opengl()
+        kinds['camera/image_raw'] = Image
+    except RuntimeError:
+        pass
+    with client(REACH) as connection:
+        connection.subscribe('achieved_goal')
+        scalars, pictures = [], []
+        kind, profile = kinds[distance.name], rclpy_profile(distance.qos)
+        connection.node.create_subscription(kind, distance.name, scalars.append, profile)
+        connection.node.create_subscription(Image, 'camera/image_raw', pictures.append, profile)
+        connection.spin_until(lambda: len(scalars) > 5, 'scalars')
+        if Image in kinds.values():
+            connection.spin_until(lambda: len(pictures) > 2, 'pictures')
+        assert connection.call(SetBool, '/sim_node/pause', data=True).success
+        connection.spin(1.0)
+        last = connection.stamps('achieved_goal')[-1]
+        # Who has been there: pictures are fewer than ticks, but the last one is of the last tick.
+        assert [message_stamp(each) for each in pictures[-1:]] in ([], [last])
+        seen = {}
+
+        def subscribe(name):
+            def keep(message):
+                parts = getattr(message, 'markers', getattr(message, 'transforms', [message]))
+                seen[name] = message_stamp(parts[-1])
+
+            connection.node.create_subscription(kinds[name], name, keep, profile)
+
+        for name in kinds:
+            subscribe(name)
+        connection.spin_until(lambda: len(seen) == len(kinds), 'last tick, once more')
+        assert seen == dict.fromkeys(kinds, last)
+        # And once only.
+        connection.spin(1.5)
+        count = len(scalars)
+        connection.spin(1.5)
+        assert len(scalars) == count
+        # Nothing is said of a robot that is gone.
+        end(robot)
+        seen.clear()
+        subscribe('goal_markers')
+        connection.spin(3.0)
+        assert not seen
+    end(node)
 
 
 def test_without_opengl_the_camera_says_so_and_the_rest_goes_on(
