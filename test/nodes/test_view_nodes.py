@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -32,9 +33,9 @@ from fetch_hand_sim.view.requests import (
     StepOnce,
 )
 from msgs_spec.codecs import decode, message_stamp
-from msgs_spec.ros import rclpy_profile, ros_message_class
+from msgs_spec.ros import EventLoop, rclpy_profile, ros_message_class
 from msgs_spec.tasks import task_spec
-from msgs_spec.topics import topic
+from msgs_spec.topics import LATCHED, topic
 from msgs_spec.view_topics import scalar_topics
 from support.graph import POLICY_NODE, SIM_NODE, client, end, ros_args
 
@@ -201,7 +202,7 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
     from std_msgs.msg import String
     from visualization_msgs.msg import MarkerArray
 
-    from msgs_spec.topics import LATCHED, STATE
+    from msgs_spec.topics import STATE
 
     start_process(*SIM_NODE, *ros_args(task='FetchReach'))
     parameters = ros_args(camera_width=64, camera_height=48, camera_hz=5.0)
@@ -306,6 +307,66 @@ def test_who_comes_while_the_robot_stands_still_sees_the_last_tick(start_process
         connection.spin(3.0)
         assert not seen
     end(node)
+
+
+@pytest.mark.parametrize('simulated_time', [False, True])
+def test_another_robot_in_the_same_place_is_followed(
+    start_process: Start, simulated_time: bool
+) -> None:
+    """Its goals come on the same topics with another type."""
+    from std_msgs.msg import String
+
+    node = start_process(*VISUALIZATION, *ros_args(use_sim_time=simulated_time))
+    for task in ('HandReach', 'FetchPush', 'HandManipulateEggFull'):
+        spec = task_spec(task)
+        robot = start_process(*SIM_NODE, *ros_args(task=task))
+        with client(spec) as connection:
+            connection.subscribe('joint_states')
+            stamps, descriptions = [], []
+            reward = next(each for each in scalar_topics(spec) if each.name == 'scalars/reward')
+            for kind, name, profile, take in (
+                (
+                    ros_message_class(reward.type_name),
+                    reward.name,
+                    reward.qos,
+                    lambda message, stamps=stamps: stamps.append(message_stamp(message)),
+                ),
+                (String, 'robot_description', LATCHED, descriptions.append),
+            ):
+                connection.node.create_subscription(kind, name, take, rclpy_profile(profile))
+
+            def is_followed(spec=spec, stamps=stamps, descriptions=descriptions, c=connection):
+                joints = f'"{spec.robot.joints[-1]}"'
+                is_described = descriptions and joints in descriptions[-1].data
+                return is_described and len(set(stamps).intersection(c.stamps('joint_states'))) > 10
+
+            connection.spin_until(is_followed, f'scalars of {task}')
+        end(robot)
+    end(node)
+
+
+def test_a_viewer_sees_another_robot_in_the_same_place(start_process: Start) -> None:
+    """Served as the page is."""
+    rclpy.init()
+    node = rclpy.create_node('viewer')
+    viewer, loop = LiveRobot(node, may_command=True), EventLoop(node)
+    try:
+        for task, size in (('HandReach', 15), ('FetchPush', 3), ('HandManipulateEggFull', 7)):
+            robot = start_process(*SIM_NODE, *ros_args(task=task))
+            deadline = time.monotonic() + 30.0
+            goal = np.zeros(0)
+            while goal.size != size:
+                assert time.monotonic() < deadline, f'no picture of {task}'
+                loop.wait(0.05)
+                picture = viewer.picture()
+                if picture is not None and picture.frame is not None:
+                    goal = picture.frame.desired_goal
+            viewer.perform(SetGoal(goal))
+            end(robot)
+    finally:
+        loop.close()
+        node.destroy_node()
+        rclpy.shutdown()
 
 
 def test_without_opengl_the_camera_says_so_and_the_rest_goes_on(
