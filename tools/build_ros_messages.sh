@@ -1,6 +1,6 @@
 #!/bin/sh
 # Builds tf2_msgs and simulation_interfaces, which PyPI lacks, for the ROS wheels of an environment,
-# from Jazzy's public sources (a few minutes; needs git, cmake, make, g++ and Python's headers).
+# from Jazzy's public sources (minutes; needs git, cmake, make, g++ and Python's headers).
 # tools/build_ros_messages.sh PREFIX; VENV=... chooses the environment, which is left as it is.
 set -eu
 if [ $# -ne 1 ]; then
