@@ -1,8 +1,8 @@
 """The services of `simulation_interfaces`, translated to what a `Robot` offers.
 
 That package belongs to ROS and is not on PyPI, so nothing of it is imported: requests and responses
-come from rclpy, and the list of features from its `SimulatorFeatures`. Constants are those of
-release 2.0.0.
+come from rclpy, and the list of features from its `SimulatorFeatures`. Constants are those of all
+releases from 1.0.0 to 2.1.0; Jazzy has 1.5.1.
 """
 
 from __future__ import annotations
@@ -10,14 +10,19 @@ from __future__ import annotations
 from typing import Any
 
 from fetch_hand_sim.sim_node.robot import Answer, Robot
+from msgs_spec.services import MAX_STEPS
 
 PLAYING, PAUSED = 1, 2
+# What the list of features has no word for.
+CUSTOM_INFO = (
+    'One fixed scene; states are playing and paused; time never goes back, also over resets; '
+    f'at most {MAX_STEPS} steps per call.'
+)
 # The default is to reset all.
 SCOPE_DEFAULT, SCOPE_STATE, SCOPE_ALL = 0, 2, 255
 FEATURE_UNSUPPORTED, OK, OPERATION_FAILED = 0, 1, 4
 ALREADY_IN_TARGET_STATE = 101
 
-# Older releases lack some of these and number the others differently.
 FEATURES = (
     'SIMULATION_RESET',
     'SIMULATION_RESET_STATE',
@@ -46,7 +51,7 @@ class SimulationInterfaces:
         """Lists what is supported."""
         del request
         response.features.features = self._features
-        response.features.custom_info = 'One fixed scene; time never goes back, also over resets.'
+        response.features.custom_info = CUSTOM_INFO
         return response
 
     def get_simulation_state(self, request: Any, response: Any) -> Any:
@@ -71,8 +76,11 @@ class SimulationInterfaces:
             line = f'scope {request.scope} asked for; allowed: {SCOPE_STATE} (state), '
             line += f'{SCOPE_DEFAULT} and {SCOPE_ALL} (all but time, which never goes back)'
             return _finish(response, FEATURE_UNSUPPORTED, line)
-        answer = self._robot.reset(to_first_episode=request.scope != SCOPE_STATE)
-        return _answer(response, answer)
+        if request.scope == SCOPE_STATE:
+            return _answer(response, self._robot.reset())
+        answer = self._robot.reset(to_first_episode=True)
+        # All but what the scope has by its definition.
+        return _answer(response, Answer(answer.success, f'{answer.message}; time goes on'))
 
     def step_simulation(self, request: Any, response: Any) -> Any:
         """Runs the given number of ticks, which are control periods, while paused."""

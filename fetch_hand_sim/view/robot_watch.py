@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from fetch_hand_sim.simulation.scene import Frame
@@ -30,6 +32,9 @@ ANY_TASK = next(iter(TASKS.values()))
 _FIRST, _LAST = 'joint_states', 'applied_command'
 _NEEDED = (_FIRST, 'desired_goal', 'achieved_goal', 'is_success')
 _STATE = (*_NEEDED, 'reward', _LAST)
+# Seconds between leaving the topics of a robot and subscribing to those of another: until a topic
+# is let go of, which the executor does after the callback, it cannot have another type.
+_CHANGE_TIME = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +79,7 @@ class RobotWatch:
         self._values: dict[str, Array] = {}
         self._stamp_ns = 0
         self._subscriptions: list[Any] = []
+        self._change: Any = None
         status = topic(ANY_TASK, 'episode_status')
         self.subscribe(status, status.qos, self._take_status)
 
@@ -112,9 +118,27 @@ class RobotWatch:
             self._finish_tick()
 
     def _follow(self, spec: TaskSpec) -> None:
+        self._values = {}
+        if not self._subscriptions and self._change is None:
+            self._subscribe_to(spec)
+            return
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
-        self._values = {}
+        self._subscriptions = []
+        self._end_change()
+        # Of wall time: a node that follows simulated time has none of a robot that is gone.
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._change = self._node.create_timer(
+            _CHANGE_TIME, lambda: self._subscribe_to(spec), clock=clock
+        )
+
+    def _end_change(self) -> None:
+        if self._change is not None:
+            self._node.destroy_timer(self._change)
+            self._change = None
+
+    def _subscribe_to(self, spec: TaskSpec) -> None:
+        self._end_change()
         names = [*_STATE, *(['object_pose'] if spec.has_object else [])]
         self._subscriptions = [
             self.subscribe(source, WATCHING, self._collector(source), raw=True)

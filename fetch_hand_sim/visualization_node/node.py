@@ -28,6 +28,7 @@ from fetch_hand_sim.visualization_node.transforms import (
     frame_prefix,
     view_transform,
 )
+from msgs_spec.listeners import Listeners
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.ros import (
     BEAT,
@@ -47,6 +48,8 @@ _PICTURES: dict[str, Callable[[NDArray[np.uint8], str, int], Any]] = {
     'camera/image_raw': image_message,
     'camera/image_raw/compressed': compressed_message,
 }
+# Seconds without a tick after which a robot counts as one that stands still.
+_STILL = 0.5
 # Callbacks served before a picture is drawn, which takes as long as some ticks do.
 _SERVED_FIRST = 200
 
@@ -66,10 +69,16 @@ class VisualizationNode(Node):
         self._scalars: Scalars | None = None
         self._success_rule = ''
         self._latest: SeenTick | None = None
+        # The same, until it has been sent as markers and as a picture.
+        self._unmarked: SeenTick | None = None
+        self._undrawn: SeenTick | None = None
+        self._ticked_at = 0.0
         self._prefix = frame_prefix(self.get_namespace())
         self._outputs: dict[str, Any] = {}
         for source in SHOWN:
             self._open(source)
+        self._listeners = Listeners(self, self._outputs.values())
+        self._has_newcomer = False
         self._camera = Camera(
             settings['camera_width'],
             settings['camera_height'],
@@ -86,6 +95,7 @@ class VisualizationNode(Node):
                 loop.wait(BEAT)
                 loop.serve_pending(_SERVED_FIRST)
                 self._show_latest()
+                self._repeat_for_newcomers()
         finally:
             self._camera.close()
             loop.close()
@@ -119,12 +129,13 @@ class VisualizationNode(Node):
     def _begin(self, spec: TaskSpec) -> None:
         """Takes another robot."""
         self._camera.close()
-        self._latest = self._scalars = None
+        self._latest = self._unmarked = self._undrawn = self._scalars = None
         self._scene = Scene(spec.name)
         self._transforms = Transforms(spec.name, self._prefix)
         for source in scalar_topics(spec):
             if source.name not in self._outputs:
                 self._open(source)
+        self._listeners = Listeners(self, self._outputs.values())
         urdf = self._transforms.description.to_xml(self._prefix, self._watch.joint_prefix)
         description = self._outputs['robot_description']
         description.publish(description.msg_type(data=urdf))
@@ -138,7 +149,8 @@ class VisualizationNode(Node):
             self._send_transforms('/tf', self._transforms.moving(tick.frame), tick.stamp_ns)
         for name, data in self._scalars.messages(tick).items():
             self._outputs[name].publish(data)
-        self._latest = tick
+        self._latest = self._unmarked = self._undrawn = tick
+        self._ticked_at = time.monotonic()
 
     def _send_transforms(self, name: str, transforms: list[Transform], stamp_ns: int) -> None:
         output = self._outputs.get(name)
@@ -147,16 +159,31 @@ class VisualizationNode(Node):
 
     def _show_latest(self) -> None:
         """Sends what need not come with every tick: markers and pictures."""
-        tick, scene = self._latest, self._scene
-        if tick is None or scene is None:
+        scene = self._scene
+        if scene is None:
             return
-        self._latest = None
-        if self._has_listener('goal_markers'):
+        tick, self._unmarked = self._unmarked, None
+        if tick is not None and self._has_listener('goal_markers'):
             markers = marker_array(scene.markers(tick.frame), tick.stamp_ns)
             self._outputs['goal_markers'].publish(markers)
+        tick = self._undrawn
+        if tick is None or not self._camera.is_due:
+            return
         wanted = [name for name in _PICTURES if self._has_listener(name)]
-        if wanted and self._camera.is_due:
+        self._undrawn = None
+        if wanted:
             self._take_photo(scene, tick, wanted)
+
+    def _repeat_for_newcomers(self) -> None:
+        """Says the last tick again to who comes while the robot stands still."""
+        if self._latest is None or time.monotonic() - self._ticked_at < _STILL:
+            return
+        self._has_newcomer |= self._listeners.update()
+        if self._has_newcomer and self._listeners.are_connected():
+            self._has_newcomer = False
+            # Nothing is said in the name of a robot that is gone.
+            if self.count_publishers('joint_states'):
+                self._on_tick(self._latest)
 
     def _take_photo(self, scene: Scene, tick: SeenTick, wanted: list[str]) -> None:
         try:

@@ -7,8 +7,10 @@ import re
 import signal
 import subprocess
 import sys
+import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 
@@ -31,9 +33,9 @@ from fetch_hand_sim.view.requests import (
     StepOnce,
 )
 from msgs_spec.codecs import decode, message_stamp
-from msgs_spec.ros import rclpy_profile, ros_message_class
+from msgs_spec.ros import EventLoop, rclpy_profile, ros_message_class
 from msgs_spec.tasks import task_spec
-from msgs_spec.topics import topic
+from msgs_spec.topics import LATCHED, topic
 from msgs_spec.view_topics import scalar_topics
 from support.graph import POLICY_NODE, SIM_NODE, client, end, ros_args
 
@@ -200,7 +202,7 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
     from std_msgs.msg import String
     from visualization_msgs.msg import MarkerArray
 
-    from msgs_spec.topics import LATCHED, STATE
+    from msgs_spec.topics import STATE
 
     start_process(*SIM_NODE, *ros_args(task='FetchReach'))
     parameters = ros_args(camera_width=64, camera_height=48, camera_hz=5.0)
@@ -242,6 +244,129 @@ def test_standard_tools_get_what_they_need(start_process: Start) -> None:
         assert small.shape == picture.shape and small.std() > 10.0
     node.send_signal(signal.SIGINT)
     assert node.wait(10) == 0
+
+
+def test_who_comes_while_the_robot_stands_still_sees_the_last_tick(start_process: Start) -> None:
+    from sensor_msgs.msg import Image
+    from std_srvs.srv import SetBool
+
+    robot = start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    node = start_process(*VISUALIZATION, *ros_args(camera_width=64, camera_height=48))
+    (distance, *_) = scalar_topics(REACH)
+    kinds = {
+        name: ros_message_class(type_name)
+        for name, type_name in (
+            ('goal_markers', 'visualization_msgs/msg/MarkerArray'),
+            (distance.name, distance.type_name),
+            ('/tf', 'tf2_msgs/msg/TFMessage'),
+        )
+        # PyPI has no tf2_msgs.
+        if name != '/tf' or find_spec('tf2_msgs') is not None
+    }
+    try:
+        prepare_opengl()
+        kinds['camera/image_raw'] = Image
+    except RuntimeError:
+        pass
+    with client(REACH) as connection:
+        connection.subscribe('achieved_goal')
+        scalars, pictures = [], []
+        kind, profile = kinds[distance.name], rclpy_profile(distance.qos)
+        connection.node.create_subscription(kind, distance.name, scalars.append, profile)
+        connection.node.create_subscription(Image, 'camera/image_raw', pictures.append, profile)
+        connection.spin_until(lambda: len(scalars) > 5, 'scalars')
+        if Image in kinds.values():
+            connection.spin_until(lambda: len(pictures) > 2, 'pictures')
+        assert connection.call(SetBool, '/sim_node/pause', data=True).success
+        connection.spin(1.0)
+        last = connection.stamps('achieved_goal')[-1]
+        # Who has been there: pictures are fewer than ticks, but the last one is of the last tick.
+        assert [message_stamp(each) for each in pictures[-1:]] in ([], [last])
+        seen = {}
+
+        def subscribe(name):
+            def keep(message):
+                parts = getattr(message, 'markers', getattr(message, 'transforms', [message]))
+                seen[name] = message_stamp(parts[-1])
+
+            connection.node.create_subscription(kinds[name], name, keep, profile)
+
+        for name in kinds:
+            subscribe(name)
+        connection.spin_until(lambda: len(seen) == len(kinds), 'last tick, once more')
+        assert seen == dict.fromkeys(kinds, last)
+        # And once only.
+        connection.spin(1.5)
+        count = len(scalars)
+        connection.spin(1.5)
+        assert len(scalars) == count
+        # Nothing is said of a robot that is gone.
+        end(robot)
+        seen.clear()
+        subscribe('goal_markers')
+        connection.spin(3.0)
+        assert not seen
+    end(node)
+
+
+@pytest.mark.parametrize('simulated_time', [False, True])
+def test_another_robot_in_the_same_place_is_followed(
+    start_process: Start, simulated_time: bool
+) -> None:
+    """Its goals come on the same topics with another type."""
+    from std_msgs.msg import String
+
+    node = start_process(*VISUALIZATION, *ros_args(use_sim_time=simulated_time))
+    for task in ('HandReach', 'FetchPush', 'HandManipulateEggFull'):
+        spec = task_spec(task)
+        robot = start_process(*SIM_NODE, *ros_args(task=task))
+        with client(spec) as connection:
+            connection.subscribe('joint_states')
+            stamps, descriptions = [], []
+            reward = next(each for each in scalar_topics(spec) if each.name == 'scalars/reward')
+            for kind, name, profile, take in (
+                (
+                    ros_message_class(reward.type_name),
+                    reward.name,
+                    reward.qos,
+                    lambda message, stamps=stamps: stamps.append(message_stamp(message)),
+                ),
+                (String, 'robot_description', LATCHED, descriptions.append),
+            ):
+                connection.node.create_subscription(kind, name, take, rclpy_profile(profile))
+
+            def is_followed(spec=spec, stamps=stamps, descriptions=descriptions, c=connection):
+                joints = f'"{spec.robot.joints[-1]}"'
+                is_described = descriptions and joints in descriptions[-1].data
+                return is_described and len(set(stamps).intersection(c.stamps('joint_states'))) > 10
+
+            connection.spin_until(is_followed, f'scalars of {task}')
+        end(robot)
+    end(node)
+
+
+def test_a_viewer_sees_another_robot_in_the_same_place(start_process: Start) -> None:
+    """Served as the page is."""
+    rclpy.init()
+    node = rclpy.create_node('viewer')
+    viewer, loop = LiveRobot(node, may_command=True), EventLoop(node)
+    try:
+        for task, size in (('HandReach', 15), ('FetchPush', 3), ('HandManipulateEggFull', 7)):
+            robot = start_process(*SIM_NODE, *ros_args(task=task))
+            deadline = time.monotonic() + 30.0
+            goal = np.zeros(0)
+            while goal.size != size:
+                assert time.monotonic() < deadline, f'no picture of {task}'
+                loop.wait(0.05)
+                picture = viewer.picture()
+                if picture is not None and picture.frame is not None:
+                    goal = picture.frame.desired_goal
+            viewer.perform(SetGoal(goal))
+            end(robot)
+    finally:
+        loop.close()
+        node.destroy_node()
+        rclpy.shutdown()
 
 
 def test_without_opengl_the_camera_says_so_and_the_rest_goes_on(

@@ -1,6 +1,7 @@
 """The services of a robot.
 
-Those of `simulation_interfaces` against stand-ins with the fields of its release 2.0.0.
+Those of `simulation_interfaces` against stand-ins with the fields of its releases 1.0.0 to 2.1.0;
+`test_ros_messages.py` has the real ones.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def test_simulation_interfaces_translate_to_the_robot(make):
     for scope in (0, 255):
         case.robot.step(10)
         assert call(services.reset_simulation, scope=scope)[1].endswith(
-            'a tick of its own starts episode 0 with seed 0'
+            'a tick of its own starts episode 0 with seed 0; time goes on'
         )
         case.robot.tick_when_due()
     before, after = case.ticks[0][0], case.ticks[-1][0]
@@ -83,6 +84,9 @@ def test_simulation_interfaces_list_only_features_the_release_knows(make):
 
 def test_services_open_with_and_without_simulation_interfaces(make, monkeypatch):
     """Stand-in modules: the real ones need type support that no wheel has."""
+    package = 'simulation_interfaces'
+    # Where they are installed, as if they were not.
+    monkeypatch.setitem(sys.modules, f'{package}.msg', None)
     case = make()
     opened = {}
     node = SimpleNamespace(create_service=lambda type_, name, call: opened.update({name: call}))
@@ -92,7 +96,6 @@ def test_services_open_with_and_without_simulation_interfaces(make, monkeypatch)
     assert (answer.success, 'pause it first' in answer.message) == (False, True)
 
     types = {spec.type_name.rpartition('/')[2]: object for spec in INTERFACE_SERVICES}
-    package = 'simulation_interfaces'
     monkeypatch.setitem(sys.modules, package, ModuleType(package))
     for name, content in (('msg', {'SimulatorFeatures': Features}), ('srv', types)):
         module = ModuleType(f'{package}.{name}')

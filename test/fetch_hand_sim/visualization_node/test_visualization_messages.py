@@ -16,7 +16,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rendering import simulation_frame
 from fetch_hand_sim.simulation.scene import Scene
-from fetch_hand_sim.simulation.urdf import ROOT, Pose
+from fetch_hand_sim.simulation.urdf import ROOT
 from fetch_hand_sim.view.page.ray import MousePlace, mouse_ray
 from fetch_hand_sim.visualization_node.camera import Camera
 from fetch_hand_sim.visualization_node.messages import (
@@ -29,6 +29,7 @@ from fetch_hand_sim.visualization_node.messages import (
 from fetch_hand_sim.visualization_node.transforms import Transforms, frame_prefix, view_transform
 from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TASKS
+from support.frames import tree
 
 STAMP = 3_000_000_007
 
@@ -41,22 +42,6 @@ def moved_frame(task):
     for _ in range(5):
         simulation.step(rng.uniform(-1, 1, (1, simulation.spec.robot.action_size)))
     return simulation_frame(simulation)
-
-
-def tree(messages):
-    """Where every frame is in the root, from messages alone."""
-    poses = {ROOT: Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))}
-    waiting = list(messages)
-    while waiting:
-        known = [each for each in waiting if each.header.frame_id in poses]
-        assert known, [each.child_frame_id for each in waiting]
-        for each in known:
-            assert each.child_frame_id not in poses, 'two parents'
-            t, r = each.transform.translation, each.transform.rotation
-            pose = Pose(np.array([t.x, t.y, t.z]), np.array([r.w, r.x, r.y, r.z]))
-            poses[each.child_frame_id] = poses[each.header.frame_id] @ pose
-        waiting = [each for each in waiting if each not in known]
-    return poses
 
 
 @pytest.mark.parametrize('task', ['FetchReach', 'FetchPush', 'HandReach', 'HandManipulateEggFull'])
