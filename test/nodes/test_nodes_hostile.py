@@ -70,7 +70,7 @@ def test_flood_of_commands_neither_delays_nor_grows_the_robot(start_process: Sta
     assert int(report['rejected: not finite']) > 100
     assert int(report['commands accepted']) > 100
     # 25 on a machine with a processor to spare; a robot that reads all that comes has next to none.
-    assert rate > 12.5
+    assert rate > 5.0
     assert grown < 20_000
     end(sim)
 
