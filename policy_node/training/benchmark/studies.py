@@ -43,12 +43,24 @@ _FINE_TUNING = {
     'random_epsilon': 0.2,
 }
 _COARSE_FIRST = {'first_distance': 8.0}
+# A pen is dropped by most noise, and a drop that counts as final teaches to hold it only while some
+# goals are met besides.
+_HELD = {
+    'learning_starts': 64_000,
+    'noise_std': 0.1,
+    'random_epsilon': 0.1,
+    'ticks_after_drop': 3,
+    'drop_is_lost': True,
+    'first_rotation': 3.0,
+    'first_distance': 2.0,
+}
 
 
 def start_from(task: str, networks: str) -> dict[str, Any]:
     """Fields of a run that starts from the networks of the task named in `STARTS_FROM`."""
     coarse = _COARSE_FIRST if task_spec(task).position_counts else {}
-    return {**_FINE_TUNING, **coarse, 'init_from': networks}
+    held = _HELD if 'Pen' in task else {}
+    return {**_FINE_TUNING, **coarse, **held, 'init_from': networks}
 
 
 def reduced_budget(task: str) -> dict[str, Any]:
