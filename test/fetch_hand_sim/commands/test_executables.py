@@ -30,4 +30,4 @@ def test_an_unknown_executable_is_named_with_those_there_are():
 
 def test_shipped_actors_are_asked_for_by_task():
     assert is_actor_shipped('FetchReach')
-    assert not is_actor_shipped('HandManipulatePenFull')
+    assert not is_actor_shipped('SomebodysTask')
