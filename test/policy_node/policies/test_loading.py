@@ -98,7 +98,7 @@ def test_no_name_is_the_shipped_actor_of_the_task(monkeypatch: pytest.MonkeyPatc
     # A task of another package has none.
     others = {task: path for task, path in shipped_actors().items() if task != 'HandReach'}
     monkeypatch.setattr(loading, 'shipped_actors', lambda: others)
-    with pytest.raises(ValueError, match='no actor is shipped for HandReach .*FetchReach'):
+    with pytest.raises(ValueError, match=r'no actor is shipped for HandReach .*FetchReach'):
         load_policy('', 'HandReach')
 
 
