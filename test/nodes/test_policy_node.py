@@ -33,7 +33,6 @@ REACH = task_spec('FetchReach')
         ({'policy': 'nosuch'}, "no actor 'nosuch'; shipped: "),
         ({'checkpoint': 'nosuch'}, "no actor 'nosuch'; shipped: "),
         ({'policy': 'FetchReach', 'task': 'HandReach'}, 'trained on FetchReach, not on HandReach'),
-        ({'task': 'HandManipulatePenFull'}, 'no actor is shipped for HandManipulatePenFull'),
     ],
 )
 def test_a_policy_that_is_not_there_is_noticed_before_a_robot_is(
