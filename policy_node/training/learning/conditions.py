@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from policy_node.policies.actor import MLP
@@ -20,6 +21,8 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.replay import Array
 
 Goals = NDArray[np.float64]
+# Of the layer that takes the inputs, in actors and critics alike.
+_WEIGHT, _BIAS = 'hidden.0.weight', 'hidden.0.bias'
 # Thresholds drawn, as shares of the task's own.
 SMALLEST_THRESHOLD, LARGEST_THRESHOLD = 0.5, 8.0
 
@@ -113,7 +116,6 @@ def make_condition(kind: str, metric: GoalMetric) -> Condition | None:
     return None
 
 
-@torch.no_grad()
 def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
     """A network without its last input, which is `value` for good.
 
@@ -123,9 +125,30 @@ def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
         value: That input.
     """
     folded = MLP(shape.feature_size, shape.action_size, shape)
-    state = network.state_dict()
-    weight = state['hidden.0.weight']
-    state['hidden.0.weight'] = weight[:, :-1].clone()
-    state['hidden.0.bias'] = state['hidden.0.bias'] + value * weight[:, -1]
-    folded.load_state_dict(state)
+    folded.load_state_dict(without_input(network.state_dict(), shape.feature_size, value))
     return folded
+
+
+def without_input(tensors: dict[str, Tensor], column: int, value: float) -> dict[str, Tensor]:
+    """Networks, by name, without the input at that column, which is `value` for good."""
+    changed = {}
+    for name in first_weights(tensors):
+        weight, bias = tensors[name], name.replace(_WEIGHT, _BIAS)
+        changed[name] = torch.cat([weight[:, :column], weight[:, column + 1 :]], dim=1)
+        changed[bias] = tensors[bias] + value * weight[:, column]
+    return tensors | changed
+
+
+def with_input(tensors: dict[str, Tensor], column: int) -> dict[str, Tensor]:
+    """Networks, by name, with one input more at that column, to which they are blind."""
+    changed = {}
+    for name in first_weights(tensors):
+        weight = tensors[name]
+        blind = weight.new_zeros((len(weight), 1))
+        changed[name] = torch.cat([weight[:, :column], blind, weight[:, column:]], dim=1)
+    return tensors | changed
+
+
+def first_weights(tensors: dict[str, Tensor]) -> list[str]:
+    """Names of the weights of layers that take the inputs."""
+    return [name for name in tensors if name.endswith(_WEIGHT)]

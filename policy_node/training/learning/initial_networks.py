@@ -14,6 +14,12 @@ from policy_node.policies import checkpoint
 from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.shipped import actor_path
+from policy_node.training.learning.conditions import (
+    ACTING_INPUT,
+    first_weights,
+    with_input,
+    without_input,
+)
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.config_rules import unusual_networks
 from policy_node.training.learning.config_values import config_from_dict
@@ -23,7 +29,6 @@ from policy_node.training.learning.training_state import part_of, read_state
 # Updates of the critic alone where it starts from nothing beside an actor that is already good:
 # the gradient of a critic that knows nothing would ruin it.
 CRITIC_FIRST = 5_000
-_FIRST_WEIGHT = 'hidden.0.weight'
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,27 +74,30 @@ class InitialNetworks:
             raise ValueError(f'{config.task} cannot start from {origin}: {"; ".join(differing)}')
 
     def fitted(self, config: TrainConfig) -> InitialNetworks:
-        """These networks for another run, in which the position of an object may begin to count.
+        """These networks for another run, in which other inputs may begin to count.
 
-        Where it did not count, the goal's position was always about the object's own: networks have
-        learnt nothing from it, and what they do elsewhere is chance (an actor that dropped 1 block
-        in 200 dropped half of them). So they start blind to it: its weights become zero.
+        Where the position of an object did not count, the goal's position was always about the
+        object's own: networks have learnt nothing from it, and what they do elsewhere is chance (an
+        actor that dropped 1 block in 200 dropped half of them). So they start blind to it: its
+        weights become zero. They start blind to a condition as well.
 
         Raises:
             ValueError: If the run cannot start from them; one line names the sizes of both.
         """
         self.require_fit(config)
         before, now, shape = task_spec(self.origin['task']), task_spec(config.task), self.shape
-        if shape.goal_features is None or before.position_counts or not now.position_counts:
-            return self
-        inputs = shape.goal_features.goal_position(shape.observation_size, shape.goal_size)
-        tensors = dict(self.tensors)
-        for name in tensors:
-            # The critic's inputs are the actor's, then the action.
-            if name.endswith(_FIRST_WEIGHT):
-                tensors[name] = tensors[name].clone()
-                tensors[name][:, inputs] = 0.0
-        return replace(self, tensors=tensors)
+        fitted = self
+        # The critic's inputs are the actor's, then the action.
+        if shape.goal_features is not None and now.position_counts and not before.position_counts:
+            inputs = shape.goal_features.goal_position(shape.observation_size, shape.goal_size)
+            changed = {name: self.tensors[name].clone() for name in first_weights(self.tensors)}
+            for weight in changed.values():
+                weight[:, inputs] = 0.0
+            fitted = replace(self, tensors=self.tensors | changed)
+        if config.condition != 'none':
+            tensors = with_input(fitted.tensors, shape.feature_size)
+            fitted = replace(fitted, tensors=tensors)
+        return fitted
 
 
 def network_shape(config: TrainConfig) -> NetworkShape:
@@ -124,13 +132,14 @@ def read_initial_networks(name: str) -> InitialNetworks:
 def _of_run(folder: Path) -> InitialNetworks:
     state = read_state(folder / STATE_FILE)
     config = config_from_dict(state.extra['config'])
-    _require_plain(config, str(folder))
+    _require_usual(config, str(folder))
     kept = ('actor', 'critic', 'target_', 'average_actor', 'observation_stat', 'goal_stat')
     tensors = {
         key: value
         for key, value in state.tensors.items()
         if key.startswith(kept) and '_optimizer.' not in key
     }
+    tensors = _unconditioned(tensors, config)
     origin = {
         'name': str(folder),
         'task': config.task,
@@ -141,7 +150,7 @@ def _of_run(folder: Path) -> InitialNetworks:
     return InitialNetworks(tensors, network_shape(config), config.goal_features, origin)
 
 
-def _require_plain(config: TrainConfig, name: str) -> None:
+def _require_usual(config: TrainConfig, name: str) -> None:
     """Refuses networks of a run that no other run has the like of."""
     if found := unusual_networks(config):
         raise ValueError(f'{name} cannot be started from: {", ".join(found)}')
@@ -161,8 +170,9 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         state = read_state(source)
         if state.extra.get('actor_sha256', digest) != digest:
             raise ValueError(f'{source} is the critic of another actor than {path}')
-        _require_plain(config_from_dict(state.extra['config']), str(source))
-        critic = part_of(state.tensors, 'critic')
+        config = config_from_dict(state.extra['config'])
+        _require_usual(config, str(source))
+        critic = _unconditioned(part_of(state.tensors, 'critic'), config)
         tensors |= {f'critic.{key}': value for key, value in critic.items()}
     origin = {
         'name': name,
@@ -174,6 +184,14 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         'init_from': info.init_from,
     }
     return InitialNetworks(tensors, info.shape, info.goal_features, origin)
+
+
+def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str, Tensor]:
+    """Networks of a run as they are at the condition under which its actor acts."""
+    if config.condition == 'none':
+        return tensors
+    column = network_shape(config).feature_size
+    return without_input(tensors, column, ACTING_INPUT[config.condition])
 
 
 def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:

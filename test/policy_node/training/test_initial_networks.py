@@ -97,6 +97,38 @@ def test_a_position_that_begins_to_count_changes_nothing_at_first(
     assert block.fitted(tiny('HandManipulateBlockRotateParallel')) is block
 
 
+@pytest.mark.parametrize('condition', ['threshold', 'horizon'])
+def test_a_condition_is_new_to_networks_and_folded_when_others_start_from_them(
+    tmp_path: Path, block_run: Path, condition: str
+) -> None:
+    """The same values at every condition to begin with; later those at which the actor acts."""
+    config = tiny('HandManipulateBlockFull', condition=condition, init_from=str(block_run))
+    plain = read_initial_networks(str(block_run)).fitted(tiny('HandManipulateBlockFull'))
+    run = Trainer(
+        config,
+        tmp_path,
+        Workers(),
+        init_from=read_initial_networks(str(block_run)).fitted(config),
+    )
+    acting = {'threshold': 0.0, 'horizon': 1.0}[condition]
+    size = plain.shape.feature_size
+    features, action = torch.randn(8, size), torch.rand(8, 20)
+
+    def said(trainer: Trainer, *inputs: float) -> tuple[torch.Tensor, torch.Tensor]:
+        seen = torch.cat([features, *(torch.full((8, 1), value) for value in inputs)], dim=1)
+        return trainer.learner.actor.network(seen), trainer.learner.critic(seen, action)
+
+    start = Trainer(tiny('HandManipulateBlockFull'), tmp_path, Workers(), init_from=plain)
+    for value in (acting, 0.3, -2.0):
+        torch.testing.assert_close(said(run, value), said(start))
+    run.train()
+    assert run.counters.updates > 0
+    assert not torch.equal(said(run, acting)[1], said(run, -2.0)[1])
+    after = read_initial_networks(str(tmp_path))
+    follower = Trainer(tiny('HandManipulateBlockFull'), tmp_path, Workers(), init_from=after)
+    torch.testing.assert_close(said(follower), said(run, acting))
+
+
 def test_where_it_started_is_kept_through_resume_and_shipped(
     tmp_path: Path, block_run: Path
 ) -> None:
