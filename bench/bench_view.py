@@ -2,7 +2,9 @@
 
 `make bench-view` runs it. Visitors are web sockets that take every picture and draw none; with
 `--browser` a headless Chromium draws as well, on the same processors. In lockstep a policy that
-rests answers every tick, so ticks per second say what is left of the machine.
+rests answers every tick, so ticks per second say what is left of the machine; since that changes by
+itself from one minute to the next, the viewer is stopped (`SIGSTOP`) every other two seconds.
+`taskset -c 0,1 ...` leaves two processors.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from contextlib import ExitStack
 from pathlib import Path
 from threading import Thread
@@ -20,6 +23,7 @@ from threading import Thread
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'bench'), str(ROOT / 'test')]
 
+import numpy as np  # noqa: E402
 import rclpy  # noqa: E402
 from bench_rate import Watcher, report  # noqa: E402
 from websockets.exceptions import ConnectionClosed  # noqa: E402
@@ -30,6 +34,8 @@ from msgs_spec.topics import topic  # noqa: E402
 from msgs_spec.transport import keep_discovery_local  # noqa: E402
 
 VISITORS = 3
+# Seconds of a turn with the viewer or without, and before it until either is under way.
+_TURN, _SETTLING = 2.0, 0.7
 # Seconds after which a process that was told to end is killed.
 _END_TIMEOUT = 20.0
 
@@ -78,53 +84,70 @@ def visit(stack: ExitStack, address: str, number: int) -> None:
     stack.callback(socket.close)
 
 
-def measure(
-    watcher: Watcher, label: str, seconds: float, factor: float, without: float = 0.0
-) -> float:
-    """Watches for a while and prints what was seen; returns ticks per second.
-
-    Args:
-        watcher: Hears the robot.
-        label: What is measured.
-        seconds: How long.
-        factor: Real-time factor; 0 in lockstep.
-        without: Ticks per second without viewers; 0 if this is that.
-    """
+def measure(watcher: Watcher, label: str, seconds: float) -> None:
+    """Watches a robot in real time for a while and prints what was seen."""
     watcher.watch(2.0)
     watcher.times.clear()
     before = watcher.missed
     watcher.watch(seconds)
-    rate = len(watcher.times) / seconds
-    if factor:
-        report(label, watcher.times, watcher.missed - before, factor)
-        return rate
-    share = f', {100.0 * rate / without:.1f} % of without' if without else ''
-    print(f'{label}: {rate:.0f} ticks/s{share}; load average {os.getloadavg()[0]:.1f}', flush=True)
-    return rate
+    report(label, watcher.times, watcher.missed - before, 1.0)
 
 
-def compare(watcher: Watcher, options: argparse.Namespace, factor: float) -> None:
-    """Measures without viewers, with one, its visitors, while it is stopped, and without again."""
-    seconds = options.seconds
-    without = measure(watcher, 'no viewer', seconds, factor)
+def rate(watcher: Watcher, seconds: float) -> float:
+    """Ticks per second from now on."""
+    watcher.watch(_SETTLING)
+    watcher.times.clear()
+    began = time.monotonic()
+    watcher.watch(seconds)
+    return len(watcher.times) / (time.monotonic() - began)
+
+
+def take_turns(watcher: Watcher, seconds: float) -> None:
+    """Measures a robot in lockstep beside a viewer with visitors that runs, and that does not."""
+    print(f'no viewer: {rate(watcher, seconds):.0f} ticks/s', flush=True)
     with ExitStack() as stack:
         view, address = open_view(stack)
-        measure(watcher, 'a viewer that nobody visits', seconds, factor, without)
         for number in range(VISITORS):
             visit(stack, address, number)
-        measure(watcher, f'{VISITORS} visitors that do not draw', seconds, factor, without)
-        if options.browser and factor:
+        watcher.watch(2.0)
+        turns = np.zeros((max(2, round(seconds / _TURN)), 2))
+        for index, turn in enumerate(turns):
+            # Who begins changes too.
+            for runs in (0, 1) if index % 2 else (1, 0):
+                view.send_signal(signal.SIGCONT if runs else signal.SIGSTOP)
+                turn[runs] = rate(watcher, _TURN)
+        view.send_signal(signal.SIGCONT)
+    without, beside = turns.mean(axis=0)
+    low, middle, high = np.percentile(turns[:, 1] / turns[:, 0], (25, 50, 75))
+    print(
+        f'{VISITORS} visitors that do not draw: {beside:.0f} ticks/s, {without:.0f} while the '
+        f'viewer is stopped: {100.0 * beside / without:.1f} %; of {len(turns)} pairs of turns the '
+        f'median {100.0 * middle:.1f} %, quartiles {100.0 * low:.1f} and {100.0 * high:.1f} %',
+        flush=True,
+    )
+    print(f'no viewer any more: {rate(watcher, seconds):.0f} ticks/s', flush=True)
+
+
+def compare(watcher: Watcher, seconds: float, with_browser: bool) -> None:
+    """Measures without viewers, with one, its visitors, while it is stopped, and without again."""
+    measure(watcher, 'no viewer', seconds)
+    with ExitStack() as stack:
+        view, address = open_view(stack)
+        measure(watcher, 'a viewer that nobody visits', seconds)
+        for number in range(VISITORS):
+            visit(stack, address, number)
+        measure(watcher, f'{VISITORS} visitors that do not draw', seconds)
+        if with_browser:
             from support.browser import Browser
 
             browser = Browser()
             stack.callback(browser.close)
             browser.open(f'http://{address}/')
-            measure(watcher, 'and a Chromium that draws', seconds, factor, without)
+            measure(watcher, 'and a Chromium that draws', seconds)
         view.send_signal(signal.SIGSTOP)
-        measure(watcher, 'a viewer that is stopped', seconds, factor, without)
+        measure(watcher, 'a viewer that is stopped', seconds)
         view.send_signal(signal.SIGCONT)
-    # How much the machine itself has changed meanwhile.
-    measure(watcher, 'no viewer any more', seconds, factor, without)
+    measure(watcher, 'no viewer any more', seconds)
 
 
 def main() -> None:
@@ -135,9 +158,10 @@ def main() -> None:
     parser.add_argument('--browser', action='store_true', help='let a Chromium draw as well')
     options = parser.parse_args()
     keep_discovery_local()
-    for mode, factor in (('realtime', 1.0), ('lockstep', 0.0)):
+    for mode in ('realtime', 'lockstep'):
         rclpy.init()
-        print(f'{options.task}, {mode}, {os.cpu_count()} CPUs', flush=True)
+        processors = len(os.sched_getaffinity(0))
+        print(f'{options.task}, {mode}, {processors} processors', flush=True)
         with ExitStack() as stack:
             watcher = Watcher(topic(task_spec(options.task), 'joint_states'))
             # A line for every episode would bury the table.
@@ -147,7 +171,10 @@ def main() -> None:
             if mode == 'lockstep':
                 start(stack, 'policy_node.node', *quiet, '-p', 'policy:=resting')
             watcher.wait_for_ticks()
-            compare(watcher, options, factor)
+            if mode == 'lockstep':
+                take_turns(watcher, options.seconds)
+            else:
+                compare(watcher, options.seconds, options.browser)
         rclpy.shutdown()
 
 

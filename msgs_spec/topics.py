@@ -206,7 +206,7 @@ def _command_topics(task: TaskSpec) -> list[TopicSpec]:
     return specs
 
 
-# Wall-clock content, of both nodes or of `sim_node`: no part of a tick and never logged.
+# In wall time, of both nodes or of `sim_node`: no part of a tick and never logged.
 DIAGNOSTICS = TopicSpec(
     '/diagnostics',
     'diagnostic_msgs/msg/DiagnosticArray',
@@ -218,7 +218,15 @@ REAL_TIME_FACTOR = TopicSpec(
     'Achieved in the last second, 1 Hz wall time; not logged.',
     (VectorPart('real_time_factor', 1, ''),),
 )
-MONITORING = (DIAGNOSTICS, REAL_TIME_FACTOR)
+LATEST_TICKS_PER_SECOND = 30
+LATEST_TICK = TopicSpec(
+    'latest_tick',
+    'std_msgs/msg/UInt8MultiArray',
+    'All messages of a tick in one, for who only looks: `layout` names topics and their bytes. The '
+    f'latest tick, at most {LATEST_TICKS_PER_SECOND} Hz wall time, while somebody subscribes; not '
+    'logged.',
+)
+MONITORING = (DIAGNOSTICS, REAL_TIME_FACTOR, LATEST_TICK)
 
 
 @cache

@@ -23,6 +23,7 @@ from fetch_hand_sim.sim_node import NODE_NAME
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
 from fetch_hand_sim.sim_node.health import Health, Surroundings, lasting_problems, waiting_line
+from fetch_hand_sim.sim_node.latest_tick import LatestTick
 from fetch_hand_sim.sim_node.pacing import RealTimePacer
 from fetch_hand_sim.sim_node.receivers import Receivers
 from fetch_hand_sim.sim_node.robot import Messages, Robot
@@ -42,8 +43,8 @@ from msgs_spec.ros import (
     ros_message_class,
     set_callback,
 )
-from msgs_spec.tick import EpisodeStatus, Tick
-from msgs_spec.topics import DIAGNOSTICS, MONITORING, REAL_TIME_FACTOR, topics
+from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
+from msgs_spec.topics import DIAGNOSTICS, LATEST_TICK, MONITORING, REAL_TIME_FACTOR, topics
 
 _WARN_PERIOD = 1.0
 # Seconds a beat may take: none begins that close to a tick.
@@ -72,6 +73,8 @@ class SimNode(Node):
         self._recording_context: RecordingContext | None = None
         self._recorder = self._make_recorder()
         self._outputs = self._open_topics()
+        encoder = TickEncoder(self._robot.runner.spec)
+        self._latest_tick = LatestTick(self._outputs[LATEST_TICK.name], encoder)
         self._watch = GraphWatch(self, self._robot.runner.spec, self._outputs)
         open_services(self, self._robot)
         now = time.monotonic()
@@ -130,7 +133,8 @@ class SimNode(Node):
     def _open_topics(self) -> dict[str, Publisher]:
         receivers = Receivers(self._robot, self._recorder, self._on_commander, self._warn)
         publishers = {}
-        for spec in (*topics(self._robot.runner.spec), *MONITORING):
+        # Who hears of the task has seen before whether there is `latest_tick`.
+        for spec in (*MONITORING, *topics(self._robot.runner.spec)):
             message_class = ros_message_class(spec.type_name)
             profile = rclpy_profile(spec.qos)
             if spec.direction == 'subscribed':
@@ -233,6 +237,7 @@ class SimNode(Node):
         ):
             return
         self._beat_due = now + BEAT
+        self._latest_tick.say_when_due()
         if now - self._ticked_at >= BEAT:
             self._stand_still(now)
         if now >= self._report_due:
@@ -251,6 +256,7 @@ class SimNode(Node):
             if watch.has_newcomer and watch.is_heard():
                 watch.has_newcomer = False
                 self._publish(robot.last_messages)
+                self._latest_tick.repeat()
         elif not has_started:
             is_waiting = now - self._ticked_at > _WAITING_PERIOD
         if is_waiting:
@@ -261,6 +267,7 @@ class SimNode(Node):
         if self._watch.has_newcomer and self._watch.is_heard():
             self._watch.has_newcomer = False
         self._publish(messages)
+        self._latest_tick.take(tick, messages)
         if self._recorder is not None:
             self._recorder.record(tick, messages)
         if tick.status.phase == 'finished':

@@ -39,10 +39,11 @@ class LiveRobot:
         self._trail: deque[Array] = deque(maxlen=TRAIL_TICKS)
         self._curves: Curves | None = None
         self._rule = ''
+        self._episode: tuple[int, int] | None = None
         self._picture: Picture | None = None
         self._is_new = False
         self._requests = RobotRequests(node, self._update_facts)
-        self._watch = RobotWatch(node, self._on_status, self._on_tick)
+        self._watch = RobotWatch(node, self._on_status, self._on_tick, every_tick=False)
         self._watch.subscribe(DIAGNOSTICS, WATCHING, self._on_diagnostics)
         introduction = topic(ANY_TASK, 'policy_status')
         self._watch.subscribe(introduction, introduction.qos, self._on_commander)
@@ -79,10 +80,13 @@ class LiveRobot:
             self._rule = rule
             self._curves = Curves(spec, GoalMetric(spec, success_rule=rule))
         self._requests.take_task(spec)
-        if status.phase == 'reset':
+        # Of a fast robot the reset itself may not have been among the ticks that came.
+        episode = status.episode, status.seed
+        if status.phase == 'reset' or episode != self._episode or status.tick < self._facts.tick:
             self._trail.clear()
-            self._update_facts(tick=0, episode_return=0.0)
+            self._count(status.tick, status.episode_return)
             self._requests.begin_episode()
+        self._episode = episode
         self._is_new = True
 
     def _on_tick(self, tick: SeenTick) -> None:
@@ -93,10 +97,11 @@ class LiveRobot:
         frame = dataclasses.replace(tick.frame, desired_goal=goal)
         self._trail.append(tracked_position(frame))
         self._curves.add(tick.stamp_ns * 1e-9, frame, tick.reward, tick.command)
-        facts, steps = self._facts, int(tick.command is not None)
-        self._update_facts(
-            tick=facts.tick + steps, episode_return=facts.episode_return + (tick.reward or 0.0)
-        )
+        if tick.status is not None:
+            self._count(tick.status.tick, tick.status.episode_return)
+        else:
+            steps, reward = int(tick.command is not None), tick.reward or 0.0
+            self._count(self._facts.tick + steps, self._facts.episode_return + reward)
         self._picture = Picture(
             task=spec.name,
             frame=frame,
@@ -104,6 +109,9 @@ class LiveRobot:
             trail=tuple(self._trail),
             command=tick.command,
         )
+
+    def _count(self, tick: int, episode_return: float) -> None:
+        self._update_facts(tick=tick, episode_return=episode_return)
 
     def _show_goal(self, goal: Array) -> None:
         """Shows a goal before the robot confirms it."""

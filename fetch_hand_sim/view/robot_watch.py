@@ -18,11 +18,13 @@ from fetch_hand_sim.simulation.scene import Frame
 from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode_status
+from msgs_spec.latest_tick import split_messages
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.ros import rclpy_profile, ros_message_class
+from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import QosSpec, TopicSpec, topic
+from msgs_spec.topics import LATEST_TICK, QosSpec, TopicSpec, topic
 
 # Nothing is sent twice for a viewer.
 WATCHING = QosSpec(depth=5, reliability='best_effort', durability='volatile')
@@ -35,6 +37,8 @@ _STATE = (*_NEEDED, 'reward', _LAST)
 # Seconds between leaving the topics of a robot and subscribing to those of another: until a topic
 # is let go of, which the executor does after the callback, it cannot have another type.
 _CHANGE_TIME = 0.2
+# Seconds between two looks at whether there is `latest_tick`.
+_CHOICE_PERIOD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +50,14 @@ class SeenTick:
         frame: Where robot, object and goals are.
         reward: Of the tick; None at a reset.
         command: (action size,) what was applied, command units; None at a reset.
+        status: Of the episode at this tick; None where that did not come along.
     """
 
     stamp_ns: int
     frame: Frame
     reward: float | None
     command: Array | None
+    status: EpisodeStatus | None
 
 
 class RobotWatch:
@@ -60,7 +66,9 @@ class RobotWatch:
     Args:
         node: Of this process.
         on_status: Gets what the robot says of its episode; the task may be another one.
-        on_tick: Gets every tick.
+        on_tick: Gets every tick, or the latest.
+        every_tick: Whether each counts, also of a robot that is faster than eyes are. If not,
+            `latest_tick` is taken where there is one; replays have none.
 
     Attributes:
         status: The latest status; None until there is a robot.
@@ -71,6 +79,7 @@ class RobotWatch:
         node: Node,
         on_status: Callable[[EpisodeStatus], None],
         on_tick: Callable[[SeenTick], None],
+        every_tick: bool = True,
     ) -> None:
         self._node = node
         self._on_status = on_status
@@ -78,10 +87,17 @@ class RobotWatch:
         self.status: EpisodeStatus | None = None
         self._values: dict[str, Array] = {}
         self._stamp_ns = 0
+        self._every_tick = every_tick
+        self._takes_latest = False
+        self._codecs: dict[str, TopicCodec] = {}
         self._subscriptions: list[Any] = []
         self._change: Any = None
-        status = topic(ANY_TASK, 'episode_status')
-        self.subscribe(status, status.qos, self._take_status)
+        self._status_topic = status = topic(ANY_TASK, 'episode_status')
+        self.subscribe(status, status.qos, self._hear_status)
+        # Of wall time: a node that follows simulated time has none of a robot that is gone.
+        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
+        if not every_tick:
+            node.create_timer(_CHOICE_PERIOD, self._choose, clock=self._clock)
 
     @property
     def spec(self) -> TaskSpec | None:
@@ -104,18 +120,49 @@ class RobotWatch:
             message_class, source.name, callback, profile, raw=raw
         )
 
-    def _take_status(self, message: Any) -> None:
-        try:
-            status = EpisodeStatus.from_values(decode_status(message))
-            spec = task_spec(status.task, status.joint_prefix, status.control_hz)
-        except ValueError:
+    def _hear_status(self, message: Any) -> None:
+        """Takes a status from its own topic: `latest_tick` brings that of a robot which ticks."""
+        status = _read_status(message)
+        if status is None:
             return
+        is_other = self.status is None or self.status.task != status.task
+        if is_other or not self._takes_latest or status.phase == 'waiting':
+            self._take_status(status)
+
+    def _take_status(self, status: EpisodeStatus) -> None:
         if self.status is None or self.status.task != status.task:
-            self._follow(spec)
+            self._follow(task_spec(status.task, status.joint_prefix, status.control_hz))
         self.status = status
         self._on_status(status)
         if status.phase == 'reset':
             self._finish_tick()
+
+    def _take_latest(self, data: bytes) -> None:
+        try:
+            parts = split_messages(data)
+            source = self._status_topic
+            status = _read_status(deserialize(source.type_name, parts[source.name]))
+            given = {
+                name: self._codecs[name].decode(parts[name]) for name in parts.keys() & self._codecs
+            }
+            stamp_ns = given[_FIRST][0]
+        except (KeyError, ValueError):
+            return
+        if status is None:
+            return
+        self._take_status(status)
+        # Not where that was another robot's, whose topics are still to come.
+        if self._subscriptions:
+            self._values = {name: values for name, (_, values) in given.items()}
+            self._stamp_ns = stamp_ns
+            self._finish_tick(status)
+
+    def _choose(self) -> None:
+        if self.spec is not None and self._has_latest() != self._takes_latest:
+            self._follow(self.spec)
+
+    def _has_latest(self) -> bool:
+        return not self._every_tick and self._node.count_publishers(LATEST_TICK.name) > 0
 
     def _follow(self, spec: TaskSpec) -> None:
         self._values = {}
@@ -126,10 +173,8 @@ class RobotWatch:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []
         self._end_change()
-        # Of wall time: a node that follows simulated time has none of a robot that is gone.
-        clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._change = self._node.create_timer(
-            _CHANGE_TIME, lambda: self._subscribe_to(spec), clock=clock
+            _CHANGE_TIME, lambda: self._subscribe_to(spec), clock=self._clock
         )
 
     def _end_change(self) -> None:
@@ -140,13 +185,17 @@ class RobotWatch:
     def _subscribe_to(self, spec: TaskSpec) -> None:
         self._end_change()
         names = [*_STATE, *(['object_pose'] if spec.has_object else [])]
+        self._codecs = {name: TopicCodec(topic(spec, name)) for name in names}
+        inputs = {each.topic: self._collector(each) for each in self._codecs.values()}
+        self._takes_latest = self._has_latest()
+        if self._takes_latest:
+            inputs = {LATEST_TICK: self._take_latest}
         self._subscriptions = [
-            self.subscribe(source, WATCHING, self._collector(source), raw=True)
-            for source in (topic(spec, name) for name in names)
+            self.subscribe(source, WATCHING, take, raw=True) for source, take in inputs.items()
         ]
 
-    def _collector(self, source: TopicSpec) -> Callable[[bytes], None]:
-        codec = TopicCodec(source)
+    def _collector(self, codec: TopicCodec) -> Callable[[bytes], None]:
+        source = codec.topic
 
         def collect(data: bytes) -> None:
             try:
@@ -163,7 +212,7 @@ class RobotWatch:
 
         return collect
 
-    def _finish_tick(self) -> None:
+    def _finish_tick(self, status: EpisodeStatus | None = None) -> None:
         """Passes the tick on if there is one; nothing of it is left for the next."""
         values, spec = self._values, self.spec
         if spec is None or any(name not in values for name in _NEEDED):
@@ -177,4 +226,15 @@ class RobotWatch:
             is_success=bool(values['is_success'][0]),
         )
         reward = float(values['reward'][0]) if 'reward' in values else None
-        self._on_tick(SeenTick(self._stamp_ns, frame, reward, values.get('applied_command')))
+        command = values.get('applied_command')
+        self._on_tick(SeenTick(self._stamp_ns, frame, reward, command, status))
+
+
+def _read_status(message: Any) -> EpisodeStatus | None:
+    """What an `episode_status` says; None if that is no robot of ours."""
+    try:
+        status = EpisodeStatus.from_values(decode_status(message))
+        task_spec(status.task, status.joint_prefix, status.control_hz)
+    except ValueError:
+        return None
+    return status

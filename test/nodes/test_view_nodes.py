@@ -45,6 +45,9 @@ VIEW = (sys.executable, '-m', 'fetch_hand_sim.view', '--no-browser')
 VISUALIZATION = (sys.executable, '-m', 'fetch_hand_sim.visualization_node')
 
 
+VIEW_REPLAY = (sys.executable, '-m', 'fetch_hand_sim.replay_node')
+
+
 class Follower:
     """A `LiveRobot` with the latest of its pictures."""
 
@@ -367,6 +370,45 @@ def test_a_viewer_sees_another_robot_in_the_same_place(start_process: Start) -> 
         loop.close()
         node.destroy_node()
         rclpy.shutdown()
+
+
+def test_a_fast_robot_is_seen_as_it_is_now_and_then_and_a_replay_after_it(
+    start_process: Start, tmp_path: Path
+) -> None:
+    """One message for all of a tick, as often as eyes need it; a replay has none of these."""
+    settings = {'real_time_factor': 0.0, 'episode_dir': tmp_path, 'seed': 5}
+    robot = start_process(*SIM_NODE, *ros_args(task='FetchPush', **settings))
+    with client(task_spec('FetchPush')) as connection:
+        connection.subscribe('latest_tick', 'joint_states', 'achieved_goal', 'reward')
+        follower = Follower(connection)
+        follower.until(lambda p: p.facts.episode > 3 and p.frame is not None, 'episodes')
+        names = [name for name, _ in connection.node.get_topic_names_and_types()]
+        ours = connection.node.get_subscriptions_info_by_topic('/achieved_goal')
+        assert '/latest_tick' in names and len(ours) == 1, 'one of the test, none of the viewer'
+        began = time.monotonic()
+        connection.received['latest_tick'].clear()
+        connection.received['joint_states'].clear()
+        connection.spin(2.0)
+        seconds = time.monotonic() - began
+        seen, ticks = (len(connection.received[n]) for n in ('latest_tick', 'joint_states'))
+        assert 5 * seconds < seen < 36 * seconds
+        assert ticks > 3 * seen
+        follower.robot.perform(SetPaused(True))
+        follower.until(lambda p: p.facts.is_paused, 'pause')
+        connection.spin(1.0)
+        follower.until(lambda p: True, 'picture')
+        picture = follower.picture
+        (stamp,) = {message_stamp(connection.received['joint_states'][-1])}
+        assert picture.stamp_ns == stamp, 'the last tick, also where it came too soon to be said'
+        achieved = decode(
+            topic(task_spec('FetchPush'), 'achieved_goal'), connection.received['achieved_goal'][-1]
+        )
+        np.testing.assert_array_equal(picture.frame.achieved_goal, achieved)
+        end(robot)
+        first = min(path for path in tmp_path.iterdir() if path.name[0] != '.')
+        start_process(*VIEW_REPLAY, *ros_args(path=first, loop=True))
+        follower.until(lambda p: p.facts.episode == 0 and p.facts.tick > 20, 'ticks of the replay')
+        assert follower.picture.facts.seed == 5
 
 
 def test_without_opengl_the_camera_says_so_and_the_rest_goes_on(
