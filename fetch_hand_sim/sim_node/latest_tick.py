@@ -49,7 +49,7 @@ class LatestTick:
         self.say_when_due()
 
     def repeat(self) -> None:
-        """Says the tick again, to who has come since."""
+        """Has the tick said again, to who has come since."""
         self._is_said = False
 
     def say_when_due(self) -> None:
