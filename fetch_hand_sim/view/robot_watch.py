@@ -57,7 +57,7 @@ class SeenTick:
     frame: Frame
     reward: float | None
     command: Array | None
-    status: EpisodeStatus | None
+    status: EpisodeStatus | None = None
 
 
 class RobotWatch:
