@@ -17,6 +17,7 @@ from rclpy.node import Node
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
+from fetch_hand_sim.view.frame_rate import FrameRate
 from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests, Session
@@ -24,7 +25,8 @@ from fetch_hand_sim.view.web import announce, open_page
 from msgs_spec.ros import EventLoop, NodeFailure, StopSignals, destroy, run_node
 
 NODE_NAME = 'view'
-_FRAME_TIME = 1.0 / 60.0
+# Seconds between two looks for news, and after news: `latest_tick` comes no more often.
+_FRAME_TIME, _NEWS_TIME = 1.0 / 60.0, 1.0 / 30.0
 _SERVED_FIRST = 200
 # Seconds in which a robot that runs is found for sure.
 _DISCOVERY_TIME = 2.0
@@ -45,7 +47,8 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
         robot = LiveRobot(node, may_command=not options.read_only)
         loop = EventLoop(node)
         stack.callback(loop.close)
-        handle, address = open_page(options.host, options.port, [Page(), Requests(robot.perform)])
+        plugins = [Page(), Requests(robot.perform)]
+        handle, address = open_page(options.host, options.port, plugins, FrameRate())
         stack.callback(handle.close)
         nodes = stack.enter_context(_nodes(options, node, robot, loop, stop))
         _give_way()
@@ -137,8 +140,9 @@ def _give_way() -> None:
 def _serve(
     session: Session, loop: EventLoop, nodes: list[subprocess.Popen[str]], stop: StopSignals
 ) -> None:
+    is_new = False
     while not stop and all(node.poll() is None for node in nodes):
         # Asleep, not waiting for messages: a robot in lockstep sends thousands a second.
-        time.sleep(_FRAME_TIME)
+        time.sleep(_NEWS_TIME if is_new else _FRAME_TIME)
         loop.serve_pending(_SERVED_FIRST)
-        session.update()
+        is_new = session.update()

@@ -89,8 +89,8 @@ class Session:
         self._source = source
         self._scene: Scene | None = None
 
-    def update(self) -> None:
-        """Shows what is new and does what the page asked for.
+    def update(self) -> bool:
+        """Shows what is new and does what the page asked for; returns whether there was news.
 
         Raises:
             Exception: What ended the viewer's thread.
@@ -100,6 +100,7 @@ class Session:
         if picture is not None:
             self._show(picture)
         self._handle.sync()
+        return picture is not None
 
     def _show(self, picture: Picture) -> None:
         if self._scene is None or self._scene.spec.name != picture.task:

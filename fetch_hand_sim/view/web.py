@@ -23,9 +23,11 @@ from mujoco.studio import (
     viewer_protocol,
     web_viewer,
 )
+from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.web import web_server
 from websockets.exceptions import ConnectionClosed
 
+from fetch_hand_sim.view.frame_rate import FrameRate, Touch
 from fetch_hand_sim.view.guard import Guard, guarded_serve, is_loopback, new_token
 from msgs_spec.command_line import CommandError
 
@@ -75,7 +77,20 @@ class Address:
 
 
 class _Viewer(web_viewer.WebViewer):
-    """The web viewer without what it tells the terminal, and without files from visitors."""
+    """The web viewer without what it tells the terminal, and without files from visitors.
+
+    Attributes:
+        frame_rate: How often to build the page; None is as often as it can, 60 times a second.
+    """
+
+    frame_rate: FrameRate | None = None
+
+    def prepare_next_frame(self) -> bool:
+        """Waits for the next frame and begins it."""
+        if self.frame_rate is not None:
+            time.sleep(self.frame_rate.wait_time(time.monotonic(), _read_touch()))
+        begun: bool = super().prepare_next_frame()
+        return begun
 
     @messages.handler(priority=messages.Priority.INTERNAL)
     def _on_post_model(self, event: messages.PostModelEvent) -> None:
@@ -87,11 +102,22 @@ class _Viewer(web_viewer.WebViewer):
         return ''
 
 
+def _read_touch() -> Touch:
+    """What mouse and keyboard of the page did in the last frame."""
+    io = imgui.GetIO()
+    return Touch(
+        mouse=(io.MousePos.x, io.MousePos.y),
+        wheel=io.MouseWheel,
+        is_down=imgui.IsAnyMouseDown(),
+        is_typing=io.WantCaptureKeyboard,
+    )
+
+
 def open_page(
     host: str,
     port: int,
     plugins: Sequence[plugin.Plugin],
-    token: str | None = None,
+    frame_rate: FrameRate | None = None,
 ) -> tuple[viewer_handle.ViewerHandle, Address]:
     """Binds, serves the page from a thread and checks that the guard stands; once per process.
 
@@ -99,13 +125,13 @@ def open_page(
         host: Interface to listen on.
         port: A port, or 0 for the first free one from 8080.
         plugins: Of the page and of the robot's side.
-        token: Secret of the address where others can connect; None makes one.
+        frame_rate: How often to build the page; None is 60 times a second.
 
     Raises:
         CannotServe: If the port is taken or the host is not ours.
     """
     needs_token = not is_loopback(host)
-    guard = Guard((token or new_token()) if needs_token else None)
+    guard = Guard(new_token() if needs_token else None)
     listening = _bind(host, port)
     address = Address(host, listening.getsockname()[1], guard.token)
     # The two places where the viewer meets the network; it offers no option for either.
@@ -120,6 +146,7 @@ def open_page(
         _wake_seldom()
         config = viewer_protocol.ViewerConfig(title='fetch_hand_sim', gfx='web')
         viewer = _Viewer(config, endpoint, plugins=viewer_plugins)
+        viewer.frame_rate = frame_rate
         viewer_protocol.run_viewer_loop(viewer)
 
     handle = launch_thread.launch_thread(run, sim_plugins=sim_plugins)

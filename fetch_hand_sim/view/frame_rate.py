@@ -1,0 +1,52 @@
+"""How often the page of a robot is built: as often as there is news, or a hand on the mouse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+# Seconds between two frames that only follow the robot: `latest_tick` comes 30 times a second.
+_FOLLOWING = 1.0 / 30.0
+# Seconds after the last touch for which frames come as fast as the viewer makes them.
+_ATTENTION = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """What mouse and keyboard do; a page is touched where this changes or a button is held.
+
+    Attributes:
+        mouse: Where the pointer is, pixels.
+        wheel: What the wheel turned in this frame.
+        is_down: Whether a button is held.
+        is_typing: Whether a field takes what is typed.
+    """
+
+    mouse: tuple[float, float] = (0.0, 0.0)
+    wheel: float = 0.0
+    is_down: bool = False
+    is_typing: bool = False
+
+
+class FrameRate:
+    """Says how long to wait before the next frame. Times are seconds of one clock that only grows.
+
+    A robot in lockstep beside a viewer, on two processors, pays for every frame that shows nothing
+    new.
+    """
+
+    def __init__(self) -> None:
+        self._touch = Touch()
+        self._touched = 0.0
+        self._began = 0.0
+
+    def wait_time(self, now: float, touch: Touch) -> float:
+        """Returns for how long to wait, and takes that the next frame begins then."""
+        is_held = touch.is_down or touch.is_typing or touch.wheel != 0.0
+        if is_held or touch.mouse != self._touch.mouse:
+            self._touched = now
+        self._touch = touch
+        wait = 0.0
+        if now - self._touched > _ATTENTION:
+            wait = max(0.0, self._began + _FOLLOWING - now)
+        self._began = now + wait
+        return wait
