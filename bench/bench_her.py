@@ -239,7 +239,7 @@ def write_csv(rows: Sequence[Row], columns: Sequence[str], path: Path, machine: 
     """Writes rows below a comment that says where they come from."""
     with path.open('w', newline='') as file:
         file.write(f'# {machine}\n')
-        writer = csv.DictWriter(file, columns)
+        writer = csv.DictWriter(file, columns, lineterminator='\n')
         writer.writeheader()
         writer.writerows(rows)
 

@@ -242,7 +242,7 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     with open(arguments.output / 'bench_sim.csv', 'w', newline='') as file:
         file.write(f'# {machine}\n')
-        writer = csv.DictWriter(file, [*COLUMNS, *RESET_COLUMNS])
+        writer = csv.DictWriter(file, [*COLUMNS, *RESET_COLUMNS], lineterminator='\n')
         writer.writeheader()
         writer.writerows(rows)
     plot(rows, arguments.output / 'bench_sim.png', machine)

@@ -127,7 +127,7 @@ def write_csv(outcomes: EpisodeOutcomes, path: Path) -> None:
     names = EpisodeOutcomes.__slots__
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open('w', newline='') as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator='\n')
         writer.writerow(names)
         columns = [np.asarray(getattr(outcomes, name)) for name in names]
         integers = [c.astype(int) if c.dtype == np.bool_ else c for c in columns]

@@ -143,7 +143,7 @@ def write_report(jobs: Sequence[Job], output: Path, command: str) -> None:
     output.mkdir(parents=True, exist_ok=True)
     write_curves(jobs, found, output / 'benchmark_curves.csv')
     with (output / 'benchmark.csv').open('w', newline='') as file:
-        writer = csv.DictWriter(file, list(table[0]))
+        writer = csv.DictWriter(file, list(table[0]), lineterminator='\n')
         writer.writeheader()
         writer.writerows(table)
     about = {'command': command, 'source_revisions': revisions, 'machine': machine()}
@@ -235,7 +235,7 @@ def _label(axes: Any, task: str, paper_epochs: bool) -> None:
 def write_curves(jobs: Sequence[Job], curves: Sequence[Curve], path: Path) -> None:
     """Writes every evaluation of jobs as CSV."""
     with path.open('w', newline='') as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator='\n')
         writer.writerow(['task', 'arm', 'seed', 'env_steps', 'success'])
         for job, curve in zip(jobs, curves, strict=True):
             name = (job.config.task, job.arm.name, job.config.seed)

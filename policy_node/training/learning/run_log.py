@@ -61,7 +61,9 @@ class RunLog:
         partial = self.path.with_name(f'.{self.path.name}.partial')
         self._file: IO[str] = partial.open('w', newline='')
         # Logs from before a column was added leave it empty.
-        self._writer = csv.DictWriter(self._file, COLUMNS, restval='', extrasaction='ignore')
+        self._writer = csv.DictWriter(
+            self._file, COLUMNS, restval='', extrasaction='ignore', lineterminator='\n'
+        )
         self._writer.writeheader()
         self._writer.writerows(kept)
         self._file.flush()
