@@ -29,7 +29,7 @@ BEST_ORDER = (
 )
 STARTS_FROM = {
     'HandManipulateBlockRotateParallel': 'HandManipulateBlockRotateXYZ',
-    'HandManipulateBlockRotateZ': 'HandManipulateBlockRotateXYZ',
+    'HandManipulateBlockRotateZ': 'HandManipulateBlockRotateParallel',
     'HandManipulateBlockFull': 'HandManipulateBlockRotateXYZ',
     'HandManipulateEggFull': 'HandManipulateEggRotate',
     'HandManipulatePenFull': 'HandManipulatePenRotate',
