@@ -177,7 +177,7 @@ class ConfigFields:
     the last third of the run. 1 keeps them constant."""
 
     evaluate_every: int = 50_000
-    """Environment steps between evaluations."""
+    """Environment steps between evaluations; the actor that a run ends with is evaluated too."""
     evaluation_episodes: int = 200
     """Episodes behind a decision which actor is best; hopeless evaluations end earlier."""
     checkpoint_seconds: float = 180.0

@@ -48,8 +48,8 @@ class Collected:
 
     episodes: Episodes
     train_success: float
-    evaluation: EpisodeOutcomes | None
-    evaluated: Actor | None
+    evaluation: EpisodeOutcomes | None = None
+    evaluated: Actor | None = None
     guided: EpisodeOutcomes | None = None
 
 
@@ -196,9 +196,12 @@ class Trainer:
                 clock.write(self.counters)
                 self._check(losses)
                 self._keep_best(collected)
+                if collected.evaluation is None and self._has_ended():
+                    collected = submit(self._evaluate_last, collected).result()
+                    self._keep_best(collected)
                 if log is not None:
                     log.write(self._row(collected, losses, time.monotonic() - before))
-                reason = self._reason_to_stop(collected)
+                reason = self._reason_to_stop()
                 if reason:
                     self.save()
                     return reason
@@ -228,12 +231,13 @@ class Trainer:
         return actor, steps < self.config.random_steps, evaluated
 
     def _collect(self, actor: Actor, random: bool, evaluated: Actor | None) -> Collected:
-        outcomes = guided = None
-        if evaluated is not None:
-            outcomes = self._evaluator.evaluate(evaluated, self.counters.best_success)
-            guided = self._evaluator.evaluate_guided(evaluated)
-        episodes, success = self.collector.collect(actor, random)
-        return Collected(episodes, success, outcomes, evaluated, guided)
+        collected = Collected(*self.collector.collect(actor, random))
+        return collected if evaluated is None else self._evaluate(collected, evaluated)
+
+    def _evaluate(self, collected: Collected, actor: Actor) -> Collected:
+        outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
+        guided = self._evaluator.evaluate_guided(actor)
+        return replace(collected, evaluation=outcomes, evaluated=actor, guided=guided)
 
     def _exploration(self) -> float:
         """Share of noise and random actions for a run as far as this one."""
@@ -305,7 +309,21 @@ class Trainer:
         if outcomes is not None and actor is not None and self._evaluator.is_complete(outcomes):
             self._saver.keep_best(outcomes, actor, self.counters)
 
-    def _reason_to_stop(self, collected: Collected) -> str:
+    def _has_ended(self) -> bool:
+        """Whether the run is over by its own limits; who stops it earlier need not wait."""
+        config, counters = self.config, self.counters
+        is_late = 0 < config.time_limit <= counters.seconds
+        return counters.env_steps >= config.total_steps or is_late
+
+    def _evaluate_last(self, collected: Collected) -> Collected:
+        """Evaluates the actor that the run ends with: falling noise and steps make it the best."""
+        if not self.workers.is_first or self.counters.updates == 0:
+            return collected
+        actor = self.learner.evaluation_actor()
+        self._evaluator.proposer = self.learner.proposer(averaged=True)
+        return self._evaluate(collected, actor)
+
+    def _reason_to_stop(self) -> str:
         config, reason = self.config, self._stop_reason
         target = config.success_target
         if not reason and 0 < target <= self.counters.best_success:

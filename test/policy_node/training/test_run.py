@@ -111,6 +111,22 @@ def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(
     assert [row['updates'] for row in read_progress(run / 'progress.csv')] == [4, 8, 12, 16, 20]
 
 
+def test_the_actor_that_a_run_ends_with_is_evaluated(tmp_path: Path) -> None:
+    trainer = Trainer(small(total_steps=2_000, evaluate_every=100_000), tmp_path, Workers())
+    log = StopAfter(trainer, 1000)
+    trainer.train(log)
+    evaluated = [row['env_steps'] for row in log.rows if row.get('eval_success') is not None]
+    assert evaluated == [800, 2_000], 'after the first updates, and at the end'
+    assert trainer.counters.best_success == max(row.get('eval_success') or 0 for row in log.rows)
+
+
+def test_a_run_that_is_stopped_does_not_wait_for_an_evaluation(tmp_path: Path) -> None:
+    trainer = Trainer(small(total_steps=2_000, evaluate_every=100_000), tmp_path, Workers())
+    log = StopAfter(trainer, 3)
+    assert trainer.train(log) == 'interrupted'
+    assert log.rows[-1].get('eval_success') is None
+
+
 def test_the_newest_episodes_are_kept_in_order(tmp_path: Path) -> None:
     def replay() -> EpisodeReplay:
         return EpisodeReplay(8, ticks=5, observation_size=3, goal_size=2, action_size=1)
