@@ -152,6 +152,14 @@ def _rates() -> tuple[Arm, ...]:
         'noise': ('noise held for 40 ms', {'noise_seconds': 0.04}),
         'both': ('both', {'discount': 'time', 'noise_seconds': 0.04}),
         'steps': ('returns of 10 steps', {'n_step': 10}),
+        'discount_steps': (
+            'discount per 40 ms, returns of 10 steps',
+            {'discount': 'time', 'n_step': 10},
+        ),
+        'noise_steps': (
+            'noise held for 40 ms, returns of 10 steps',
+            {'noise_seconds': 0.04, 'n_step': 10},
+        ),
         'three': (
             'all three',
             {'discount': 'time', 'noise_seconds': 0.04, 'n_step': 10},
