@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# Seconds between two frames that only follow the robot: `latest_tick` comes 30 times a second.
-_FOLLOWING = 1.0 / 30.0
+from msgs_spec.topics import LATEST_TICKS_PER_SECOND
+
+# Seconds between two frames that only follow the robot, and so between two pictures of it.
+FOLLOWING = 1.0 / LATEST_TICKS_PER_SECOND
 # Seconds after the last touch for which frames come as fast as the viewer makes them.
 _ATTENTION = 0.5
 
@@ -47,6 +49,6 @@ class FrameRate:
         self._touch = touch
         wait = 0.0
         if now - self._touched > _ATTENTION:
-            wait = max(0.0, self._began + _FOLLOWING - now)
+            wait = max(0.0, self._began + FOLLOWING - now)
         self._began = now + wait
         return wait

@@ -17,7 +17,7 @@ from rclpy.node import Node
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
-from fetch_hand_sim.view.frame_rate import FrameRate
+from fetch_hand_sim.view.frame_rate import FOLLOWING, FrameRate
 from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests, Session
@@ -25,8 +25,7 @@ from fetch_hand_sim.view.web import announce, open_page
 from msgs_spec.ros import EventLoop, NodeFailure, StopSignals, destroy, run_node
 
 NODE_NAME = 'view'
-# Seconds between two looks for news, and after news: `latest_tick` comes no more often.
-_FRAME_TIME, _NEWS_TIME = 1.0 / 60.0, 1.0 / 30.0
+_FRAME_TIME = 1.0 / 60.0
 _SERVED_FIRST = 200
 # Seconds in which a robot that runs is found for sure.
 _DISCOVERY_TIME = 2.0
@@ -143,6 +142,6 @@ def _serve(
     is_new = False
     while not stop and all(node.poll() is None for node in nodes):
         # Asleep, not waiting for messages: a robot in lockstep sends thousands a second.
-        time.sleep(_NEWS_TIME if is_new else _FRAME_TIME)
+        time.sleep(FOLLOWING if is_new else _FRAME_TIME)
         loop.serve_pending(_SERVED_FIRST)
         is_new = session.update()

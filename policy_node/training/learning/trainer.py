@@ -195,10 +195,11 @@ class Trainer:
                 collected = self._collect_or_explain(job)
                 clock.write(self.counters)
                 self._check(losses)
+                if collected.evaluation is None and self.counters.updates > 0 and self._limit():
+                    # Noise and learning rate have fallen, and nothing else would measure it.
+                    last = self._actor_to_evaluate()
+                    collected = submit(self._evaluate, collected, last).result()
                 self._keep_best(collected)
-                if collected.evaluation is None and self._has_ended():
-                    collected = submit(self._evaluate_last, collected).result()
-                    self._keep_best(collected)
                 if log is not None:
                     log.write(self._row(collected, losses, time.monotonic() - before))
                 reason = self._reason_to_stop()
@@ -225,16 +226,22 @@ class Trainer:
         actor, evaluated = self.learner.acting_actor(), None
         if may_evaluate and counters.updates > 0 and steps >= counters.next_evaluation:
             counters.next_evaluation = steps + self.config.evaluate_every
-            if self.workers.is_first:
-                evaluated = self.learner.evaluation_actor()
-                self._evaluator.proposer = self.learner.proposer(averaged=True)
+            evaluated = self._actor_to_evaluate()
         return actor, steps < self.config.random_steps, evaluated
 
-    def _collect(self, actor: Actor, random: bool, evaluated: Actor | None) -> Collected:
-        collected = Collected(*self.collector.collect(actor, random))
-        return collected if evaluated is None else self._evaluate(collected, evaluated)
+    def _actor_to_evaluate(self) -> Actor | None:
+        """The actor as it is evaluated now; None where another worker does it."""
+        if not self.workers.is_first:
+            return None
+        self._evaluator.proposer = self.learner.proposer(averaged=True)
+        return self.learner.evaluation_actor()
 
-    def _evaluate(self, collected: Collected, actor: Actor) -> Collected:
+    def _collect(self, actor: Actor, random: bool, evaluated: Actor | None) -> Collected:
+        return self._evaluate(Collected(*self.collector.collect(actor, random)), evaluated)
+
+    def _evaluate(self, collected: Collected, actor: Actor | None) -> Collected:
+        if actor is None:
+            return collected
         outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
         guided = self._evaluator.evaluate_guided(actor)
         return replace(collected, evaluation=outcomes, evaluated=actor, guided=guided)
@@ -309,29 +316,20 @@ class Trainer:
         if outcomes is not None and actor is not None and self._evaluator.is_complete(outcomes):
             self._saver.keep_best(outcomes, actor, self.counters)
 
-    def _has_ended(self) -> bool:
-        """Whether the run is over by its own limits; who stops it earlier need not wait."""
+    def _limit(self) -> str:
+        """Which of its own limits the run has reached; empty if none."""
         config, counters = self.config, self.counters
-        is_late = 0 < config.time_limit <= counters.seconds
-        return counters.env_steps >= config.total_steps or is_late
-
-    def _evaluate_last(self, collected: Collected) -> Collected:
-        """Evaluates the actor that the run ends with: falling noise and steps make it the best."""
-        if not self.workers.is_first or self.counters.updates == 0:
-            return collected
-        actor = self.learner.evaluation_actor()
-        self._evaluator.proposer = self.learner.proposer(averaged=True)
-        return self._evaluate(collected, actor)
+        if counters.env_steps >= config.total_steps:
+            return f'{config.total_steps:,} environment steps done'
+        if 0 < config.time_limit <= counters.seconds:
+            return f'time limit of {config.time_limit:g} s reached'
+        return ''
 
     def _reason_to_stop(self) -> str:
-        config, reason = self.config, self._stop_reason
-        target = config.success_target
+        target, reason = self.config.success_target, self._stop_reason
         if not reason and 0 < target <= self.counters.best_success:
             reason = f'success target {target:g} reached'
-        if not reason and self.counters.env_steps >= config.total_steps:
-            reason = f'{config.total_steps:,} environment steps done'
-        if not reason and 0 < config.time_limit <= self.counters.seconds:
-            reason = f'time limit of {config.time_limit:g} s reached'
+        reason = reason or self._limit()
         return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
 
     def save(self) -> None:
