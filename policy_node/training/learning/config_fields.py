@@ -45,6 +45,9 @@ class ConfigFields:
     narrow_above: float = 0.0
     """Share of a cycle's episodes that must end in success, by goals as coarse as they are then,
     for these to narrow on; steps of other cycles do not count towards it. 0 never waits."""
+    reward_grades: str = ''
+    """Multiples of the success thresholds, as `.5,1,2,4`: the sparse reward of training becomes the
+    share of them within which the distance is, times that of the rotation, minus 1."""
     strategy: str = 'future'
     """Hindsight goals: final, future, episode, random, futureactual, or none (no hindsight)."""
     hindsight_k: int = 4

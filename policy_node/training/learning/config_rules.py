@@ -9,6 +9,7 @@ from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, TaskSpec, tas
 from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
 from policy_node.training.learning.config_fields import ConfigFields
 from policy_node.training.learning.goal_choice import GOAL_CHOICES
+from policy_node.training.learning.graded import parse_grades
 from policy_node.training.learning.hindsight import parse_mixture
 from policy_node.training.learning.multi_step import CORRECTIONS
 
@@ -122,6 +123,8 @@ def require_allowed(config: ConfigFields) -> None:
     goal_features(config.goal_features, spec)
     if config.goals:
         parse_mixture(config.goals)
+    if config.reward_grades:
+        parse_grades(config.reward_grades)
     for reason in _contradictions(config, spec):
         raise ValueError(reason)
     if not config.hidden_sizes or min(config.hidden_sizes) < 1:
@@ -198,7 +201,7 @@ def _contradictions_of_subgoals(config: ConfigFields) -> Iterator[str]:
         yield 'subgoal_every excludes condition, goal_choice, importance and advantage'
     if guided and config.ticks_after_drop >= 0:
         yield 'subgoal_every excludes ticks_after_drop'
-    if guided and config.reward_type != 'sparse':
+    if guided and (config.reward_type != 'sparse' or config.reward_grades):
         yield 'subgoal_every needs reward_type sparse: a subgoal is reached or missed'
     if imagined and (guided or conditioned or config.advantage):
         yield 'subgoal_prior excludes subgoal_every, condition and advantage'
@@ -235,6 +238,8 @@ def _contradictions_of_goals(config: ConfigFields) -> Iterator[str]:
         yield 'condition threshold needs reward_type sparse'
     if config.narrows and (conditioned or config.reward_type == 'dense'):
         yield 'first_distance and first_rotation need reward_type sparse and condition none'
+    if config.reward_grades and (conditioned or config.reward_type == 'dense'):
+        yield 'reward_grades needs reward_type sparse and condition none'
     if config.narrow_above > 0 and not config.narrows:
         yield 'narrow_above needs first_distance or first_rotation above 1'
     if config.narrows and config.subgoal_every > 0:

@@ -13,6 +13,7 @@ from policy_node.training.learning.conditions import Condition, make_condition
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.frame_skip import HeldSteps
 from policy_node.training.learning.goal_choice import CANDIDATES, GOAL_CHOICES, Judge
+from policy_node.training.learning.graded import GradedReward, parse_grades
 from policy_node.training.learning.hindsight import RewardFunction, draw_sources, flat, goals_of
 from policy_node.training.learning.multi_step import StepCounter, discounted_rewards
 from policy_node.training.learning.replay import Array, Episodes
@@ -190,18 +191,20 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
     """
 
     def reward_at(progress: float) -> RewardFunction:
-        return narrowed(metric, config, progress).reward
+        then = narrowed(metric, config, progress)
+        if not config.reward_grades:
+            return then.reward
+        return GradedReward(then, parse_grades(config.reward_grades))
 
-    final = narrowed(metric, config, progress=1.0)
     counter: StepCounter | HeldSteps | None = None
     if config.longest_hold > 1:
         counter = HeldSteps(config.longest_hold)
     if config.n_step > 1:
         limits = config.correction, config.trace, config.cut_distance
         counter = StepCounter(config.n_step, *limits)
-    condition = make_condition(config.condition, final)
+    condition = make_condition(config.condition, narrowed(metric, config, progress=1.0))
     return TransitionSampler(
-        final.reward,
+        reward_at(1.0),
         config.tick_gamma,
         counter,
         condition,

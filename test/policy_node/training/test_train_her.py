@@ -21,6 +21,7 @@ from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.generate_episodes import main as generate_episodes
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.graded import GradedReward, parse_grades
 from policy_node.training.learning.logged_episodes import read_experience
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import RunLog, read_progress
@@ -256,6 +257,35 @@ def test_training_may_ask_for_less_rotation_than_the_task(tmp_path: Path) -> Non
     assert metric.reward(achieved, goal).tolist() == [0.0, 0.0, -1.0]
     tighter = scale_thresholds(metric, 1.0, 0.6)
     assert tighter.reward(achieved, goal).tolist() == [0.0, -1.0, -1.0]
+
+
+def test_graded_rewards_are_shares_of_thresholds_met() -> None:
+    """BlockFull: 0.01 m and 0.1 rad, at multiples of 0.5, 1, 2 and 4 of them."""
+    metric = Simulation('HandManipulateBlockFull', num_envs=1, num_threads=1).metric
+    goal = np.zeros((5, 7))
+    goal[:, 3] = 1.0
+    achieved = goal.copy()
+    achieved[:, 0] = [0.0, 0.006, 0.015, 0.03, 0.05]
+    angle = np.array([0.0, 0.04, 0.3, 0.3, 0.0])
+    achieved[:, 3], achieved[:, 4] = np.cos(angle / 2), np.sin(angle / 2)
+    reward = GradedReward(metric, parse_grades('.5,1,2,4'))
+    met = np.array([1.0, 0.75 * 1.0, 0.5 * 0.25, 0.25 * 0.25, 0.0 * 1.0])
+    np.testing.assert_array_equal(reward(achieved, goal), met - 1.0)
+    sparse = GradedReward(metric, parse_grades('1'))
+    np.testing.assert_array_equal(sparse(achieved, goal), metric.reward(achieved, goal))
+
+
+def test_training_may_grade_its_rewards(tmp_path: Path) -> None:
+    """FetchReach succeeds within 0.05 m: within 0.1 m half of the grades 1 and 2 are met."""
+    trainer = Trainer(small_config(reward_grades='1,2', batch_size=512), tmp_path, Workers())
+    trainer.experience.replay.add(trainer.collector.collect(trainer.learner.actor)[0])
+    batch = trainer.experience.batch(env_steps=0)
+    assert set(batch.reward.tolist()) == {-1.0, -0.5, 0.0}
+    position = batch.next_observation[:, :3].astype(np.float64)
+    distance = np.linalg.norm(position - batch.goal, axis=-1)
+    clear = np.abs(distance - 0.05) > 1e-4
+    np.testing.assert_array_equal(batch.reward[clear] == 0.0, distance[clear] < 0.05)
+    assert trainer.simulation.metric.reward_type == 'sparse'
 
 
 def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_path: Path) -> None:
