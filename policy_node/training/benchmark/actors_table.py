@@ -42,6 +42,16 @@ def _row(task: str, report: dict[str, Any]) -> str:
 
 
 def steps_behind(report: dict[str, Any]) -> int:
-    """Environment steps behind an actor and behind all that its training started from."""
-    before: dict[str, Any] = report.get('init_from') or {}
-    return int(report['env_steps']) + (steps_behind(before) if before else 0)
+    """Environment steps behind an actor and behind all that its training started from, each once.
+
+    Args:
+        report: The JSON of an actor.
+    """
+    runs: dict[object, int] = {}
+    waiting = [report]
+    while waiting:
+        run = waiting.pop()
+        runs[run.get('sha256') or id(run)] = int(run['env_steps'])
+        waiting += [run['init_from']] if run.get('init_from') else []
+        waiting += run.get('mean_of', [])
+    return sum(runs.values())

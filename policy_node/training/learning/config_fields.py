@@ -89,7 +89,7 @@ class ConfigFields:
 
     init_from: str = ''
     """Networks and normalisers to start from: a run folder, a shipped actor or the file of one;
-    empty starts from nothing."""
+    their mean where several are given with commas; empty starts from nothing."""
     critic_first: int = 0
     """Updates of the critic alone before the actor learns too; 0 is 5,000 where `init_from` is an
     actor without its critic, else none."""

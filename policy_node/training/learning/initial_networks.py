@@ -121,12 +121,56 @@ def read_initial_networks(name: str) -> InitialNetworks:
         name: A run folder, whose latest networks are meant; a shipped actor; or the file of an
             actor. The critic of an actor lies beside it (`<Task>.training.safetensors`), or in the
             training state of the run folder that holds the file; without either it is missing.
+            Several with commas between them: their mean.
 
     Raises:
-        ValueError: If there is no such actor or run, or a file is damaged.
+        ValueError: If there is no such actor or run, a file is damaged, or several do not fit.
     """
     path = Path(name)
-    return _of_run(path) if path.is_dir() else _of_actor(name, actor_path(name))
+    if path.is_dir():
+        return _of_run(path)
+    if ',' in name and not path.exists():
+        return mean_of([read_initial_networks(part.strip()) for part in name.split(',')])
+    return _of_actor(name, actor_path(name))
+
+
+def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
+    """The mean of networks that were trained on from the same ones, each weight for itself.
+
+    Such a mean is often better than any of them (Wortsman et al. 2022, "Model soups", arXiv
+    2203.05482). What only some have, as a critic, it has not.
+
+    Raises:
+        ValueError: If they are of different tasks, sizes or inputs.
+    """
+    first = parts[0]
+    kinds = [(part.origin['task'], part.shape, part.goal_features) for part in parts]
+    for part, kind in zip(parts, kinds, strict=True):
+        if kind != kinds[0]:
+            raise ValueError(
+                f'no mean of {first.origin["name"]} and {part.origin["name"]}: they are '
+                f'{_described(first)} and {_described(part)}'
+            )
+    shared = set.intersection(*(set(part.tensors) for part in parts))
+    tensors = {
+        name: torch.stack([part.tensors[name] for part in parts]).mean(dim=0)
+        for name in first.tensors
+        if name in shared
+    }
+    origin = {
+        'name': ','.join(part.origin['name'] for part in parts),
+        'critic': any(name.startswith('critic.') for name in tensors),
+        'task': first.origin['task'],
+        'env_steps': 0,
+        'command': '',
+        'mean_of': [part.origin for part in parts],
+    }
+    return replace(first, tensors=tensors, origin=origin)
+
+
+def _described(networks: InitialNetworks) -> str:
+    sizes = networks.shape.hidden_sizes
+    return f'{networks.origin["task"]} {sizes} {networks.goal_features}'
 
 
 def _of_run(folder: Path) -> InitialNetworks:

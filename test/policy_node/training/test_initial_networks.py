@@ -12,6 +12,7 @@ import torch
 from policy_node.policies import checkpoint
 from policy_node.policies.loading import load_actor
 from policy_node.policies.shipped import shipped_actors
+from policy_node.training.benchmark.actors_table import steps_behind
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.initial_networks import read_initial_networks
@@ -64,6 +65,39 @@ def test_a_run_starts_with_all_networks_of_another(tmp_path: Path, block_run: Pa
     ) * 3
     assert started.learner.critic_optimizer.state_dict()['state'] == {}
     assert source.learner.critic_optimizer.state_dict()['state'] != {}
+
+
+def test_a_run_starts_from_the_mean_of_several(tmp_path: Path, block_run: Path) -> None:
+    task, runs = 'HandManipulateBlockRotateXYZ', [block_run]
+    for seed in (1, 2):
+        runs.append(tmp_path / str(seed))
+        arguments = ['--task', task, '--init-from', str(block_run), '--steps', '200', *SET]
+        assert main([*arguments, '--seed', str(seed), '--output', str(runs[-1])]) == 0
+    parts = [read_initial_networks(str(run)) for run in runs]
+    together = ','.join(map(str, runs))
+    networks = read_initial_networks(together)
+    assert networks.has_critic
+    for name, value in networks.tensors.items():
+        mean = sum(part.tensors[name].double() for part in parts) / 3
+        torch.testing.assert_close(value.double(), mean, rtol=1e-5, atol=1e-6)
+    name = 'actor.network.output.weight'
+    assert not torch.equal(parts[1].tensors[name], parts[2].tensors[name])
+    mixed = [f'{block_run}/best.safetensors', str(runs[1])]
+    assert read_initial_networks(','.join(mixed)).origin['critic']
+    output = tmp_path / 'on'
+    arguments = ['--task', task, '--init-from', together, '--steps', '200', *SET]
+    assert main([*arguments, '--output', str(output)]) == 0
+    origin = checkpoint.read_info(output / 'latest.safetensors').init_from
+    assert [part['name'] for part in origin['mean_of']] == [str(run) for run in runs]
+    # 200 steps each, all from one run of 400, which is counted once where its hash is known.
+    assert steps_behind({'env_steps': 200, 'init_from': origin}) == 200 + 400 + 2 * (200 + 400)
+
+
+def test_no_mean_of_networks_of_two_tasks(tmp_path: Path, block_run: Path) -> None:
+    with pytest.raises(ValueError, match=r'no mean of .*: they are HandManipulateBlockRotateXYZ'):
+        read_initial_networks(f'{block_run},HandManipulateEggFull')
+    with pytest.raises(ValueError, match='nobody'):
+        read_initial_networks(f'{block_run},nobody')
 
 
 @pytest.mark.parametrize('features', ['relative', 'symmetric'])
