@@ -144,6 +144,9 @@ class ConfigFields:
     """Share of the old target network kept by a target update."""
     target_update_interval: int = 40
     """Updates between target updates."""
+    policy_delay: int = 1
+    """Updates of the critic for each of the actor (TD3, arXiv 1802.09477): 2 takes three quarters
+    of the time."""
     target: str = 'polyak'
     """Networks that targets are computed with: `polyak` (slow copies) or `none` (those that
     learn)."""

@@ -73,13 +73,17 @@ class DDPG(ActorCritic):
             self._achieved_start = task_spec(config.task).achieved_goal_start
         self._action_size = shape.action_size - (config.longest_hold > 1)
         self._bfloat16 = uses_bfloat16(config.precision, device)
+        # Loss and value at the actor's last update.
+        self._of_actor = torch.zeros(()), torch.zeros(())
 
     def update(self, batch: Transitions) -> Losses:
         """Improves critic and actor on a batch and, when due, moves the targets."""
         known = self._known(batch)
         weight = None if self._ratio is None else self._weights(self._ratio, known)
         critic_loss = self._update_critic(known, weight)
-        actor_loss, value = self._update_actor(known)
+        if self.updates % self.config.policy_delay == 0:
+            self._of_actor = self._update_actor(known)
+        actor_loss, value = self._of_actor
         self.updates += 1
         if self.updates % self.config.target_update_interval == 0:
             self._move_targets()

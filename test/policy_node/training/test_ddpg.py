@@ -110,6 +110,20 @@ def test_targets_move_by_the_share_and_at_the_interval_asked_for() -> None:
         torch.testing.assert_close(value, expected)
 
 
+def test_a_delayed_actor_learns_at_every_third_update_of_the_critic() -> None:
+    learner = make_learner(policy_delay=3)
+    moved = []
+    for _ in range(6):
+        actor = copy.deepcopy(learner.actor.network.state_dict())
+        critic = copy.deepcopy(learner.critic.state_dict())
+        losses = learner.update(make_batch())
+        now = learner.actor.network.state_dict()
+        moved.append(any(not torch.equal(actor[name], now[name]) for name in actor))
+        assert any(not torch.equal(critic[n], v) for n, v in learner.critic.state_dict().items())
+        assert losses.value != 0.0
+    assert moved == [True, False, False, True, False, False]
+
+
 def test_the_actor_update_leaves_the_critic_alone_and_normalizers_untouched() -> None:
     learner = make_learner(learning_rate=0.0)
     learner.actor_optimizer.param_groups[0]['lr'] = 0.1
