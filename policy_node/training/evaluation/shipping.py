@@ -80,7 +80,10 @@ def ship(
     if (run / STATE_FILE).is_file():
         ship_critic(run / STATE_FILE, target)
     title = f'{info.task}, {info.config["recipe"]} recipe, seed {info.seed}'
-    draw_curve(read_progress(run / 'progress.csv'), title, target.with_suffix('.png'))
+    progress, curve = read_progress(run / 'progress.csv'), target.with_suffix('.png')
+    # A mean of networks, taken as it is, has no curve of its own: that of a part stays.
+    if progress[-1].get('updates') or not curve.is_file():
+        draw_curve(progress, title, curve)
     shipped.write_text(json.dumps(report, indent=2) + '\n')
     return True
 

@@ -195,7 +195,8 @@ class Trainer:
                 collected = self._collect_or_explain(job)
                 clock.write(self.counters)
                 self._check(losses)
-                if collected.evaluation is None and self.counters.updates > 0 and self._limit():
+                knows = self.counters.updates > 0 or bool(self.config.init_from)
+                if collected.evaluation is None and knows and self._limit():
                     # Noise and learning rate have fallen, and nothing else would measure it.
                     last = self._actor_to_evaluate()
                     collected = submit(self._evaluate, collected, last).result()

@@ -93,6 +93,23 @@ def test_a_run_starts_from_the_mean_of_several(tmp_path: Path, block_run: Path) 
     assert steps_behind({'env_steps': 200, 'init_from': origin}) == 200 + 400 + 2 * (200 + 400)
 
 
+def test_a_mean_is_evaluated_and_shipped_as_it_is(tmp_path: Path, block_run: Path) -> None:
+    """No update comes before `learning_starts`; the curve of the actor before it stays."""
+    actors, runs = tmp_path / 'actors', [block_run, tmp_path / 'second', tmp_path / 'mean']
+    actors.mkdir()
+    arguments = ['--task', 'HandManipulateBlockRotateXYZ', '--steps', '200', *SET]
+    for run, start in ((runs[1], str(block_run)), (runs[2], f'{block_run},{runs[1]}')):
+        given = ['--set', 'learning_starts=100000', '--init-from', start, '--output', str(run)]
+        assert main([*arguments, *given]) == 0
+    assert [row['updates'] for row in read_progress(runs[2] / 'progress.csv')] == [0.0]
+    curve = actors / 'HandManipulateBlockRotateXYZ.png'
+    curve.write_bytes(b'of a part')
+    assert ship_actor([str(runs[2]), '--episodes', '2', '--actors', str(actors)]) == 0
+    assert curve.read_bytes() == b'of a part'
+    report = json.loads(curve.with_suffix('.json').read_text())
+    assert len(report['init_from']['mean_of']) == 2
+
+
 def test_no_mean_of_networks_of_two_tasks(tmp_path: Path, block_run: Path) -> None:
     with pytest.raises(ValueError, match=r'no mean of .*: they are HandManipulateBlockRotateXYZ'):
         read_initial_networks(f'{block_run},HandManipulateEggFull')
