@@ -138,15 +138,15 @@ def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
     """The mean of networks that were trained on from the same ones, each weight for itself.
 
     Such a mean is often better than any of them (Wortsman et al. 2022, "Model soups", arXiv
-    2203.05482). What only some have, as a critic, it has not.
+    2203.05482). What only some have, as a critic, it has not. Tasks may differ, as RotateZ and
+    RotateParallel do; the first is that of the mean.
 
     Raises:
-        ValueError: If they are of different tasks, sizes or inputs.
+        ValueError: If they are of different sizes or inputs, or position counts for some alone.
     """
     first = parts[0]
-    kinds = [(part.origin['task'], part.shape, part.goal_features) for part in parts]
-    for part, kind in zip(parts, kinds, strict=True):
-        if kind != kinds[0]:
+    for part in parts:
+        if _kind(part) != _kind(first):
             raise ValueError(
                 f'no mean of {first.origin["name"]} and {part.origin["name"]}: they are '
                 f'{_described(first)} and {_described(part)}'
@@ -166,6 +166,11 @@ def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
         'mean_of': [part.origin for part in parts],
     }
     return replace(first, tensors=tensors, origin=origin)
+
+
+def _kind(networks: InitialNetworks) -> tuple[object, ...]:
+    counts = task_spec(networks.origin['task']).position_counts
+    return networks.shape, networks.goal_features, counts
 
 
 def _described(networks: InitialNetworks) -> str:

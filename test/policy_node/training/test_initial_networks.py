@@ -110,9 +110,13 @@ def test_a_mean_is_evaluated_and_shipped_as_it_is(tmp_path: Path, block_run: Pat
     assert len(report['init_from']['mean_of']) == 2
 
 
-def test_no_mean_of_networks_of_two_tasks(tmp_path: Path, block_run: Path) -> None:
+def test_no_mean_of_networks_that_differ_in_kind(block_run: Path) -> None:
     with pytest.raises(ValueError, match=r'no mean of .*: they are HandManipulateBlockRotateXYZ'):
         read_initial_networks(f'{block_run},HandManipulateEggFull')
+    with pytest.raises(ValueError, match=r'no mean of .*BlockFull: they are'):
+        read_initial_networks('HandManipulateBlockRotateZ,HandManipulateBlockFull')
+    blocks = read_initial_networks('HandManipulateBlockRotateParallel,HandManipulateBlockRotateZ')
+    assert blocks.origin['task'] == 'HandManipulateBlockRotateParallel'
     with pytest.raises(ValueError, match='nobody'):
         read_initial_networks(f'{block_run},nobody')
 
