@@ -256,11 +256,14 @@ def test_a_second_source_of_time_is_named(start_process: Start) -> None:
 
 
 def test_memory_stays_flat_at_twenty_times_real_time(
-    start_process: Start, soak_seconds: float
+    start_process: Start, soak_seconds: float, tmp_path: Path
 ) -> None:
-    sim = start_process(*SIM_NODE, *ros_args(real_time_factor=20.0))
-    policy = start_process(*POLICY_NODE, *ros_args(policy='random'))
-    with client(REACH) as robot:
+    # Ten episodes a second are a line each: a pipe that nobody reads would be full after a minute,
+    # and a process that logs into it stands still.
+    with (tmp_path / 'log').open('w') as log, client(REACH) as robot:
+        said = {'stdout': log, 'stderr': log}
+        sim = start_process(*SIM_NODE, *ros_args(real_time_factor=20.0), **said)
+        policy = start_process(*POLICY_NODE, *ros_args(policy='random'), **said)
         robot.subscribe('/diagnostics')
         robot.spin_until(
             lambda: (
@@ -275,7 +278,8 @@ def test_memory_stays_flat_at_twenty_times_real_time(
         ticks = int(robot.values()['ticks'])
         deadline = time.monotonic() + soak_seconds
         while time.monotonic() < deadline:
-            robot.spin(1.0)
+            robot.spin(5.0)
+            assert robot.reports() and robot.reports('/policy_node'), 'both go on'
             robot.received.clear()
             robot.received_at.clear()
         robot.spin_until(lambda: bool(robot.reports()), 'a report')

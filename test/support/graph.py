@@ -41,7 +41,7 @@ def ros_args(**parameters: object) -> list[str]:
 def finish(process: subprocess.Popen[str], timeout: float = TIMEOUT) -> tuple[int, str]:
     """Waits for a process; returns its exit code and all it printed."""
     output, errors = process.communicate(timeout=timeout)
-    return process.returncode, output + errors
+    return process.returncode, (output or '') + (errors or '')
 
 
 def end(process: subprocess.Popen[str]) -> str:
