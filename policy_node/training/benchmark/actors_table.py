@@ -47,11 +47,12 @@ def steps_behind(report: dict[str, Any]) -> int:
     Args:
         report: The JSON of an actor.
     """
-    runs: dict[object, int] = {}
+    runs: dict[tuple[object, int], int] = {}
     waiting = [report]
     while waiting:
         run = waiting.pop()
-        runs[run.get('sha256') or id(run)] = int(run['env_steps'])
+        steps = int(run['env_steps'])
+        runs[run.get('sha256') or run.get('name'), steps] = steps
         waiting += [run['init_from']] if run.get('init_from') else []
         waiting += run.get('mean_of', [])
     return sum(runs.values())

@@ -165,7 +165,23 @@ def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
         'command': '',
         'mean_of': [part.origin for part in parts],
     }
-    return replace(first, tensors=tensors, origin=origin)
+    return replace(first, tensors=tensors, origin=_said_once(origin, set()))
+
+
+def _said_once(origin: dict[str, Any], said: set[tuple[Any, ...]]) -> dict[str, Any]:
+    """An origin in which what several parts came from is told in full the first time alone."""
+    key = origin.get('sha256', origin['name']), origin['env_steps']
+    if key in said:
+        short = ('name', 'task', 'env_steps', 'sha256')
+        return {name: origin[name] for name in short if name in origin}
+    said.add(key)
+    before, parts = origin.get('init_from'), origin.get('mean_of')
+    told = dict(origin)
+    if before:
+        told['init_from'] = _said_once(before, said)
+    if parts:
+        told['mean_of'] = [_said_once(part, said) for part in parts]
+    return told
 
 
 def _kind(networks: InitialNetworks) -> tuple[object, ...]:

@@ -89,8 +89,10 @@ def test_a_run_starts_from_the_mean_of_several(tmp_path: Path, block_run: Path) 
     assert main([*arguments, '--output', str(output)]) == 0
     origin = checkpoint.read_info(output / 'latest.safetensors').init_from
     assert [part['name'] for part in origin['mean_of']] == [str(run) for run in runs]
-    # 200 steps each, all from one run of 400, which is counted once where its hash is known.
-    assert steps_behind({'env_steps': 200, 'init_from': origin}) == 200 + 400 + 2 * (200 + 400)
+    before = [part.get('init_from') for part in origin['mean_of']]
+    assert before == [{}, *[{'name': str(block_run), 'task': task, 'env_steps': 400}] * 2]
+    # 200 steps each, all from one run of 400, which counts once.
+    assert steps_behind({'env_steps': 200, 'init_from': origin}) == 200 + 400 + 2 * 200
 
 
 def test_a_mean_is_evaluated_and_shipped_as_it_is(tmp_path: Path, block_run: Path) -> None:
