@@ -8,7 +8,7 @@ and prints a table beside the published numbers.
 the networks of another. At the end it also evaluates each best actor on fresh episodes and puts it
 with its critic, evaluation and curve into <output>/actors.
 
-`--study NAME`, any other: one of the paper's requests for research (docs/research). Trains
+`--study NAME`, any other: one of the paper's requests for research, or `ingredients`. Trains
 task x arm x seed, measures each run on fresh episodes, and renews data, figure and table in
 docs/research/NAME after each.
 

@@ -1,4 +1,4 @@
-"""The studies of the paper's nine requests for research: what each compares, as data.
+"""The studies: what each compares, as data. Nine answer the paper's requests for research.
 
 All arms of a study share task, budget and settings and differ in `changes` alone. Settings are the
 `best` recipe but for what is named here. Every run is one of `train_her`: on one thread it gives
@@ -33,7 +33,8 @@ class Study:
 
     Attributes:
         name: Name of the folder and of the command-line option.
-        request: Number of the request in the second part of Plappert et al. 2018.
+        request: Number of the request in the second part of Plappert et al. 2018; None if it
+            answers none of them.
         question: What it asks.
         settings: Fields of `TrainConfig` for all arms, by task; the first task is the default.
         arms: What is compared; the first is the baseline.
@@ -41,7 +42,7 @@ class Study:
     """
 
     name: str
-    request: int
+    request: int | None
     question: str
     settings: Mapping[str, Mapping[str, Any]]
     arms: tuple[Arm, ...]
@@ -79,6 +80,7 @@ _PICK = {'total_steps': 800_000, **_EVALUATED}
 _SLIDE = {'total_steps': 2_000_000, **_EVALUATED, 'evaluate_every': 64_000}
 _ROTATE = {'total_steps': 1_000_000, **_EVALUATED, 'evaluate_every': 64_000}
 _ROTATE_XYZ = {**_ROTATE, 'total_steps': 2_000_000}
+_SCREENED = {'evaluate_every': 64_000, 'evaluation_episodes': 128}
 # Sparse, with settings that the dense recipe of the task does not have.
 _SPARSE_HAND_REACH = {
     'total_steps': 2_000_000,
@@ -324,6 +326,23 @@ STUDIES: dict[str, Study] = {
                 'FetchPush': _PUSH,
             },
             _rates(),
+        ),
+        Study(
+            'ingredients',
+            None,
+            'What does each part of the recipe for the hand buy?',
+            {
+                'HandManipulateEggRotate': {**_SCREENED, 'total_steps': 400_000},
+                'HandManipulateBlockRotateXYZ': {**_SCREENED, 'total_steps': 600_000},
+            },
+            (
+                Arm('best', 'the recipe'),
+                Arm('plain', 'plain features', {'goal_features': 'plain'}),
+                Arm('few', '13 samples per step, not 51', {'batch_size': 256}),
+                Arm('future', 'future goals alone', {'strategy': 'future'}),
+                Arm('graded', 'graded rewards', {'reward_grades': '.5,1,2'}),
+            ),
+            seeds=2,
         ),
     )
 }

@@ -73,8 +73,9 @@ class DDPG(ActorCritic):
             self._achieved_start = task_spec(config.task).achieved_goal_start
         self._action_size = shape.action_size - (config.longest_hold > 1)
         self._bfloat16 = uses_bfloat16(config.precision, device)
+        zero = torch.zeros((), device=device)
         # Loss and value at the actor's last update.
-        self._of_actor = torch.zeros(()), torch.zeros(())
+        self._of_actor = zero, zero
 
     def update(self, batch: Transitions) -> Losses:
         """Improves critic and actor on a batch and, when due, moves the targets."""
@@ -87,7 +88,7 @@ class DDPG(ActorCritic):
         self.updates += 1
         if self.updates % self.config.target_update_interval == 0:
             self._move_targets()
-        return Losses(critic_loss.detach(), actor_loss.detach(), value.detach())
+        return Losses(critic_loss.detach(), actor_loss, value)
 
     def targets(self, reward: Tensor, discount: Tensor, next_features: Tensor) -> Tensor:
         """Targets (batch,) from reward, discount and the features of the next state."""
@@ -196,7 +197,7 @@ class DDPG(ActorCritic):
             loss = -value + self._penalty(known, action)
         if self.updates >= self.critic_first:
             self.step(self.actor_optimizer, loss, self.actor_parameters)
-        return loss, value
+        return loss.detach(), value.detach()
 
     def _penalty(self, known: Known, action: Tensor) -> Tensor:
         """What the actor's actions cost beside their value."""

@@ -7,7 +7,6 @@ what it knows of one while it never meets both.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -54,12 +53,9 @@ def parse_grades(text: str) -> tuple[float, ...]:
         grades = tuple(float(part) for part in text.split(','))
     except ValueError:
         grades = ()
-    if not grades or not _rising((0.0, *grades, 1e3)):
+    rising = all(low < high for low, high in pairwise((0.0, *grades, 1e3)))
+    if not grades or not rising:
         raise ValueError(
             f'reward_grades {text!r}: numbers above 0 and below 1000, rising, as in .5,1,2'
         )
     return grades
-
-
-def _rising(values: Sequence[float]) -> bool:
-    return all(first < second for first, second in pairwise(values))
