@@ -39,7 +39,7 @@ help:
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
 	@echo 'make torture    100,000 hostile messages per test, an hour of memory at 20x, 50 killed'
 	@echo '                robots, 10,000 damaged and 2,000 crafted episode files'
-	@echo 'make test-release  the tests that train or install, and the tutorials; documentation; wheel and'
+	@echo 'make test-release  the long tests, among them the tutorials; documentation; wheel and'
 	@echo '                sdist, built, installed elsewhere and used; the tests of Gymnasium-Robotics'
 	@echo 'make bench-episodes  what logging costs and how fast logs load'
 	@echo 'make env        only create $(VENV)'
@@ -124,7 +124,7 @@ bench-rate: env
 	$(BIN)/python bench/bench_rate.py --seconds $(SECONDS)
 
 torture: env
-	$(BIN)/python -m pytest --hostile-messages 100000 --soak-seconds 3600 --timeout 0 \
+	$(BIN)/python -m pytest -m '' --hostile-messages 100000 --soak-seconds 3600 --timeout 0 \
 		test/fetch_hand_sim/sim_node/test_receivers.py \
 		test/policy_node/node/test_responder.py test/policy_node/policies/test_hostile_files.py \
 		test/nodes/test_nodes_hostile.py

@@ -13,7 +13,10 @@ from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import read_summary
 
 
-@pytest.mark.parametrize(('number', 'code'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ('number', 'code'),
+    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.release)],
+)
 def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, tmp_path):
     command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting']
     demo = start_process(*command, '--episodes', '100', cwd=tmp_path)

@@ -255,6 +255,7 @@ def test_a_second_source_of_time_is_named(start_process: Start) -> None:
     assert '/clock comes from /a/sim_node too' in outputs[1]
 
 
+@pytest.mark.release
 def test_memory_stays_flat_at_twenty_times_real_time(
     start_process: Start, soak_seconds: float, tmp_path: Path
 ) -> None:

@@ -312,7 +312,7 @@ def test_who_comes_while_the_robot_stands_still_sees_the_last_tick(start_process
     end(node)
 
 
-@pytest.mark.parametrize('simulated_time', [False, True])
+@pytest.mark.parametrize('simulated_time', [pytest.param(False, marks=pytest.mark.release), True])
 def test_another_robot_in_the_same_place_is_followed(
     start_process: Start, simulated_time: bool
 ) -> None:

@@ -75,7 +75,9 @@ def record(start_process, directory, task, actor):
     return min(directory.iterdir())
 
 
-@pytest.mark.parametrize('task', ['FetchReach', 'HandManipulateBlockFull'])
+@pytest.mark.parametrize(
+    'task', ['FetchReach', pytest.param('HandManipulateBlockFull', marks=pytest.mark.release)]
+)
 def test_actor_on_a_replay_repeats_the_recorded_commands(start_process, tmp_path, task):
     """FetchReach with the shipped actor, a hand task with an untrained one."""
     actor: object = 'FetchReach'
