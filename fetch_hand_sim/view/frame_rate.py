@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from msgs_spec.topics import LATEST_TICKS_PER_SECOND
 
 # Seconds between two frames that only follow the robot, and so between two pictures of it.
 FOLLOWING = 1.0 / LATEST_TICKS_PER_SECOND
+# The same of a robot that is faster than real time, whose ticks no eye follows one by one.
+OVERLOOKING = 1.0 / 20.0
 # Seconds after the last touch for which frames come as fast as the viewer makes them.
 _ATTENTION = 0.5
 
@@ -32,11 +35,17 @@ class Touch:
 class FrameRate:
     """Says how long to wait before the next frame. Times are seconds of one clock that only grows.
 
-    A robot in lockstep beside a viewer, on two processors, pays for every frame that shows nothing
-    new.
+    A robot in lockstep beside a viewer, on two processors, pays for every frame.
+
+    Args:
+        period: Seconds between two frames while nobody touches the page, asked for each.
+
+    Attributes:
+        period: As given.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, period: Callable[[], float] = lambda: FOLLOWING) -> None:
+        self.period = period
         self._touch = Touch()
         self._touched = 0.0
         self._began = 0.0
@@ -49,6 +58,6 @@ class FrameRate:
         self._touch = touch
         wait = 0.0
         if now - self._touched > _ATTENTION:
-            wait = max(0.0, self._began + FOLLOWING - now)
+            wait = max(0.0, self._began + self.period() - now)
         self._began = now + wait
         return wait

@@ -11,6 +11,7 @@ from rclpy.node import Node
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import tracked_position
 from fetch_hand_sim.view.curves import Curves
+from fetch_hand_sim.view.frame_rate import FOLLOWING, OVERLOOKING
 from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Graphs, Picture
 from fetch_hand_sim.view.requests import LatestRequest, Request, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RobotRequests
@@ -20,6 +21,9 @@ from msgs_spec.codecs import decode_status
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic
+
+# Of the ticks per second that a robot has in real time: one with more is faster.
+_HURRY = 1.5
 
 
 class LiveRobot:
@@ -52,6 +56,13 @@ class LiveRobot:
     def spec(self) -> TaskSpec | None:
         """The robot's task; None until there is one."""
         return self._watch.spec
+
+    @property
+    def picture_period(self) -> float:
+        """Seconds between two pictures that show enough of it."""
+        status = self._watch.status
+        is_fast = status is not None and self._facts.rate > _HURRY * status.control_hz
+        return OVERLOOKING if is_fast else FOLLOWING
 
     def picture(self) -> Picture | None:
         """Returns what to show if it has changed since the last call."""

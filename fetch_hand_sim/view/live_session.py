@@ -17,7 +17,7 @@ from rclpy.node import Node
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
-from fetch_hand_sim.view.frame_rate import FOLLOWING, FrameRate
+from fetch_hand_sim.view.frame_rate import FrameRate
 from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests, Session
@@ -47,12 +47,13 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
         loop = EventLoop(node)
         stack.callback(loop.close)
         plugins = [Page(), Requests(robot.perform)]
-        handle, address = open_page(options.host, options.port, plugins, FrameRate())
+        frame_rate = FrameRate(lambda: robot.picture_period)
+        handle, address = open_page(options.host, options.port, plugins, frame_rate)
         stack.callback(handle.close)
         nodes = stack.enter_context(_nodes(options, node, robot, loop, stop))
         _give_way()
         announce(address, options.browser)
-        _serve(Session(handle, robot), loop, nodes, stop)
+        _serve(Session(handle, robot), frame_rate, loop, nodes, stop)
 
 
 @contextmanager
@@ -137,11 +138,15 @@ def _give_way() -> None:
 
 
 def _serve(
-    session: Session, loop: EventLoop, nodes: list[subprocess.Popen[str]], stop: StopSignals
+    session: Session,
+    frame_rate: FrameRate,
+    loop: EventLoop,
+    nodes: list[subprocess.Popen[str]],
+    stop: StopSignals,
 ) -> None:
     is_new = False
     while not stop and all(node.poll() is None for node in nodes):
         # Asleep, not waiting for messages: a robot in lockstep sends thousands a second.
-        time.sleep(FOLLOWING if is_new else _FRAME_TIME)
+        time.sleep(frame_rate.period() if is_new else _FRAME_TIME)
         loop.serve_pending(_SERVED_FIRST)
         is_new = session.update()

@@ -21,6 +21,10 @@ def test_nobody_touches_the_page():
     assert len(frames(FrameRate(), 10.0, 12.0)) == pytest.approx(60, abs=2)
 
 
+def test_a_robot_in_a_hurry_is_shown_less_often():
+    assert len(frames(FrameRate(lambda: 0.05), 10.0, 12.0)) == pytest.approx(40, abs=2)
+
+
 def test_a_frame_that_takes_longer_is_followed_at_once():
     assert len(frames(FrameRate(), 10.0, 12.0, work=0.05)) == 40
 
