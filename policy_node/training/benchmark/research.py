@@ -333,7 +333,7 @@ STUDIES: dict[str, Study] = {
             'What does each part of the recipe for the hand buy?',
             {
                 'HandManipulateEggRotate': {**_SCREENED, 'total_steps': 400_000},
-                'HandManipulateBlockRotateXYZ': {**_SCREENED, 'total_steps': 600_000},
+                'HandManipulateBlockRotateXYZ': {**_SCREENED, 'total_steps': 400_000},
             },
             (
                 Arm('best', 'the recipe'),
