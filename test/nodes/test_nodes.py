@@ -58,6 +58,7 @@ def test_actor_in_another_process_reaches_its_goals(start_process: Start, tmp_pa
     assert all(len(e.metadata['checkpoint_sha256']) == 64 for e in logged)
 
 
+@pytest.mark.alone
 def test_no_tick_is_left_out_and_all_are_40_ms_apart(start_process: Start) -> None:
     """How even the rate is in wall time depends on the machine: `make bench-rate` measures it."""
     sim = start_process(*SIM_NODE)

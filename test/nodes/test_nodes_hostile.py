@@ -41,6 +41,7 @@ def resident_kilobytes(process: subprocess.Popen[str]) -> int:
     return int(re.search(r'VmRSS:\s+(\d+) kB', status)[1])
 
 
+@pytest.mark.alone
 def test_flood_of_commands_neither_delays_nor_grows_the_robot(start_process: Start) -> None:
     sim = start_process(*SIM_NODE)
     source = topic(REACH, 'commands')
@@ -78,6 +79,7 @@ def test_flood_of_commands_neither_delays_nor_grows_the_robot(start_process: Sta
     end(sim)
 
 
+@pytest.mark.alone
 def test_hostile_messages_on_every_input_leave_robot_policy_and_log_sound(
     start_process: Start, tmp_path: Path, hostile_count: int
 ) -> None:
@@ -173,6 +175,7 @@ def test_best_effort_commander_is_named(start_process: Start) -> None:
     assert '/commands of /client is not received' in end(sim)
 
 
+@pytest.mark.alone
 def test_stopped_simulation_counts_what_it_missed_and_never_makes_up_for_it(
     start_process: Start,
 ) -> None:

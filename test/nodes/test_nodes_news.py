@@ -125,6 +125,7 @@ def test_whoever_joins_a_robot_that_stands_still_sees_its_last_state(
     end(sim)
 
 
+@pytest.mark.alone
 def test_oversized_messages_cost_neither_the_log_nor_the_rate(
     start_process: Start, tmp_path: Path
 ) -> None:

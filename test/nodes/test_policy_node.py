@@ -135,6 +135,7 @@ def test_robots_in_other_namespaces_are_named(start_process: Start) -> None:
     end(sim)
 
 
+@pytest.mark.alone
 def test_the_first_command_comes_soon_after_the_start(start_process: Start) -> None:
     """Under 3 s on an idle machine; this one may be busy, so only what it costs is counted."""
     import resource

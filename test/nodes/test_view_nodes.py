@@ -184,6 +184,7 @@ def test_the_robot_shares_no_memory_with_who_listens(start_process: Start) -> No
         assert '/dev/shm/fastrtps' in Path('/proc/self/maps').read_text()
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP])
 def test_a_viewer_that_dies_or_hangs_is_not_noticed(start_process: Start, number: int) -> None:
     start_process(*SIM_NODE, *ros_args(task='FetchReach'))
@@ -372,6 +373,7 @@ def test_a_viewer_sees_another_robot_in_the_same_place(start_process: Start) -> 
         rclpy.shutdown()
 
 
+@pytest.mark.alone
 def test_a_fast_robot_is_seen_as_it_is_now_and_then_and_a_replay_after_it(
     start_process: Start, tmp_path: Path
 ) -> None:

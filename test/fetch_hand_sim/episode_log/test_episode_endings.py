@@ -36,6 +36,7 @@ def finish(process, timeout=TIMEOUT):
     return process.returncode, output + errors
 
 
+@pytest.mark.alone
 @pytest.mark.timeout(60 + 10 * KILLS)
 def test_killed_at_random_moments_a_robot_loses_a_quarter_of_a_second(tmp_path):
     """At factors 1 to 50 of real time, and nothing is left that recovery could not clear away."""

@@ -102,6 +102,7 @@ def test_the_file_is_the_one_a_writer_alone_makes(
     assert len(made) == 2 and made == files(tmp_path / 'writer')
 
 
+@pytest.mark.alone
 def test_a_slow_disk_delays_no_tick(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,6 +119,7 @@ def test_a_slow_disk_delays_no_tick(
     assert len(list((tmp_path / 'recorder').iterdir())) == 2
 
 
+@pytest.mark.alone
 def test_a_robot_that_is_faster_than_its_disk_waits_and_says_so(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:

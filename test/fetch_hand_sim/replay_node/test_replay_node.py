@@ -123,6 +123,7 @@ def test_generated_episodes_equal_those_of_the_nodes(start_process, tmp_path):
     assert [batch.metadata[key] for key in same] == [node.metadata[key] for key in same]
 
 
+@pytest.mark.alone
 def test_every_message_comes_back_as_recorded_with_its_timing(start_process, episode):
     logged = read_episode(episode)
     with client(REACH) as listener:
@@ -168,6 +169,7 @@ def test_late_subscribers_get_the_latched_topics_of_an_offset(start_process, epi
         assert message_stamp(listener.received['joint_states'][0]) == 2_000_000_000
 
 
+@pytest.mark.alone
 def test_rate_loop_and_pause(start_process, episode):
     start_process(*REPLAY_NODE, *ros_args(path=episode, rate=2.0, loop=True))
     with client(REACH) as listener:
@@ -266,6 +268,7 @@ def test_an_episode_with_unreadable_messages_is_refused(episode, tmp_path):
     shutil.rmtree(path)
 
 
+@pytest.mark.alone
 def test_playhead_follows_rate_and_pauses():
     head = Playhead(1_000, 2.0, now=10.0, is_paused=True)
     assert head.position_ns(99.0) == 1_000
