@@ -193,8 +193,9 @@ class Processes:
 
 def _work(job: Job, command: str) -> None:
     """The body of a process of `Processes`."""
-    # Out of the terminal's group, so that Ctrl-C does not come twice.
-    os.setsid()
+    # Out of the terminal's group, so that Ctrl-C does not come twice; in the session of the caller,
+    # because Linux shares processors out by session: in one of its own `nice` would not hold.
+    os.setpgid(0, 0)
     if sys.platform == 'linux':
         ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
     job.folder.mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -134,6 +135,9 @@ def test_two_at_once_are_stopped_resumed_and_shipped(tmp_path: Path) -> None:
         while not all(log.is_file() and log.read_text().count('\n') >= 2 for log in logs):
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.05)
+        children = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
+        sessions = {os.getsid(int(child)) for child in children}
+        assert sessions == {os.getsid(process.pid)}, 'where Linux groups by session, `nice` holds'
         process.send_signal(signal.SIGINT)
         printed, said = process.communicate(timeout=200)
     finally:
