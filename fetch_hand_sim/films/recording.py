@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode
-from fetch_hand_sim.episode_log.messages import read_messages
+from fetch_hand_sim.episode_log.messages import MessageFile, read_messages
 from fetch_hand_sim.episode_log.summary import expand_episodes
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
@@ -54,8 +54,9 @@ def load_recording(path: Path) -> Recording:
     arrays = load_episode(path)
     ticks = len(arrays) + 1
     spec = arrays.spec
-    joints = _vectors(path, spec, 'joint_states', ticks)[:, : len(spec.robot.joints)]
-    poses = _object_poses(path, arrays, ticks)
+    messages = read_messages(path)
+    joints = _vectors(messages, spec, 'joint_states', ticks)[:, : len(spec.robot.joints)]
+    poses = _object_poses(messages, arrays, ticks)
     achieved, desired = arrays.observations['achieved_goal'], arrays.goals
     frames = [
         Frame(
@@ -71,23 +72,22 @@ def load_recording(path: Path) -> Recording:
     return Recording(arrays, frames, times, arrays.path.stem.removesuffix('_0'))
 
 
-def _object_poses(path: Path, arrays: EpisodeArrays, ticks: int) -> Array | None:
+def _object_poses(messages: MessageFile, arrays: EpisodeArrays, ticks: int) -> Array | None:
     if not arrays.spec.has_object:
         return None
     if arrays.spec.goal is GoalKind.POSE:
         return arrays.observations['achieved_goal']
-    return _vectors(path, arrays.spec, 'object_pose', ticks)
+    return _vectors(messages, arrays.spec, 'object_pose', ticks)
 
 
-def _vectors(path: Path, spec: TaskSpec, name: str, ticks: int) -> Array:
+def _vectors(messages: MessageFile, spec: TaskSpec, name: str, ticks: int) -> Array:
     """The vectors (ticks, size) of a topic that every tick has."""
-    file = read_messages(path)
-    resolved = next((each for each in file.offsets if each.rpartition('/')[2] == name), name)
+    resolved = next((each for each in messages.offsets if each.rpartition('/')[2] == name), name)
     try:
-        rows = file.rows(resolved).data[:ticks]
+        rows = messages.rows(resolved).data[:ticks]
         return TopicCodec(topic(spec, name)).decode_many(rows)[1]
     except (ValueError, KeyError) as error:
-        raise EpisodeReadError(f'{file.path}: no readable {name}: {error}') from error
+        raise EpisodeReadError(f'{messages.path}: no readable {name}: {error}') from error
 
 
 def load_recordings(path: Path, count: int) -> list[Recording]:
