@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from msgs_spec.command_line import (
     EXIT_SUCCESS,
@@ -45,7 +45,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     add('--task', choices=list(TASKS), metavar='TASK', help=', '.join(TASKS))
-    add('--recipe', choices=RECIPES, default='best', help='default: best')
+    add('--recipe', choices=RECIPES, help='default: best')
     add('--her', action=argparse.BooleanOptionalAction, default=True, help='hindsight on or off')
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='a field by its name')
     add('--output', type=Path, help='default: runs/<task>_<recipe>_seed<seed>')
@@ -62,23 +62,33 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
         ValueError: If something is missing, unknown or not allowed.
     """
     overrides = given_fields(options, _OWN_OPTIONS)
+    overrides.update(parse_assignment(text) for text in options.set)
     if not options.her:
         if overrides.get('strategy', 'none') != 'none':
             raise ValueError(f'--no-her excludes --strategy {overrides["strategy"]}')
         overrides['strategy'] = 'none'
-    overrides.update(parse_assignment(text) for text in options.set)
-    if options.resume is None:
-        if options.task is None:
-            raise ValueError(f'--task is missing; allowed: {", ".join(TASKS)}')
-        return recipe_config(options.task, options.recipe, **overrides)
+    if options.resume is not None:
+        return _resumed_config(options, overrides)
+    if options.task is None:
+        raise ValueError(f'--task is missing; allowed: {", ".join(TASKS)}')
+    return recipe_config(options.task, options.recipe or 'best', **overrides)
+
+
+def _resumed_config(options: argparse.Namespace, overrides: dict[str, Any]) -> TrainConfig:
+    """The configuration of a run that goes on, with what may change in it."""
     from policy_node.training.learning.run_folder import STATE_FILE
     from policy_node.training.learning.training_state import read_state
 
-    if options.init_from is not None:
+    if options.output is not None:
+        raise ValueError(f'--output excludes --resume: the run goes on in {options.resume}')
+    if overrides.get('init_from'):
         raise ValueError('--init-from excludes --resume: a run goes on with its own networks')
     stored = read_state(options.resume / STATE_FILE).extra['config']
-    if options.task not in (None, stored['task']):
-        raise ValueError(f'{options.resume} is a run of {stored["task"]}, not of {options.task}')
+    for name in _OWN_OPTIONS:
+        chosen = (getattr(options, name), overrides.get(name))
+        wrong = [value for value in chosen if value not in (None, stored.get(name))]
+        if wrong:
+            raise ValueError(f'{options.resume} is a run of {stored.get(name)}, not of {wrong[0]}')
     return config_from_dict({**stored, **overrides})
 
 
@@ -121,6 +131,8 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
     """
     if directory is None:
         return None
+    if config.algorithm == 'ppo':
+        raise ValueError('algorithm ppo excludes --from-episodes: it learns from its own alone')
     if config.longest_hold > 1:
         raise ValueError(
             'longest_hold above 1 excludes --from-episodes: their actions have no length'

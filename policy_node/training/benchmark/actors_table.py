@@ -8,6 +8,7 @@ from typing import Any
 
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.published import BEST, CEILINGS
+from policy_node.training.learning.origins import steps_behind
 
 
 def actors_table(actors: Path) -> str:
@@ -39,20 +40,3 @@ def _row(task: str, report: dict[str, Any]) -> str:
         str(BEST.get(task, 'no number found')),
     ]
     return f'| {" | ".join(cells)} |'
-
-
-def steps_behind(report: dict[str, Any]) -> int:
-    """Environment steps behind an actor and behind all that its training started from, each once.
-
-    Args:
-        report: The JSON of an actor.
-    """
-    runs: dict[tuple[object, int], int] = {}
-    waiting = [report]
-    while waiting:
-        run = waiting.pop()
-        steps = int(run['env_steps'])
-        runs[run.get('sha256') or run.get('name'), steps] = steps
-        waiting += [run['init_from']] if run.get('init_from') else []
-        waiting += run.get('mean_of', [])
-    return sum(runs.values())

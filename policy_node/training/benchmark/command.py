@@ -40,7 +40,7 @@ from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.jobs import ARMS, Job
 from policy_node.training.benchmark.research import FINAL_EPISODES, STUDIES, research_jobs
-from policy_node.training.benchmark.research_report import write_study
+from policy_node.training.benchmark.research_report import require_all_runs, write_study
 from policy_node.training.benchmark.results import write_report
 from policy_node.training.benchmark.studies import best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
@@ -61,8 +61,11 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     names = ('paper', 'best', *STUDIES)
     add('--study', choices=names, default='paper', help='default: paper')
-    add('--tasks', nargs='+', choices=list(TASKS), metavar='TASK', help='default: FetchReach; all')
-    add('--seeds', nargs='+', type=int, metavar='SEED', help='default: 0 1 2 3 4; 0')
+    default = 'default: FetchReach; all; the first of the study'
+    add('--tasks', nargs='+', choices=list(TASKS), metavar='TASK', help=default)
+    add(
+        '--seeds', nargs='+', type=int, metavar='SEED', help='default: 0 to 4 (ingredients: 0 1); 0'
+    )
     add('--arms', nargs='+', metavar='ARM', help='default: all; not in study best')
     count = whole_number(1)
     add('--jobs', type=count, help='at once; default: 1; one per core')
@@ -123,6 +126,9 @@ def _overrides(options: argparse.Namespace) -> dict[str, Any]:
     for name in decided:
         if name in overrides:
             raise ValueError(f'--set {name} is not possible: jobs differ in it')
+    for name in ('time_limit', 'success_target'):
+        if overrides.get(name):
+            raise ValueError(f'--set {name} is not possible: a job ends when its steps are done')
     if overrides.get('strategy') == 'none':
         raise ValueError('--set strategy=none is not possible: choose --arms')
     return overrides
@@ -183,6 +189,8 @@ def _run(options: argparse.Namespace, command: str) -> int:
         require_extra('cluster')
     try:
         jobs = jobs_from_arguments(options)
+        if options.study in STUDIES:
+            require_all_runs(jobs, _report_folder(options))
         _output(options).mkdir(parents=True, exist_ok=True)
     except (ValueError, TypeError) as error:
         raise UsageError(str(error)) from None

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from policy_node.training.benchmark.final import FINAL_FILE
+from policy_node.training.benchmark.final import FINAL_FILE, read_final
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.config_values import config_from_dict
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.run_log import read_progress
-from policy_node.training.learning.training_state import read_state
+from policy_node.training.learning.training_state import read_counters, read_state
 
 PROGRESS_FILE = 'progress.csv'
 # What may differ between two parts of a job without another result to be expected; where a run
@@ -85,13 +85,21 @@ class Job:
     @property
     def is_finished(self) -> bool:
         """Whether the budget is spent, so that the curve is whole, and the end measured."""
-        measured = not self.final_episodes or (self.folder / FINAL_FILE).is_file()
-        return self.is_trained and measured
+        return self.is_trained and self._is_measured
+
+    @property
+    def _is_measured(self) -> bool:
+        if not self.final_episodes:
+            return True
+        measured = (self.folder / FINAL_FILE).is_file()
+        return measured and read_final(self.folder)['episodes'] == self.final_episodes
 
     @property
     def is_trained(self) -> bool:
-        """Whether the budget is spent."""
-        return self.has_checkpoint and self.env_steps >= self.config.total_steps
+        """Whether the budget is spent and the end saved; a log may be ahead of what was saved."""
+        if not self.has_checkpoint:
+            return False
+        return read_counters(self.folder / STATE_FILE).env_steps >= self.config.total_steps
 
     @property
     def is_ready(self) -> bool:

@@ -1,4 +1,8 @@
-"""Data, figure and table of a study, under `docs/research/<name>`; renewed after every run."""
+"""Data, figure and table of a study, under `docs/research/<name>`; renewed after every run.
+
+A command renews the tasks that it runs; what is there of other tasks, from another day or machine,
+stays.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,8 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import (
@@ -19,48 +25,137 @@ from policy_node.training.benchmark.measures import (
 )
 from policy_node.training.benchmark.research import STEP_COUNTS, Study
 from policy_node.training.benchmark.results import (
+    Band,
+    Curve,
     aggregate,
     by_arm,
+    curve_rows,
     draw,
     machine,
     source_revisions,
-    write_curves,
+    write_csv,
 )
 
 # The page of a study keeps its table between these lines.
 BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'
+_RUNS, _ARMS, _CURVES, _ABOUT = 'runs.csv', 'arms.csv', 'curves.csv', 'study.json'
+
+Rows = list[dict[str, Any]]
+
+
+def require_all_runs(jobs: Sequence[Job], output: Path) -> None:
+    """Refuses a folder that holds runs of the jobs' tasks which are not among the jobs.
+
+    They would be gone.
+
+    Args:
+        jobs: Jobs of a study, finished or not.
+        output: Folder that `write_study` is to write.
+
+    Raises:
+        ValueError: If a run would be lost, or it cannot be seen whether; the line names one.
+    """
+    _tasks_told(output / _ABOUT)
+    tasks = {job.config.task for job in jobs}
+    ours = {(job.config.task, job.arm.name, job.config.seed) for job in jobs}
+    try:
+        found = [(row['task'], row['arm'], row['seed']) for row in read_rows(output / _RUNS)]
+    except KeyError as error:
+        raise ValueError(f'{output / _RUNS} has no column {error}') from None
+    lost = [key for key in found if key[0] in tasks and key not in ours]
+    if lost:
+        task, arm, seed = lost[0]
+        raise ValueError(
+            f'{output} holds runs that this command has not ({len(lost)}), as {task}/{arm}/seed'
+            f'{seed}: name their arms and seeds too, or another folder with --report'
+        )
 
 
 def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -> None:
-    """Writes what the finished jobs of a study gave.
+    """Writes what the finished jobs of a study gave, beside what is there of other tasks.
 
     `runs.csv` (one row per run), `arms.csv` (medians and quartiles), `curves.csv` (every
-    evaluation), `study.json` (command, machine, revisions, settings), `figure.png`, and the table
-    between its marks in `README.md`, which is made where there is none.
+    evaluation), `study.json` (by task: command, machine, revisions, settings), `figure.png`, and
+    the table between its marks in `README.md`, which is made where there is none.
 
     Args:
         study: The study.
         jobs: Finished jobs.
         output: Folder.
         command: Command line, for the record.
+
+    Raises:
+        ValueError: If a file of the folder cannot be read.
     """
     output.mkdir(parents=True, exist_ok=True)
     found = [curve_of(job) for job in jobs]
     runs = [measure_run(job, curve) for job, curve in zip(jobs, found, strict=True)]
-    groups, curves = by_arm(jobs, runs), by_arm(jobs, found)
+    groups = by_arm(jobs, runs)
     order = [arm.name for arm in study.arms]
-    arms = [sum_up(groups[task][name]) for task in groups for name in order if name in groups[task]]
-    _write_csv(runs, output / 'runs.csv')
-    _write_csv(arms, output / 'arms.csv')
-    write_curves(jobs, found, output / 'curves.csv')
-    (output / 'study.json').write_text(json.dumps(_about(study, jobs, command), indent=2) + '\n')
+    arms = [sum_up(group[name]) for group in groups.values() for name in order if name in group]
+    for name, rows in ((_RUNS, runs), (_ARMS, arms), (_CURVES, curve_rows(jobs, found))):
+        write_csv(_with_other_tasks(study, rows, output / name), output / name)
+    about = _about(study, jobs, command, output / _ABOUT)
+    (output / _ABOUT).write_text(json.dumps(about, indent=2) + '\n')
     labels = {arm.name: arm.label for arm in study.arms}
-    bands = {
-        task: {name: aggregate(group[name]) for name in order if name in group}
-        for task, group in curves.items()
-    }
+    bands = _bands(read_rows(output / _CURVES))
     draw(bands, labels, output / 'figure.png', paper_epochs=False)
-    _renew(output / 'README.md', format_table(study, arms))
+    _renew(output / 'README.md', format_table(study, read_rows(output / _ARMS)))
+
+
+def read_rows(path: Path) -> Rows:
+    """Rows of a CSV file, numbers as numbers; none where there is no file.
+
+    Raises:
+        ValueError: If it cannot be read.
+    """
+    if not path.is_file():
+        return []
+    try:
+        rows = list(csv.DictReader(path.read_text().splitlines()))
+    except OSError as error:
+        raise ValueError(f'{path} cannot be read: {error.strerror}') from None
+    return [{name: _value(text) for name, text in row.items()} for row in rows]
+
+
+def _value(text: str | None) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(text or '')
+        except ValueError:
+            continue
+    return text or ''
+
+
+def _with_other_tasks(study: Study, rows: Rows, path: Path) -> Rows:
+    """New rows and those that a file has of other tasks, in the order of the study's tasks."""
+    tasks = {row['task'] for row in rows}
+    kept = [row for row in read_rows(path) if row['task'] not in tasks]
+    order = {name: index for index, name in enumerate(study.tasks)}
+    return sorted([*kept, *rows], key=lambda row: order.get(row['task'], len(order)))
+
+
+def _bands(rows: Rows) -> dict[str, dict[str, Band]]:
+    """Median and quartiles over seeds, by task and arm, of the rows of `curves.csv`."""
+    bands: dict[str, dict[str, Band]] = {}
+    for (task, arm), points in _grouped(rows, 'task', 'arm').items():
+        curves = [
+            Curve(
+                env_steps=np.array([row['env_steps'] for row in run], np.float64),
+                success=np.array([row['success'] for row in run], np.float64),
+                episodes=0,
+            )
+            for run in _grouped(points, 'seed').values()
+        ]
+        bands.setdefault(task, {})[arm] = aggregate(curves)
+    return bands
+
+
+def _grouped(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
+    groups: dict[tuple[Any, ...], Rows] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups
 
 
 def format_table(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
@@ -75,7 +170,7 @@ def format_table(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
         steps = row[f'steps_to_{GOOD_SUCCESS}_median']
         cells = [
             row['task'],
-            f'`{row["arm"]}`: {labels[row["arm"]]}',
+            f'`{row["arm"]}`: {labels.get(row["arm"], "an arm of before")}',
             str(row['seeds']),
             _quartiles(row, 'area'),
             f'{steps:,} ({row["reached"]})' if steps != '' else f'censored ({row["reached"]})',
@@ -109,17 +204,31 @@ def _quartiles(row: Mapping[str, Any], name: str) -> str:
     return '{:.3f} ({:.3f} ... {:.3f})'.format(*values)
 
 
-def _about(study: Study, jobs: Sequence[Job], command: str) -> dict[str, Any]:
+def _about(study: Study, jobs: Sequence[Job], command: str, path: Path) -> dict[str, Any]:
+    """What `study.json` says; of other tasks, what it says already."""
+    tasks = _tasks_told(path)
+    for task, settings in _shared_settings(study, jobs).items():
+        tasks[task] = {
+            'command': command,
+            'source_revisions': source_revisions([j for j in jobs if j.config.task == task]),
+            'machine': machine(),
+            'settings': settings,
+        }
     return {
         'study': study.name,
         'request': study.request,
         'question': study.question,
-        'command': command,
-        'source_revisions': source_revisions(jobs),
-        'machine': machine(),
-        'settings': _shared_settings(study, jobs),
         'arms': {arm.name: dict(arm.changes) for arm in study.arms},
+        'tasks': tasks,
     }
+
+
+def _tasks_told(path: Path) -> dict[str, Any]:
+    """What a `study.json` says of its tasks."""
+    try:
+        return dict(json.loads(path.read_text())['tasks']) if path.is_file() else {}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f'{path} is no record of a study: {error!r}') from None
 
 
 def _shared_settings(study: Study, jobs: Sequence[Job]) -> dict[str, dict[str, Any]]:
@@ -132,13 +241,6 @@ def _shared_settings(study: Study, jobs: Sequence[Job]) -> dict[str, dict[str, A
         task: {name: value for name, value in config.items() if name not in own}
         for task, config in configs.items()
     }
-
-
-def _write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    with path.open('w', newline='') as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def _renew(page: Path, table: str) -> None:

@@ -141,11 +141,8 @@ def write_report(jobs: Sequence[Job], output: Path, command: str) -> None:
     revisions, groups = source_revisions(jobs), by_arm(jobs, found)
     table = [summarize(t, a, curves) for t, arms in groups.items() for a, curves in arms.items()]
     output.mkdir(parents=True, exist_ok=True)
-    write_curves(jobs, found, output / 'benchmark_curves.csv')
-    with (output / 'benchmark.csv').open('w', newline='') as file:
-        writer = csv.DictWriter(file, list(table[0]), lineterminator='\n')
-        writer.writeheader()
-        writer.writerows(table)
+    write_csv(curve_rows(jobs, found), output / 'benchmark_curves.csv')
+    write_csv(table, output / 'benchmark.csv')
     about = {'command': command, 'source_revisions': revisions, 'machine': machine()}
     (output / 'benchmark.json').write_text(json.dumps({**about, 'results': table}, indent=2) + '\n')
     bands = {t: {a: aggregate(curves) for a, curves in arms.items()} for t, arms in groups.items()}
@@ -204,6 +201,7 @@ def draw(
     """
     from matplotlib.figure import Figure
 
+    top = _top_of_axis(bands)
     columns = min(len(bands), 4)
     rows = -(-len(bands) // columns)
     figure = Figure(figsize=(4.6 * columns + 0.8, 3.9 * rows), layout='constrained')
@@ -216,13 +214,23 @@ def draw(
                 band, color = arms[arm], f'C{index}'
                 axes.fill_between(band.env_steps, band.lower, band.upper, color=color, alpha=0.2)
                 axes.plot(band.env_steps, band.median, color=color, label=label)
-        _label(axes, task, paper_epochs)
+        _label(axes, task, top, paper_epochs)
     panels[0].legend(loc='best', fontsize='small')
     figure.savefig(path, dpi=130)
 
 
-def _label(axes: Any, task: str, paper_epochs: bool) -> None:
-    axes.set(xlabel='environment steps', ylabel='success at the last step', ylim=(-0.02, 1.02))
+def _top_of_axis(bands: Mapping[str, Mapping[str, Band]]) -> float:
+    """Success at the top of every panel: 1, or less where no arm comes near half of it."""
+    highest = max(float(band.upper.max()) for arms in bands.values() for band in arms.values())
+    return 1.0 if highest > 0.4 else max(1.25 * highest, 0.05)
+
+
+def _label(axes: Any, task: str, top: float, paper_epochs: bool) -> None:
+    from matplotlib.ticker import EngFormatter
+
+    axes.set(xlabel='environment steps', ylabel='success at the last step')
+    axes.set_ylim(-0.02 * top, 1.02 * top)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=''))
     axes.set_title(task)
     axes.grid(alpha=0.3)
     if not paper_epochs:
@@ -232,12 +240,26 @@ def _label(axes: Any, task: str, paper_epochs: bool) -> None:
     epochs.set_xlabel("the paper's epochs")
 
 
-def write_curves(jobs: Sequence[Job], curves: Sequence[Curve], path: Path) -> None:
-    """Writes every evaluation of jobs as CSV."""
+def curve_rows(jobs: Sequence[Job], curves: Sequence[Curve]) -> list[dict[str, Any]]:
+    """Every evaluation of jobs, as rows of a CSV file."""
+    return [
+        {
+            'task': job.config.task,
+            'arm': job.arm.name,
+            'seed': job.config.seed,
+            'env_steps': int(steps),
+            'success': f'{success:.6g}',
+        }
+        for job, curve in zip(jobs, curves, strict=True)
+        for steps, success in zip(curve.env_steps, curve.success, strict=True)
+    ]
+
+
+def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Writes rows as CSV; a column that a row has not is empty."""
+    # The last rows are the newest: files of before lack columns that came later.
+    columns = dict.fromkeys(name for row in reversed(rows) for name in row)
     with path.open('w', newline='') as file:
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(['task', 'arm', 'seed', 'env_steps', 'success'])
-        for job, curve in zip(jobs, curves, strict=True):
-            name = (job.config.task, job.arm.name, job.config.seed)
-            for steps, success in zip(curve.env_steps, curve.success, strict=True):
-                writer.writerow([*name, int(steps), f'{success:.6g}'])
+        writer = csv.DictWriter(file, list(columns), lineterminator='\n')
+        writer.writeheader()
+        writer.writerows(rows)

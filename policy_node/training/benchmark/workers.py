@@ -99,8 +99,13 @@ def attempt(job: Job, command: str) -> Outcome:
     """
     try:
         if not job.is_trained:
-            train_run(job.config, job.folder, resume=job.has_checkpoint, command=command)
-        if job.is_trained and job.final_episodes:
+            resume = job.has_checkpoint
+            ending = train_run(job.config, job.folder, resume=resume, command=command)
+            if ending.signal:
+                return Outcome.STOPPED
+            if not job.is_trained:
+                raise CommandError(f'it ended before its steps were done: {ending.reason}')
+        if job.final_episodes:
             measure_final(job.config, job.folder, job.final_episodes)
     except RunTakenError:
         print(f'{job.name} is being run by another process', flush=True)
@@ -108,7 +113,7 @@ def attempt(job: Job, command: str) -> Outcome:
     except CommandError as error:
         complain('benchmark', f'{job.name}: {error}')
         return Outcome.FAILED
-    return Outcome.FINISHED if job.is_finished else Outcome.STOPPED
+    return Outcome.FINISHED
 
 
 class ThisProcess:

@@ -46,9 +46,10 @@ def ship(
         Whether the actor of the run is the shipped one now.
 
     Raises:
-        ValueError: If there is no such actor.
+        ValueError: If there is no such actor, or no log beside it.
     """
     actor, info = checkpoint.load(run / name)
+    progress = _progress_of(run)
     shipped, digest = actors / f'{info.task}.json', checkpoint.checkpoint_hash(run / name)
     old = json.loads(shipped.read_text()) if shipped.is_file() else {}
     if (old.get('run_sha256'), old.get('episodes')) == (digest, episodes):
@@ -80,12 +81,24 @@ def ship(
     if (run / STATE_FILE).is_file():
         ship_critic(run / STATE_FILE, target)
     title = f'{info.task}, {info.config["recipe"]} recipe, seed {info.seed}'
-    progress, curve = read_progress(run / 'progress.csv'), target.with_suffix('.png')
+    curve = target.with_suffix('.png')
     # A mean of networks, taken as it is, has no curve of its own: that of a part stays.
     if progress[-1].get('updates') or not curve.is_file():
         draw_curve(progress, title, curve)
     shipped.write_text(json.dumps(report, indent=2) + '\n')
     return True
+
+
+def _progress_of(run: Path) -> list[dict[str, float]]:
+    """The log of a run, asked for before anything is evaluated or replaced."""
+    file = run / 'progress.csv'
+    try:
+        progress = read_progress(file)
+    except OSError as error:
+        raise ValueError(f'{file} cannot be read: {error.strerror}') from None
+    if not progress:
+        raise ValueError(f'{file} has no row')
+    return progress
 
 
 def ship_critic(state_file: Path, actor: Path) -> None:

@@ -11,6 +11,7 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.policy import Policy
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.exploration import ActionNoise, ParameterNoise
+from policy_node.training.learning.failed_goals import FailedGoals
 from policy_node.training.learning.frame_skip import Holder
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.subgoals import Guide, Proposer, subgoal_columns
@@ -53,6 +54,10 @@ class Collector:
             config.noise_ticks,
         )
         self._guide = Guide(every, generator, std, epsilon) if every else None
+        self._failed: FailedGoals | None = None
+        if config.retry_failed > 0:
+            # A generator of its own, so that exploration is the same with and without.
+            self._failed = FailedGoals(np.random.default_rng(seeds[:2]), config.retry_failed)
         self._seeds: list[int] | None = seeds
 
     def collect(self, policy: Policy, random: bool = False) -> tuple[Episodes, float]:
@@ -71,6 +76,10 @@ class Collector:
         ticks, count = spec.episode_ticks, simulation.num_envs
         observation = simulation.reset(seed=self._seeds)
         self._seeds = None
+        retried = np.zeros(count, dtype=np.bool_)
+        if self._failed is not None:
+            retried = self._failed.give(simulation)
+            observation = simulation.observe()
         episodes = Episodes(
             observation=np.empty((count, ticks + 1, spec.observation_size), np.float32),
             achieved_goal=np.empty((count, ticks + 1, spec.goal.size), np.float32),
@@ -94,6 +103,8 @@ class Collector:
         episodes.achieved_goal[:, ticks] = observation['achieved_goal']
         if not random:
             self._adapt(policy, acting, episodes)
+        if self._failed is not None:
+            self._failed.remember(simulation, whole & ~success & ~retried)
         return episodes.select(whole), float(success[whole].mean()) if whole.any() else 0.0
 
     def _acting(self, policy: Policy) -> Policy:

@@ -48,6 +48,9 @@ class ConfigFields:
     reward_grades: str = ''
     """Multiples of the success thresholds, as `.5,1,2,4`: the sparse reward of training becomes the
     share of them within which the distance is, times that of the rotation, minus 1."""
+    reward_apart: float = 0.0
+    """Share of the graded reward in which distance and rotation add up instead of multiplying, so
+    that each is worth something without the other."""
     strategy: str = 'future'
     """Hindsight goals: final, future, episode, random, futureactual, or none (no hindsight)."""
     hindsight_k: int = 4
@@ -55,6 +58,9 @@ class ConfigFields:
     goals: str = ''
     """Goal sources as a mixture instead of `strategy`: `future=.4,actual=.3,near=.1`; what is left
     of 1 keeps the goal. Also `next` (what this step achieved) and `near` (one of the next ten)."""
+    retry_failed: float = 0.0
+    """Share of the episodes whose goal is one that an earlier episode, with a goal as the task
+    draws it, failed to meet: hard goals come more often. Evaluation draws as the task does."""
     goal_choice: str = 'uniform'
     """Which of 8 future goals is taken: `uniform` (any), `bellman` (the value that errs most) or
     `uncertain` (that critics differ in most)."""
@@ -130,7 +136,7 @@ class ConfigFields:
     """Share of `learning_rate` left at `total_steps`, falling linearly; 1 keeps it constant."""
     actor_average: float = 0.0
     """Share of an average of actor weights kept each cycle; the average is what is evaluated and
-    saved as best. 0 evaluates the actor itself."""
+    saved, as best and as latest. 0 evaluates the actor itself."""
     gamma: float = 0.98
     """Discount; targets are clipped to [-1/(1-gamma), 0]."""
     discount: str = 'tick'

@@ -60,6 +60,8 @@ RANGES = (
     ('hindsight_k', 1, 1000),
     ('reward_distance', 1e-3, 1000),
     ('reward_rotation', 1e-3, 1000),
+    ('reward_apart', 0, 1),
+    ('retry_failed', 0, 1),
     ('first_distance', 1, 1000),
     ('first_rotation', 1, 1000),
     ('narrow_above', 0, 1),
@@ -211,7 +213,9 @@ def _contradictions_of_subgoals(config: ConfigFields) -> Iterator[str]:
 
 
 def _contradictions_of_values(config: ConfigFields) -> Iterator[str]:
-    """The same of how values are learnt."""
+    """The same of how values are learnt, and of what is learnt from."""
+    if config.learning_starts > config.replay_transitions:
+        yield f'learning_starts needs replay_transitions of {config.learning_starts} or more'
     if config.correction != 'none' and config.n_step == 1:
         yield f'correction {config.correction} needs n_step above 1'
     if config.aggregate != 'mean' and config.critics == 1:
@@ -277,3 +281,6 @@ def _contradictions_of_task(config: ConfigFields, spec: TaskSpec) -> Iterator[st
     for name in ('reward_rotation', 'first_rotation'):
         if spec.rotation_threshold is None and getattr(config, name) != 1.0:
             yield f'{name}: goals of {config.task} have no rotation'
+    poses = spec.position_counts and spec.rotation_threshold is not None
+    if config.reward_apart > 0 and not (config.reward_grades and poses):
+        yield 'reward_apart needs reward_grades, and goals of position and rotation'

@@ -18,9 +18,11 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     """
     name, separator, value = text.partition('=')
     hints = typing.get_type_hints(TrainConfig)
-    if not separator or name not in hints:
+    if name not in hints:
         near = did_you_mean(name, list(hints))
         raise ValueError(f'{text!r} is not name=value{near}; names: {", ".join(hints)}')
+    if not separator:
+        raise ValueError(f'{text!r} is not name=value: give {name}=...')
     return name, parse_value(name, value)
 
 

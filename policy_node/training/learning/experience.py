@@ -11,7 +11,7 @@ from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.episode_weights import episode_weights, ticks_until_dropped
 from policy_node.training.learning.goal_choice import Judge
-from policy_node.training.learning.hindsight import goal_mixture, parse_mixture
+from policy_node.training.learning.hindsight import SuccessFunction, goal_mixture, parse_mixture
 from policy_node.training.learning.normalizer import RunningStatistics
 from policy_node.training.learning.replay import EpisodeReplay, Episodes
 from policy_node.training.learning.sampling import TransitionSampler
@@ -98,11 +98,10 @@ class Experience:
         """Rewards goals as a run does in which they have narrowed this far, 0 ... 1."""
         self._sampler = self._first_sampler.at(progress)
 
-    def count_met(self, episodes: Episodes) -> int:
-        """How many episodes end at their goal, by rewards of now; lost ones do not."""
+    def count_met(self, episodes: Episodes, success: SuccessFunction) -> int:
+        """How many episodes end in `success`; lost ones do not."""
         last, desired = episodes.achieved_goal[:, -1], episodes.desired_goal
-        reward = self._sampler.compute_reward(last.astype(np.float64), desired.astype(np.float64))
-        met = reward == 0.0
+        met = success(last.astype(np.float64), desired.astype(np.float64))
         if self.config.drop_is_lost and self._count_ticks is not None:
             met &= self._count_ticks(episodes) == episodes.ticks
         return int(met.sum())

@@ -20,23 +20,29 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class GradedReward:
-    """A reward from -1 to 0: the shares of thresholds met, distance times rotation, minus 1.
+    """A reward from -1 to 0: the shares of thresholds met by distance and rotation, minus 1.
+
+    Both count as their product, or, to the share `apart`, as their mean: then each is worth
+    something without the other.
 
     Attributes:
         metric: Distances and thresholds of the task.
         grades: Multiples of its thresholds; with 1 alone the sparse reward of poses.
+        apart: Share of the reward in which distance and rotation add up, 0 ... 1.
     """
 
     metric: GoalMetric
     grades: tuple[float, ...]
+    apart: float = 0.0
 
     def __call__(self, achieved_goal: Values, desired_goal: Values) -> Values:
         """Rewards (...,) of goals (..., goal size)."""
         distance, rotation = self.metric.distances(achieved_goal, desired_goal)
-        share = self._share(distance, self.metric.spec.distance_threshold)
-        if self.metric.spec.rotation_threshold is not None:
-            share = share * self._share(rotation, self.metric.spec.rotation_threshold)
-        return share - 1.0
+        near = self._share(distance, self.metric.spec.distance_threshold)
+        if self.metric.spec.rotation_threshold is None:
+            return near - 1.0
+        turned = self._share(rotation, self.metric.spec.rotation_threshold)
+        return (1.0 - self.apart) * near * turned + self.apart * (near + turned) / 2.0 - 1.0
 
     def _share(self, error: Values, threshold: float) -> Values:
         met = [error < threshold * grade for grade in self.grades]

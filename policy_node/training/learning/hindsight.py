@@ -17,6 +17,7 @@ from policy_node.training.learning.subgoals import subgoals_of
 from policy_node.training.learning.transitions import Starts
 
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+SuccessFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
 
 # Where the goal of a transition comes from: the episode's own; a later achieved goal of the
 # episode; its last; any of it; any achieved goal of the replay; a desired goal of any episode; what

@@ -23,6 +23,7 @@ from policy_node.training.learning.conditions import (
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.config_rules import unusual_networks
 from policy_node.training.learning.config_values import config_from_dict
+from policy_node.training.learning.origins import steps_behind
 from policy_node.training.learning.run_folder import STATE_FILE, companion_file
 from policy_node.training.learning.training_state import part_of, read_state
 
@@ -224,9 +225,11 @@ def _require_usual(config: TrainConfig, name: str) -> None:
 def _of_actor(name: str, path: Path) -> InitialNetworks:
     actor, info = checkpoint.load(path)
     tensors = {f'actor.{key}': value for key, value in actor.state_dict().items()}
+    # A mean of several has next to no steps of its own.
+    seen = steps_behind({'env_steps': info.env_steps, 'init_from': info.init_from})
     for part in ('observation', 'goal'):
         mean, std = (tensors[f'actor.{part}_normalizer.{key}'] for key in ('mean', 'std'))
-        for key, value in _sums(mean, std, info.env_steps).items():
+        for key, value in _sums(mean, std, seen).items():
             tensors[f'{part}_statistics.{key}'] = value
     beside = (companion_file(path), path.parent / STATE_FILE)
     source = next((file for file in beside if file.is_file()), None)

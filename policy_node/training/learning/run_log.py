@@ -131,12 +131,30 @@ def _clock(seconds: float) -> str:
 
 
 def _rows_until(path: Path, env_steps: int) -> list[dict[str, str]]:
-    """Rows of a log up to `env_steps`; a line cut short by a killed run is left out."""
+    """Rows of a log up to `env_steps`."""
     if env_steps == 0 or not path.is_file():
         return []
-    with path.open(newline='') as file:
-        rows = [row for row in csv.DictReader(file) if None not in row.values()]
-    return [row for row in rows if float(row['env_steps']) <= env_steps]
+    return [row for row in _whole_rows(path) if float(row['env_steps']) <= env_steps]
+
+
+def _whole_rows(path: str | Path) -> list[dict[str, str]]:
+    """Rows of a log but those that a killed run has cut short."""
+    with open(path, newline='') as file:
+        return [row for row in csv.DictReader(file) if _is_whole(row)]
+
+
+def _is_whole(row: dict[str, str]) -> bool:
+    """Whether every column is there and empty or a number."""
+    texts = row.values()
+    return None not in texts and all(not text or _is_number(text) for text in texts)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _tensorboard(output: Path, resumed_steps: int) -> Any:
@@ -148,9 +166,8 @@ def _tensorboard(output: Path, resumed_steps: int) -> Any:
 
 
 def read_progress(path: str | Path) -> list[dict[str, float]]:
-    """Reads `progress.csv`; empty columns are left out of a row."""
-    with open(path, newline='') as file:
-        rows = list(csv.DictReader(file))
+    """Reads `progress.csv`; empty columns are left out of a row, and rows that were cut short."""
+    rows = _whole_rows(path)
     return [{name: float(text) for name, text in row.items() if text} for row in rows]
 
 

@@ -194,7 +194,7 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
         then = narrowed(metric, config, progress)
         if not config.reward_grades:
             return then.reward
-        return GradedReward(then, parse_grades(config.reward_grades))
+        return GradedReward(then, parse_grades(config.reward_grades), config.reward_apart)
 
     counter: StepCounter | HeldSteps | None = None
     if config.longest_hold > 1:

@@ -6,6 +6,7 @@ import time
 
 from msgs_spec.command_line import complain
 from policy_node.policies.actor import Actor
+from policy_node.policies.checkpoint import read_info
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
 from policy_node.training.evaluation.evaluator import success_rate
 from policy_node.training.learning.actor_critic import ActorCritic
@@ -46,8 +47,24 @@ class Saver:
             counters.best_success, counters.best_return = success, mean_return
             if self._workers.is_first:
                 measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
-                measured |= diagnose(outcomes)
+                measured |= {'mean_return': mean_return, **diagnose(outcomes)}
                 self.folder.save_actor(BEST_FILE, actor, counters.env_steps, measured)
+
+    def keep_no_worse(self, counters: Counters) -> None:
+        """Lets the best actor in the folder stay, which a killed run may have saved last.
+
+        An actor of fewer episodes, by another rule or without a measured return decides nothing.
+        """
+        file = self.folder.path / BEST_FILE
+        try:
+            found = read_info(file).success if file.is_file() else {}
+        except ValueError:
+            return
+        enough = found.get('episodes', 0) >= self._config.evaluation_episodes
+        if enough and found.get('rule') == self._config.success_rule and 'mean_return' in found:
+            best = float(found['last_step']), float(found['mean_return'])
+            known = counters.best_success, counters.best_return
+            counters.best_success, counters.best_return = max(known, best)
 
     def save_when_due(
         self, learner: ActorCritic, experience: Experience, counters: Counters
@@ -69,7 +86,7 @@ class Saver:
         counters: Counters,
         with_replay: bool = True,
     ) -> None:
-        """Writes the newest episodes and, as worker 0, the latest actor and the training state.
+        """Writes the newest episodes and, as worker 0, the actor as evaluated now and the state.
 
         Raises:
             OSError: If there is no room for them; what was there before is kept.
@@ -80,5 +97,5 @@ class Saver:
             kept = self._workers.share(self._config.kept_transitions)
             save_replay(self.folder.replay_file(self._workers.rank), experience.replay, kept)
         if self._workers.is_first:
-            self.folder.save_actor(LATEST_FILE, learner.acting_actor(), counters.env_steps)
+            self.folder.save_actor(LATEST_FILE, learner.evaluation_actor(), counters.env_steps)
             self.folder.save_state(learner, experience.statistics, counters)

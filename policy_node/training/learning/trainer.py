@@ -28,7 +28,7 @@ from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.replay_file import load_replay
 from policy_node.training.learning.run_folder import RunFolder
 from policy_node.training.learning.run_log import RunLog
-from policy_node.training.learning.sampling import make_sampler
+from policy_node.training.learning.sampling import make_sampler, narrowed
 from policy_node.training.learning.saving import NAME, Saver
 from policy_node.training.learning.simulations import make_simulation
 from policy_node.training.learning.threads import split_threads
@@ -134,14 +134,16 @@ class Trainer:
         """
         state = load_state(path, self.learner, self.experience.statistics)
         self.counters = state.counters
-        self.experience.narrow(state.counters.narrowing_steps / self.config.total_steps)
+        self.experience.narrow(self._narrowing)
         origin = state.extra.get('init_from', {})
         self._saver.folder = replace(self._saver.folder, init_from=origin)
         self._let_critic_learn_first()
+        self._saver.keep_no_worse(self.counters)
         # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
         self.experience.generator = self._seed(self.counters.env_steps)
         limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
-        self._refill = self.workers.share(min(limits))
+        held = self.experience.replay.capacity * self.spec.episode_ticks
+        self._refill = min(self.workers.share(min(limits)), held)
         file = self._saver.folder.replay_file(self.workers.rank)
         try:
             load_replay(file, self.experience.replay)
@@ -274,19 +276,28 @@ class Trainer:
         if self.config.narrows:
             self._narrow(episodes, int(count))
 
+    @property
+    def _narrowing(self) -> float:
+        """How far goals have narrowed, 0 ... 1."""
+        return self.counters.narrowing_steps / self.config.total_steps
+
     def _narrow(self, episodes: Episodes, count: int) -> None:
         """Narrows goals by one cycle of `count` episodes, unless too few of these met theirs."""
         counters, config = self.counters, self.config
         if config.narrow_above == 0.0:
             counters.narrowing_steps = counters.env_steps
         elif counters.updates > 0:
-            met = self.workers.sum(torch.tensor([self.experience.count_met(episodes)])).item()
+            metric = narrowed(self.simulation.metric, config, self._narrowing)
+            found = self.experience.count_met(episodes, metric.success)
+            met = self.workers.sum(torch.tensor([found])).item()
             if met >= config.narrow_above * count:
                 counters.narrowing_steps += count * self.spec.episode_ticks
-        self.experience.narrow(counters.narrowing_steps / config.total_steps)
+        self.experience.narrow(self._narrowing)
 
     def _learn(self) -> list[Losses]:
         first = self.workers.share(self.config.learning_starts) if self.counters.updates == 0 else 0
+        # The replay holds whole episodes.
+        first = min(first, self.experience.replay.capacity * self.spec.episode_ticks)
         if self.workers.any(self.experience.transitions < max(first, 1)):
             return []
         steps = self.counters.env_steps

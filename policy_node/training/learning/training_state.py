@@ -10,7 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from policy_node.policies.tensor_file import read_tensors, write_tensors
+from policy_node.policies.files import read_file
+from policy_node.policies.tensor_file import (
+    LARGEST_TENSOR_FILE,
+    parse_header,
+    read_tensors,
+    write_tensors,
+)
 from policy_node.training.learning.actor_critic import ActorCritic
 from policy_node.training.learning.normalizer import RunningStatistics
 
@@ -98,6 +104,16 @@ def write_state(path: Path, state: TrainingState) -> None:
     write_tensors(path, state.tensors, metadata)
 
 
+def read_counters(path: Path) -> Counters:
+    """Reads how far a run was when its state was written; its tensors stay untouched.
+
+    Raises:
+        ValueError: If the file is no training state of this version, or damaged.
+    """
+    metadata = parse_header(read_file(path, LARGEST_TENSOR_FILE), path).metadata
+    return _described(path, metadata)[0]
+
+
 def read_state(path: Path) -> TrainingState:
     """Reads a training state.
 
@@ -105,6 +121,12 @@ def read_state(path: Path) -> TrainingState:
         ValueError: If the file is no training state of this version, or damaged.
     """
     arrays, metadata = read_tensors(path)
+    counters, extra = _described(path, metadata)
+    tensors = {name: torch.tensor(values) for name, values in arrays.items()}
+    return TrainingState(tensors, counters, extra)
+
+
+def _described(path: Path, metadata: dict[str, str]) -> tuple[Counters, dict[str, Any]]:
     found = (metadata.get('format'), metadata.get('format_version'))
     if found != (FORMAT, str(FORMAT_VERSION)):
         raise ValueError(f'{path} is no training state of version {FORMAT_VERSION}: {found}')
@@ -117,8 +139,7 @@ def read_state(path: Path) -> TrainingState:
         raise ValueError(f'{path} lacks {error.args[0]!r} in its metadata') from None
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f'{path} has unreadable metadata: {error}') from None
-    tensors = {name: torch.tensor(values) for name, values in arrays.items()}
-    return TrainingState(tensors, counters, extra)
+    return counters, extra
 
 
 def load_state(

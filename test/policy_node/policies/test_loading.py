@@ -109,11 +109,21 @@ def test_a_task_that_is_missing_is_told_apart(name: str) -> None:
 
 
 def test_unknown_and_unfitting_names_are_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"no actor 'rnd'; shipped: .*, 'random' or 'resting'$"):
-        load_policy('rnd', 'FetchReach')
+    with pytest.raises(ValueError, match=r"no actor 'zzz'; shipped: .*, 'random' or 'resting'$"):
+        load_policy('zzz', 'FetchReach')
+    for mistyped, meant in {'rnd': 'random', 'fetchreach': 'FetchReach'}.items():
+        with pytest.raises(ValueError, match=rf"'resting'; did you mean '{meant}'\?$"):
+            load_policy(mistyped, 'FetchReach')
     with pytest.raises(ValueError, match='trained on FetchReach, not on FetchPush'):
         load_policy('FetchReach', 'FetchPush')
     with pytest.raises(ValueError, match='no actor'):
+        load_policy(tmp_path)
+    with pytest.raises(ValueError, match=r"no actor 'x+' \(File name too long\); shipped: "):
+        load_policy('x' * 300, 'FetchReach')
+    with pytest.raises(ValueError, match=r"no actor '.*gone\.onnx': there is no such file$"):
+        load_policy(tmp_path / 'gone.onnx')
+    (tmp_path / 'best.safetensors').touch()
+    with pytest.raises(ValueError, match=r'a run: .*; its best actor is .*/best\.safetensors$'):
         load_policy(tmp_path)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import fcntl
 import json
 import os
@@ -18,6 +19,7 @@ import pytest
 import torch
 
 from msgs_spec.tasks import TASKS
+from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark import published
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.jobs import ARMS
@@ -26,6 +28,11 @@ from policy_node.training.benchmark.studies import paper_jobs
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.run_folder import LOCK_FILE
 from policy_node.training.learning.run_log import COLUMNS
+from policy_node.training.learning.training_state import (
+    read_counters,
+    read_state,
+    write_state,
+)
 
 torch.set_num_threads(1)
 
@@ -215,6 +222,22 @@ def test_a_job_of_another_process_is_left_alone(
     assert not (taken / 'progress.csv').exists()
 
 
+def test_a_job_whose_end_was_not_saved_is_not_finished(tmp_path: Path) -> None:
+    """The log is ahead where the last checkpoint failed, or where a kill came before it."""
+    arguments = small(tmp_path, '--arms', 'her_sparse')
+    assert main(arguments) == 0
+    (job,) = jobs_from_arguments(parse_arguments(arguments))
+    state = job.folder / 'training_state.safetensors'
+    finished = read_state(state)
+    assert job.is_finished
+    before = dataclasses.replace(finished.counters, env_steps=800, updates=8, episodes=16)
+    write_state(state, dataclasses.replace(finished, counters=before))
+    assert job.env_steps == 1200 and not job.is_finished
+    assert main(arguments) == 0
+    assert job.is_finished and read_counters(state).env_steps == 1200
+    assert read_info(job.folder / 'latest.safetensors').env_steps == 1200
+
+
 def test_another_budget_in_the_same_folder_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -238,6 +261,8 @@ def test_another_budget_in_the_same_folder_is_refused(
         (['--study', 'best', '--full'], '--full belongs to --study paper'),
         (['--episodes', '10'], '--episodes does not belong to --study paper'),
         (['--set', 'init_from=FetchReach'], '--set init_from is not possible'),
+        (['--set', 'time_limit=2'], '--set time_limit is not possible: a job ends when its steps'),
+        (['--set', 'success_target=.9'], '--set success_target is not possible: a job ends when'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(

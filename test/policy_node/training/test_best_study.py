@@ -16,13 +16,14 @@ import torch
 
 from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
-from policy_node.training.benchmark.actors_table import steps_behind
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.studies import BEST_ORDER, STARTS_FROM, start_from
 from policy_node.training.benchmark.workers import LOG_FILE, Outcome, run_jobs
+from policy_node.training.learning.origins import steps_behind
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import read_progress
+from policy_node.training.learning.training_state import Counters, TrainingState, write_state
 
 torch.set_num_threads(1)
 
@@ -92,9 +93,9 @@ class Recorder:
         if job.config.task in self.failing:
             return job, Outcome.FAILED
         job.folder.mkdir(parents=True)
-        (job.folder / 'training_state.safetensors').touch()
-        steps = job.config.total_steps
-        (job.folder / 'progress.csv').write_text(f'seconds,env_steps\n1,{steps}\n')
+        counters = Counters(env_steps=job.config.total_steps)
+        state = TrainingState({}, counters, {'config': {}})
+        write_state(job.folder / 'training_state.safetensors', state)
         return job, Outcome.FINISHED
 
 

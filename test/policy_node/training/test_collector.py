@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,6 +99,27 @@ def test_the_second_cycle_has_new_goals() -> None:
     first, _ = collector.collect(make_actor())
     second, _ = collector.collect(make_actor())
     assert (first.desired_goal != second.desired_goal).all()
+
+
+def test_goals_of_failures_are_tried_again() -> None:
+    """Only those of failures at goals as the task draws them, and the rest are drawn as ever."""
+    config = TrainConfig('FetchReach', noise_std=0.0, random_epsilon=0.0, retry_failed=0.5)
+    seeds = list(range(64))
+    collectors = [
+        Collector(Simulation('FetchReach', num_envs=64, num_threads=1), seeds, settings)
+        for settings in (config, replace(config, retry_failed=0.0))
+    ]
+    failed: set[bytes] = set()
+    for cycle in range(3):
+        retrying, plain = (c.collect(RestingPolicy(4))[0] for c in collectors)
+        drawn = (retrying.desired_goal == plain.desired_goal).all(axis=1)
+        assert drawn.all() if cycle == 0 else 0.3 < drawn.mean() < 0.7
+        retried = {goal.tobytes() for goal in retrying.desired_goal[~drawn]}
+        assert retried <= failed
+        distance = np.linalg.norm(retrying.achieved_goal[:, -1] - retrying.desired_goal, axis=1)
+        missed = drawn & (distance > 0.05)
+        failed |= {goal.tobytes() for goal in retrying.desired_goal[missed]}
+        assert missed.sum() > 5 and (drawn & ~missed).any()
 
 
 def test_the_same_seeds_give_the_same_episodes_in_any_thread() -> None:

@@ -98,7 +98,7 @@ def test_assignments_take_the_type_of_the_field(text: str, expected: tuple[str, 
 @pytest.mark.parametrize(
     ('text', 'match'),
     [
-        ('gamma', "is not name=value; did you mean 'gamma'\\?; names: task, "),
+        ('gamma', "'gamma' is not name=value: give gamma="),
         ('zzz=1', 'is not name=value; names: task, '),
         ('gamma=high', "gamma 'high' is not of type float"),
         ('layer_norm=maybe', "layer_norm 'maybe' is not of type bool"),
@@ -126,6 +126,8 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ({'reward_grades': '2,1'}, "reward_grades '2,1': numbers above 0 and below 1000, rising"),
         ({'reward_grades': 'all'}, "reward_grades 'all': numbers"),
         ({'reward_grades': '1,2', 'condition': 'threshold'}, 'reward_grades needs'),
+        ({'reward_apart': 0.5}, 'reward_apart needs reward_grades'),
+        ({'reward_apart': 0.5, 'reward_grades': '1,2'}, 'and goals of position and rotation'),
         ({'noise_spread': 1.5}, 'noise_spread 1.5; allowed: 0 ... 1'),
         ({'hidden_sizes': (0,)}, 'hidden_sizes'),
     ],

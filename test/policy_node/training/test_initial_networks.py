@@ -12,10 +12,10 @@ import torch
 from policy_node.policies import checkpoint
 from policy_node.policies.loading import load_actor
 from policy_node.policies.shipped import shipped_actors
-from policy_node.training.benchmark.actors_table import steps_behind
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.initial_networks import read_initial_networks
+from policy_node.training.learning.origins import steps_behind
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.trainer import Trainer
@@ -91,6 +91,11 @@ def test_a_run_starts_from_the_mean_of_several(tmp_path: Path, block_run: Path) 
     assert [part['name'] for part in origin['mean_of']] == [str(run) for run in runs]
     before = [part.get('init_from') for part in origin['mean_of']]
     assert before == [{}, *[{'name': str(block_run), 'task': task, 'env_steps': 400}] * 2]
+    parts = [
+        {'name': f'runs/a/{name}.safetensors', 'env_steps': 300} for name in ('best', 'latest')
+    ]
+    parts[0]['env_steps'] = 250
+    assert steps_behind({'env_steps': 5, 'init_from': {'env_steps': 0, 'mean_of': parts}}) == 305
     # 200 steps each, all from one run of 400, which counts once.
     assert steps_behind({'env_steps': 200, 'init_from': origin}) == 200 + 400 + 2 * 200
 

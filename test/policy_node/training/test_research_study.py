@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -11,11 +10,14 @@ import pytest
 import torch
 
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
+from policy_node.training.benchmark.final import FINAL_FILE
 from policy_node.training.benchmark.measures import are_apart, area_under, sum_up
 from policy_node.training.benchmark.research import STEP_COUNTS, STUDIES, Study
-from policy_node.training.benchmark.research_report import BEGIN, END
+from policy_node.training.benchmark.research_report import BEGIN, END, format_table, read_rows
 from policy_node.training.benchmark.results import Curve
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.run_folder import STATE_FILE
+from policy_node.training.learning.training_state import Counters, TrainingState, write_state
 from support import ROOT
 
 torch.set_num_threads(1)
@@ -54,6 +56,22 @@ def test_every_study_has_its_page_and_every_request_its_line() -> None:
     assert {study.request for study in STUDIES.values()} == {None, *range(1, 10)}
 
 
+@pytest.mark.parametrize('study', STUDIES.values(), ids=list(STUDIES))
+def test_a_page_says_what_its_data_say(study: Study) -> None:
+    folder = ROOT / 'docs' / 'research' / study.name
+    runs, arms = read_rows(folder / 'runs.csv'), read_rows(folder / 'arms.csv')
+    for arm in arms:
+        own = [run for run in runs if (run['task'], run['arm']) == (arm['task'], arm['arm'])]
+        assert sum_up(own) == arm
+    assert sum(arm['seeds'] for arm in arms) == len(runs)
+    assert format_table(study, arms) in (folder / 'README.md').read_text()
+    tasks = list(dict.fromkeys(run['task'] for run in runs))
+    about = json.loads((folder / 'study.json').read_text())
+    assert set(tasks) == set(about['tasks']) <= set(study.tasks)
+    evaluated = {(row['task'], row['arm'], row['seed']) for row in read_rows(folder / 'curves.csv')}
+    assert evaluated == {(run['task'], run['arm'], run['seed']) for run in runs}
+
+
 def test_the_area_is_the_mean_success_over_the_budget() -> None:
     curve = Curve(np.array([100.0, 200.0, 400.0]), np.array([0.0, 1.0, 1.0]), 10)
     assert area_under(curve, 400) == pytest.approx((0 + 50 + 200) / 400)
@@ -85,16 +103,24 @@ def test_arms_are_apart_where_quartiles_do_not_touch() -> None:
 def test_a_study_runs_measures_and_gives_the_same_bits_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Beside what the folder holds of another task."""
     report = tmp_path / 'report'
     report.mkdir()
+    for name in ('runs.csv', 'arms.csv', 'curves.csv', 'study.json'):
+        before = (ROOT / 'docs' / 'research' / 'unbiased' / name).read_text()
+        (report / name).write_text(before.replace('FetchReach', 'FetchPush'))
+    kept = read_rows(report / 'runs.csv')
     (report / 'README.md').write_text(f'# Before\n{BEGIN}\nold\n{END}\nafter\n')
     arguments = [*SMALL, '--arms', 'future', 'weighted', '--report', str(report)]
     assert main([*arguments, '--output', str(tmp_path / 'first')]) == 0
     assert 'FetchReach/weighted/seed0 is finished; 0 to go' in capsys.readouterr().out
-    runs = list(csv.DictReader((report / 'runs.csv').open()))
+    runs = read_rows(report / 'runs.csv')
+    others = [row for row in runs if row['task'] == 'FetchPush']
+    assert [{name: row[name] for name in kept[0]} for row in others] == kept
+    runs = [row for row in runs if row['task'] == 'FetchReach']
     assert [row['arm'] for row in runs] == ['future', 'weighted']
-    assert {row['env_steps'] for row in runs} == {'800'} and {row['parts'] for row in runs} == {'1'}
-    assert all(float(row['processor_seconds']) > 0 for row in runs)
+    assert {row['env_steps'] for row in runs} == {800} and {row['parts'] for row in runs} == {1}
+    assert all(row['processor_seconds'] > 0 for row in runs)
     page = (report / 'README.md').read_text()
     assert page.startswith('# Before') and page.endswith('after\n') and 'old' not in page
     assert (
@@ -102,12 +128,41 @@ def test_a_study_runs_measures_and_gives_the_same_bits_again(
     )
     assert (report / 'figure.png').read_bytes()[:4] == b'\x89PNG'
     about = json.loads((report / 'study.json').read_text())
-    assert about['request'] == 2 and len(about['source_revisions']) == 1
+    assert about['request'] == 2 and set(about['tasks']) == {'FetchReach', 'FetchPush'}
+    assert len(about['tasks']['FetchReach']['source_revisions']) == 1
+    assert '\n| FetchPush | `future`' in page
     again = tmp_path / 'again'
     assert main([*SMALL, '--arms', 'future', '--report', str(again), '--output', str(again)]) == 0
     actor = Path('FetchReach') / 'future' / 'seed0' / 'latest.safetensors'
     same = [folder.joinpath(actor).read_bytes()[-40_000:] for folder in (tmp_path / 'first', again)]
     assert same[0] == same[1]
+
+
+def test_a_run_that_was_measured_on_other_episodes_is_measured_again(tmp_path: Path) -> None:
+    arguments = ['--study', 'unbiased', '--arms', 'actual', '--seeds', '1', '--episodes', '50']
+    (job,) = jobs_from_arguments(parse_arguments([*arguments, '--output', str(tmp_path)]))
+    job.folder.mkdir(parents=True)
+    counters = Counters(env_steps=job.config.total_steps)
+    write_state(job.folder / STATE_FILE, TrainingState({}, counters, {'config': {}}))
+    assert job.is_trained and not job.is_finished
+    for episodes in (4, 50):
+        (job.folder / FINAL_FILE).write_text(json.dumps({'success': 0.5, 'episodes': episodes}))
+        assert job.is_finished is (episodes == 50)
+
+
+def test_runs_of_others_are_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A command with fewer arms or seeds would leave a page with those alone."""
+    runs = tmp_path / 'runs.csv'
+    runs.write_text('task,arm,seed,area\nFetchReach,actual,0,0.5\nFetchReach,actual,1,0.5\n')
+    arguments = ['--study', 'unbiased', '--arms', 'actual', '--seeds', '1']
+    arguments += ['--report', str(tmp_path), '--output', str(tmp_path / 'runs')]
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert 'holds runs that this command has not (1), as FetchReach/actual/seed0: ' in error
+    assert error.count('\n') == 1 and not (tmp_path / 'runs').exists()
+    assert runs.read_text().count('\n') == 3
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from policy_node.policies import checkpoint
 from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
@@ -96,6 +98,43 @@ def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(
     said = capsys.readouterr().err
     assert 'is no replay of this run' in said
     assert '2,000 steps fill the replay before learning goes on' in said
+
+
+@pytest.mark.parametrize('damaged', [True, False])
+def test_a_replay_that_is_no_multiple_of_an_episode_is_full_with_whole_ones(
+    tmp_path: Path, damaged: bool
+) -> None:
+    """20 episodes of 50 steps go into 1,030 transitions."""
+    held = {'replay_transitions': 1_030, 'learning_starts': 1_030}
+    Trainer(small(total_steps=2_000, **held), tmp_path, Workers()).train()
+    if damaged:
+        (tmp_path / 'replay.safetensors').write_bytes(b'damaged')
+    trainer = Trainer(small(total_steps=2_400, **held), tmp_path, Workers())
+    trainer.resume(tmp_path / STATE)
+    log = StopAfter(trainer, 100)
+    trainer.train(log)
+    # Learning began with the third cycle, when 1,000 transitions were there.
+    assert [(row['env_steps'], row['updates']) for row in log.rows] == [(2_400, 16)]
+
+
+def test_a_best_actor_that_is_newer_than_the_checkpoint_stays(tmp_path: Path) -> None:
+    """As after a kill between an evaluation and the next checkpoint."""
+    trainer = Trainer(small(total_steps=2_000), tmp_path, Workers())
+    trainer.train()
+    best = tmp_path / 'best.safetensors'
+    actor, info = checkpoint.load(best)
+    assert info.success['mean_return'] == pytest.approx(trainer.counters.best_return)
+    great = {**info.success, 'last_step': 1.0, 'mean_return': -1.0}
+    checkpoint.save(best, actor, replace(info, success=great))
+    saved = best.read_bytes()
+    for episodes, kept in ((9, False), (8, True)):
+        settings = small(total_steps=2_400, evaluation_episodes=episodes)
+        trainer = Trainer(settings, tmp_path, Workers())
+        trainer.resume(tmp_path / STATE)
+        assert (trainer.counters.best_success == 1.0) is kept, 'one of fewer episodes says little'
+        if kept:
+            trainer.train()
+            assert best.read_bytes() == saved
 
 
 def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(

@@ -41,12 +41,14 @@ def test_a_run_from_before_a_column_was_added_goes_on(tmp_path: Path) -> None:
     assert rows[2]['env_steps'] == 300 and rows[2]['eval_stay'] == 0.9
 
 
-def test_a_line_that_a_killed_run_cut_short_is_dropped_on_resuming(tmp_path: Path) -> None:
+@pytest.mark.parametrize('cut', ['1,200,1', '1,200,1,,0.5,-'])
+def test_a_line_that_a_killed_run_cut_short_is_dropped(tmp_path: Path, cut: str) -> None:
     log = RunLog(tmp_path, 1000, 0)
     log.write(row(100, 0.5))
     log.close()
     with (tmp_path / 'progress.csv').open('a') as file:
-        file.write('1,200,1')
+        file.write(cut)
+    assert [values['env_steps'] for values in read_progress(tmp_path / 'progress.csv')] == [100]
     RunLog(tmp_path, 1000, 0, resumed_steps=200).close()
     assert [values['env_steps'] for values in read_progress(tmp_path / 'progress.csv')] == [100]
 

@@ -25,7 +25,7 @@ from policy_node.training.learning.graded import GradedReward, parse_grades
 from policy_node.training.learning.logged_episodes import read_experience
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import RunLog, read_progress
-from policy_node.training.learning.sampling import scale_thresholds
+from policy_node.training.learning.sampling import narrowed, scale_thresholds
 from policy_node.training.learning.trainer import (
     Collected,
     Trainer,
@@ -38,6 +38,7 @@ from policy_node.training.train_her import main
 torch.set_num_threads(1)
 
 THREADS = ['--threads', '1', '--torch-threads', '1']
+PPO = ['--algorithm', 'ppo', '--no-overlap', '--random-epsilon', '0']
 # A run of seconds: 8 simulations, 3 cycles.
 SMALL = [
     *['--task', 'FetchReach', '--num-envs', '8', '--steps', '1200', *THREADS],
@@ -145,6 +146,16 @@ def test_resume_goes_on_where_the_run_stopped(tmp_path: Path) -> None:
     count = 'observation_statistics.count'
     assert before[count] == 1200 and after[count] == 3200
     assert checkpoint.read_info(run / 'latest.safetensors').env_steps == 3200
+
+
+def test_the_latest_actor_is_the_averaged_one_that_evaluations_measure(tmp_path: Path) -> None:
+    run = tmp_path / 'run'
+    assert main([*SMALL, '--set', 'actor_average=.9', '--output', str(run)]) == 0
+    state = weights(run / 'training_state.safetensors')
+    name = 'output.weight'
+    assert not torch.equal(state[f'average_actor.{name}'], state[f'actor.network.{name}'])
+    latest = checkpoint.load(run / 'latest.safetensors')[0]
+    assert torch.equal(latest.network.state_dict()[name], state[f'average_actor.{name}'])
 
 
 def test_a_training_state_restores_everything(tmp_path: Path) -> None:
@@ -271,6 +282,9 @@ def test_graded_rewards_are_shares_of_thresholds_met() -> None:
     reward = GradedReward(metric, parse_grades('.5,1,2,4'))
     met = np.array([1.0, 0.75 * 1.0, 0.5 * 0.25, 0.25 * 0.25, 0.0 * 1.0])
     np.testing.assert_array_equal(reward(achieved, goal), met - 1.0)
+    apart = GradedReward(metric, parse_grades('.5,1,2,4'), apart=0.5)
+    mean = np.array([1.0, 0.875, 0.375, 0.25, 0.5])
+    np.testing.assert_array_equal(apart(achieved, goal), (met + mean) / 2.0 - 1.0)
     sparse = GradedReward(metric, parse_grades('1'))
     np.testing.assert_array_equal(sparse(achieved, goal), metric.reward(achieved, goal))
 
@@ -308,17 +322,25 @@ def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_p
 
 
 @pytest.mark.parametrize(
-    ('first_distance', 'above', 'narrowing_steps'),
-    [(1.1, 0.0, 1_200), (1.1, 1.0, 0), (1000.0, 1.0, 800)],
+    ('first_distance', 'above', 'grades', 'narrowing_steps'),
+    [
+        (1.1, 0.0, '', 1_200),
+        (1.1, 1.0, '', 0),
+        # Grades decide what meeting a goal is worth, not when it is met.
+        (1.1, 1.0, '40', 0),
+        (1000.0, 1.0, '', 800),
+        (1000.0, 1.0, '.0001,1', 800),
+    ],
 )
 def test_goals_narrow_on_only_after_cycles_that_met_them(
-    tmp_path: Path, first_distance: float, above: float, narrowing_steps: int
+    tmp_path: Path, first_distance: float, above: float, grades: str, narrowing_steps: int
 ) -> None:
     """Three cycles of 400 steps: nobody misses a goal of 1 m, noise misses some of 0.055 m.
 
     The first cycle ends before anything was learnt and counts for nothing where goals can wait.
     """
-    config = small_config(total_steps=1_200, first_distance=first_distance, narrow_above=above)
+    changes = {'first_distance': first_distance, 'narrow_above': above, 'reward_grades': grades}
+    config = small_config(total_steps=1_200, **changes)
     trainer = Trainer(config, tmp_path, Workers())
     log = RunLog(tmp_path, config.total_steps, config.time_limit)
     trainer.train(log)
@@ -340,7 +362,8 @@ def test_a_dropped_object_met_no_goal_where_a_drop_is_lost(tmp_path: Path) -> No
         episodes, _ = trainer.collector.collect(trainer.learner.actor, random=True)
         dropped = (episodes.achieved_goal[:, -4, 2] < 0.04).sum()
         assert dropped > 0
-        counts.append(trainer.experience.count_met(episodes))
+        success = narrowed(trainer.simulation.metric, config, 0.0).success
+        counts.append(trainer.experience.count_met(episodes, success))
     assert counts[0] == 16
     assert counts[1] <= 16 - dropped
 
@@ -462,6 +485,15 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
             "'gama=1' is not name=value; did you mean 'gamma'?",
         ),
         (['--task', 'FetchReach', '--no-her', '--strategy', 'final'], '--no-her excludes'),
+        (['--task', 'FetchReach', '--no-her', '--set', 'strategy=final'], '--no-her excludes'),
+        (
+            [*'--task FetchReach --replay-transitions 1000 --learning-starts 1001'.split()],
+            'learning_starts needs replay_transitions of 1001 or more',
+        ),
+        (
+            [*PPO, '--task', 'FetchReach', '--from-episodes', '.'],
+            'algorithm ppo excludes --from-episodes',
+        ),
         (['--task', 'FetchReach', '--strategy', 'past'], "strategy 'past'; allowed: "),
         (['--resume', 'nowhere'], 'nowhere/training_state.safetensors is no file'),
     ],
@@ -471,6 +503,25 @@ def test_bad_usage_is_one_line_and_exit_status_2(
 ) -> None:
     output = [] if '--resume' in arguments else ['--output', str(tmp_path)]
     assert main([*arguments, *output]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--task', 'FetchSlide'], 'is a run of FetchReach, not of FetchSlide'),
+        (['--set', 'task=FetchSlide'], 'is a run of FetchReach, not of FetchSlide'),
+        (['--recipe', 'paper'], 'is a run of best, not of paper'),
+        (['--output', 'elsewhere'], '--output excludes --resume: the run goes on in '),
+        (['--set', 'init_from=FetchReach'], '--init-from excludes --resume'),
+    ],
+)
+def test_what_a_run_that_goes_on_cannot_change(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    Trainer(small_config(), tmp_path, Workers()).save()
+    assert main(['--resume', str(tmp_path), *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1
 
