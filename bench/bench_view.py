@@ -35,7 +35,7 @@ from msgs_spec.transport import keep_discovery_local  # noqa: E402
 
 VISITORS = 3
 # Seconds of a turn with the viewer or without, and before it until either is under way.
-_TURN, _SETTLING = 2.0, 0.7
+_TURN, _SETTLING = 1.6, 0.4
 # Seconds after which a process that was told to end is killed.
 _END_TIMEOUT = 20.0
 
@@ -118,11 +118,12 @@ def take_turns(watcher: Watcher, seconds: float) -> None:
                 turn[runs] = rate(watcher, _TURN)
         view.send_signal(signal.SIGCONT)
     without, beside = turns.mean(axis=0)
-    low, middle, high = np.percentile(turns[:, 1] / turns[:, 0], (25, 50, 75))
+    ratios = np.log(turns[:, 1] / turns[:, 0])
+    error = ratios.std(ddof=1) / np.sqrt(len(ratios))
     print(
         f'{VISITORS} visitors that do not draw: {beside:.0f} ticks/s, {without:.0f} while the '
-        f'viewer is stopped: {100.0 * beside / without:.1f} %; of {len(turns)} pairs of turns the '
-        f'median {100.0 * middle:.1f} %, quartiles {100.0 * low:.1f} and {100.0 * high:.1f} %',
+        f'viewer is stopped; of {len(turns)} pairs of turns {100.0 * np.exp(ratios.mean()):.1f} % '
+        f'+- {100.0 * error:.1f} % (standard error)',
         flush=True,
     )
     print(f'no viewer any more: {rate(watcher, seconds):.0f} ticks/s', flush=True)

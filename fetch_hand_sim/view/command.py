@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from msgs_spec.command_line import FormerOption, require_extra, run_command
+from msgs_spec.command_line import CommandParser, FormerOption, require_extra, run_command
 from msgs_spec.tasks import TASKS
 
 _LOOPBACK = '127.0.0.1'
@@ -25,7 +25,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line; what follows `--ros-args` is kept for ROS."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     cut = words.index('--ros-args') if '--ros-args' in words else len(words)
-    parser = argparse.ArgumentParser(prog='view', description=_DESCRIPTION)
+    parser = CommandParser(prog='view', description=_DESCRIPTION)
     parser.add_argument(
         'path', nargs='?', type=Path, help='an episode, or a folder of episodes, to play'
     )

@@ -65,7 +65,7 @@ class RobotWatch:
 
     Args:
         node: Of this process.
-        on_status: Gets what the robot says of its episode; the task may be another one.
+        on_status: Gets what the robot says of its episode; it may be another robot.
         on_tick: Gets every tick, or the latest.
         every_tick: Whether each counts, also of a robot that is faster than eyes are. If not,
             `latest_tick` is taken where there is one; replays have none.
@@ -125,12 +125,15 @@ class RobotWatch:
         status = _read_status(message)
         if status is None:
             return
-        is_other = self.status is None or self.status.task != status.task
-        if is_other or not self._takes_latest or status.phase == 'waiting':
+        if self._is_other(status) or not self._takes_latest or status.phase == 'waiting':
             self._take_status(status)
 
+    def _is_other(self, status: EpisodeStatus) -> bool:
+        """Whether this is said by another robot than before."""
+        return self.status is None or not self.status.is_of_same_robot(status)
+
     def _take_status(self, status: EpisodeStatus) -> None:
-        if self.status is None or self.status.task != status.task:
+        if self._is_other(status):
             self._follow(task_spec(status.task, status.joint_prefix, status.control_hz))
         self.status = status
         self._on_status(status)

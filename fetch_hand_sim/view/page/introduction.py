@@ -14,12 +14,11 @@ def introduction(spec: TaskSpec) -> str:
         'FetchPickAndPlace': 'The arm picks the box up and holds it at the red ball.',
         'HandReach': 'The hand brings its fingertips to the red balls: thumb and finger meet.',
     }.get(spec.name)
-    if spec.formulas is not None:
-        what = f'{spec.name} is a task of another package.'
-    if what is None:
-        thing = next(word for word in ('block', 'egg', 'pen') if word in spec.name.lower())
+    things = (word for word in ('Block', 'Egg', 'Pen') if f'HandManipulate{word}' in spec.name)
+    if spec.formulas is None and (thing := next(things, '').lower()):
         how = ' and moves it there' if spec.position_counts else ''
         what = f'The hand turns the {thing} until it looks like the tinted ghost{how}.'
+    what = what or f'{spec.name} is a task of another package.'
     return f'{what} The goal turns green when it is reached.'
 
 
