@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBR
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
 	@echo 'make demo VIEW=1 [TASK=...]  the same on a page in the browser, until Ctrl-C'
-	@echo 'make test       lint, types and all tests'
+	@echo 'make test       lint, types and all tests but the long ones'
 	@echo 'make test-browser  the page in an installed Chromium'
 	@echo 'make lint       ruff and mypy only'
 	@echo 'make format     let ruff rewrite the code'

@@ -57,11 +57,17 @@ class CommandParser(argparse.ArgumentParser):
     """A parser whose errors are one line, as those of `run_command` are."""
 
     def error(self, message: str) -> NoReturn:
-        """Says what is wrong and exits; of an unknown option, which one was probably meant."""
-        unknown = re.match(r'unrecognized arguments: (--[\w-]+)', message)
-        hint = did_you_mean(unknown[1], list(self._option_string_actions)) if unknown else ''
-        complain(self.prog, f'{message}{hint}')
+        """Says what is wrong and exits; of an unknown name, which one was probably meant."""
+        complain(self.prog, f'{message}{self._hint(message)}')
         sys.exit(EXIT_USAGE)
+
+    def _hint(self, message: str) -> str:
+        unknown = re.match(r'unrecognized arguments: (--[\w-]+)', message)
+        if unknown:
+            return did_you_mean(unknown[1], list(self._option_string_actions))
+        choice = re.match(r"argument (?:[^:]*/)?(--[\w-]+): invalid choice: '([^']*)'", message)
+        choices = self._option_string_actions[choice[1]].choices if choice else None
+        return did_you_mean(choice[2], map(str, choices)) if choice and choices else ''
 
 
 def whole_number(lower: int, upper: int | None = None) -> Callable[[str], int]:

@@ -322,7 +322,7 @@ def run_node(
         complain(name, error)
         return error.exit_code
     import rclpy
-    from rclpy.exceptions import ROSInterruptException
+    from rclpy.exceptions import InvalidParameterTypeException, ROSInterruptException
     from rclpy.signals import SignalHandlerOptions
 
     try:
@@ -332,6 +332,10 @@ def run_node(
     except CommandError as error:
         complain(name, error)
         return error.exit_code
+    except InvalidParameterTypeException as error:
+        # Of a parameter that is ROS's own, such as use_sim_time.
+        complain(name, error)
+        return UsageError.exit_code
     except ROSInterruptException:
         return EXIT_SUCCESS
     finally:
@@ -357,5 +361,6 @@ def _refuse_plain_arguments(args: Sequence[str]) -> None:
             inside = False
         elif not inside:
             raise UsageError(
-                f'unknown argument {arg!r}; parameters are given as --ros-args -p <name>:=<value>'
+                f'unknown argument {arg!r}; parameters are given as --ros-args -p <name>:=<value>, '
+                'or as <name>:=<value> alone after `fetch_hand_sim sim`, `policy`, ...'
             )

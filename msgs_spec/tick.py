@@ -59,6 +59,13 @@ class EpisodeStatus:
     is_success: bool
     joint_prefix: str = JOINT_PREFIX
 
+    def is_of_same_robot(self, other: EpisodeStatus) -> bool:
+        """Whether the messages of both mean the same: who follows one can follow the other."""
+        return all(
+            getattr(self, name) == getattr(other, name)
+            for name in ('task', 'control_hz', 'joint_prefix')
+        )
+
     def to_values(self) -> dict[str, str]:
         """Returns the key/value pairs of the message."""
         values = {key: str(value) for key, value in dataclasses.asdict(self).items()}

@@ -15,8 +15,8 @@ from typing import Any
 
 from msgs_spec.robots import FETCH
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS, GoalKind, TaskSpec
-from policy_node.training.benchmark.actors_table import steps_behind
 from policy_node.training.benchmark.published import BEST, CEILINGS, RERUN
+from policy_node.training.learning.origins import steps_behind
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = ROOT / 'docs' / 'tasks'
@@ -155,7 +155,8 @@ def _actor(task: TaskSpec, actors: Path) -> str:
             (f'in `{reference["environment"]}`', f'{success}, {reference["episodes"]:,} episodes'),
         )
     failures = f'### Its failures\n\n{_failures(task, report)}'
-    curve = f'![Success during training](../../policy_node/actors/{task.name}.png)'
+    shows = 'Success during training, of a run before where the actor is a mean'
+    curve = f'![{shows}](../../policy_node/actors/{task.name}.png)'
     return f'{_table(("", ""), rows)}\n\n{curve}\n\n{failures}'
 
 

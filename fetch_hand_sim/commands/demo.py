@@ -230,12 +230,18 @@ def _show(progress: Progress, bar: TaskID, watcher: Watcher) -> None:
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog='fetch_hand_sim demo', description=__doc__)
-    parser.add_argument('--task', default='FetchReach', help='one of the thirteen tasks')
+    parser.add_argument('--task', default='FetchReach', help='default: %(default)s')
     count, seed = whole_number(1), whole_number(0, LARGEST_SEED)
-    parser.add_argument('--episodes', type=count, default=5, help='how many episodes')
-    parser.add_argument('--seed', type=seed, default=0, help='seed of the first episode')
-    parser.add_argument('--episode-dir', default='episodes', help='where episodes are logged')
-    parser.add_argument('--policy', default='', help="actor file, 'random' or 'resting'")
+    parser.add_argument('--episodes', type=count, default=5, help='how many; default: %(default)s')
+    parser.add_argument('--seed', type=seed, default=0, help='of the first; default: %(default)s')
+    parser.add_argument(
+        '--episode-dir', default='episodes', help='where they are logged; default: %(default)s'
+    )
+    parser.add_argument(
+        '--policy',
+        default='',
+        help='a shipped actor, a file, random or resting; default: the shipped actor of the task',
+    )
     parser.add_argument('--checkpoint', dest='policy', action=FormerOption, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     try:

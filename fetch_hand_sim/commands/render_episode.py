@@ -29,8 +29,12 @@ _SPEEDS = (0.01, 100.0)
 
 
 def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition('x')
-    return int(width), int(height)
+    try:
+        width, height = (int(side) for side in text.split('x'))
+    except ValueError:
+        message = f'{text[:80]!r} given; allowed: two numbers with an x between them'
+        raise argparse.ArgumentTypeError(message) from None
+    return width, height
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -46,7 +50,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         '--grid', type=_size, metavar='CxR', help='columns x rows of episodes, such as 4x4'
     )
-    parser.add_argument('--frame', type=int, default=-1, help='of a picture; default: the last')
+    parser.add_argument('--frame', type=int, default=-1, help='of a picture; default: -1, the last')
     parser.add_argument('--speed', type=float, default=1.0, help='simulated seconds per second')
     options = parser.parse_args(arguments)
     if not _SPEEDS[0] <= options.speed <= _SPEEDS[1]:

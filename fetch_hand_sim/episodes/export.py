@@ -11,8 +11,10 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium
@@ -24,10 +26,13 @@ from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
 from fetch_hand_sim.gym_envs.spaces import observation_space
 from msgs_spec.command_line import CommandError, UsageError, printable
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 
 # Parts of a dataset's id become directories.
 _DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
 _VERSION = re.compile(r'-v\d+$')
+# Minari's: where datasets live, and what is in the directories above one.
+_MINARI_PATH, _NAMESPACE = 'MINARI_DATASETS_PATH', 'namespace_metadata.json'
 _OBSERVATIONS = ('observation', 'achieved_goal', 'desired_goal')
 
 
@@ -61,7 +66,7 @@ def export_parquet(episodes: Sequence[EpisodeArrays], directory: Path) -> list[P
         The two files.
 
     Raises:
-        ExportError: If pyarrow is missing, the files exist or cannot be written.
+        ExportError: If pyarrow is missing, or a file exists or cannot be written; none is created.
     """
     pyarrow, parquet = _require('pyarrow'), _require('pyarrow.parquet')
     task = episodes[0].spec.name
@@ -75,14 +80,27 @@ def export_parquet(episodes: Sequence[EpisodeArrays], directory: Path) -> list[P
     }
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        for path, table in tables.items():
+        for path in tables:
             if path.exists():
                 raise ExportError(f'{path} exists; nothing is overwritten')
-            with path.open('xb') as stream:
-                parquet.write_table(table, stream, compression='zstd')
+        _write_tables(parquet, tables)
     except OSError as error:
         raise ExportError(f'{directory}: {error.strerror or error}') from error
     return list(tables)
+
+
+def _write_tables(parquet: Any, tables: Mapping[Path, Any]) -> None:
+    """Writes all tables under hidden names, then gives them theirs: a full disk leaves none."""
+    hidden = {path: path.with_name(f'.{path.name}.partial') for path in tables}
+    try:
+        for path, table in tables.items():
+            with hidden[path].open('wb') as stream:
+                parquet.write_table(table, stream, compression='zstd')
+        for path in tables:
+            os.replace(hidden[path], path)
+    finally:
+        for partial in hidden.values():
+            partial.unlink(missing_ok=True)
 
 
 def _step_table(pyarrow: Any, index: int, episode: EpisodeArrays) -> Any:
@@ -142,7 +160,7 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
 
     Raises:
         UsageError: If the name is not allowed.
-        ExportError: If minari is missing, the dataset exists or cannot be written. Nothing is
+        ExportError: If minari is missing, the dataset exists or cannot be written. No dataset is
             created in either case.
     """
     if not _DATASET_NAME.fullmatch(name):
@@ -150,7 +168,6 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
             f'dataset name {name!r}; allowed: letters, digits, _ and -, parts separated by /, such '
             'as logged-v0'
         )
-    os.environ['MINARI_DATASETS_PATH'] = str(directory.resolve())
     minari, collector = _require('minari'), _require('minari.data_collector')
     spec = episodes[0].spec
     dataset_id = f'{spec.name}/{name if _VERSION.search(name) else f"{name}-v0"}'
@@ -173,7 +190,7 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
     actions = spaces.Box(-1.0, 1.0, (spec.robot.action_size,), np.float64)
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        with warnings.catch_warnings():
+        with _appearing(directory, dataset_id), warnings.catch_warnings():
             # Minari warns of every field that only an author could fill in.
             warnings.filterwarnings('ignore', module='minari')
             minari.create_dataset_from_buffers(
@@ -194,12 +211,35 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
     return dataset_id
 
 
+@contextmanager
+def _appearing(directory: Path, dataset_id: str) -> Iterator[None]:
+    """Minari writes into a hidden folder meanwhile; what is whole at the end moves to its place."""
+    # Minari joins a relative path to itself.
+    directory = directory.resolve()
+    with TemporaryDirectory(prefix='.', suffix='.partial', dir=directory) as hidden:
+        os.environ[_MINARI_PATH] = hidden
+        try:
+            yield
+        finally:
+            os.environ[_MINARI_PATH] = str(directory)
+        for source in Path(hidden).rglob(_NAMESPACE):
+            target = directory / source.relative_to(hidden)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if not target.exists():
+                source.replace(target)
+        (Path(hidden) / dataset_id).rename(directory / dataset_id)
+
+
 def _environment(episode: EpisodeArrays) -> Any:
     """The Gymnasium environment the episode could have come from, for `recover_environment`."""
     register_environments()
+    record = episode.record
     spec = copy.deepcopy(gymnasium.spec(environment_id(episode.spec.name)))
     for name in ('reward_type', 'success_rule', 'control_hz'):
-        spec.kwargs[name] = getattr(episode.record, name)
+        spec.kwargs[name] = getattr(record, name)
+    # Robots up to 1.0 took as many steps at every rate.
+    rate = record.control_hz if record.timing == 'seconds' else DEFAULT_CONTROL_HZ
+    spec.max_episode_steps = task_spec(episode.spec.name, control_hz=rate).episode_ticks
     return spec
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
@@ -24,6 +25,10 @@ STILL = ('.png', '.jpg')
 _QUALITY = 72
 _COLORS = 128
 _SAMPLES = 8
+# Milliseconds that a GIF and a WebP count in.
+_UNITS = {'.gif': 10, '.webp': 1}
+# Of a picture in either: browsers show what is shorter for 100.
+_SHORTEST_MS = 20
 
 
 def check_kind(path: Path) -> None:
@@ -47,7 +52,8 @@ def write_film(path: Path, pictures: Iterable[Picture], fps: float) -> None:
     Args:
         path: Ending in .mp4, .gif or .webp.
         pictures: Drawn as they are written.
-        fps: Pictures per second.
+        fps: Pictures per second. A GIF or WebP shows 50 at most: it takes every n-th picture where
+            there are more, so that the film lasts as long.
 
     Raises:
         UsageError: If there is no ffmpeg.
@@ -71,7 +77,10 @@ def write_picture(path: Path, picture: Picture) -> None:
 def _write_animation(path: Path, pictures: Iterable[Picture], fps: float) -> None:
     from PIL import Image
 
-    images = [Image.fromarray(picture) for picture in pictures]
+    every, images, count = _kept_every(fps), [], 0
+    for count, picture in enumerate(pictures, start=1):
+        if (count - 1) % every == 0:
+            images.append(Image.fromarray(picture))
     options: dict[str, Any] = {'quality': _QUALITY, 'method': 4}
     if path.suffix == '.gif':
         # One palette for all, or colours flicker; made of some, because goals change their colour.
@@ -81,8 +90,20 @@ def _write_animation(path: Path, pictures: Iterable[Picture], fps: float) -> Non
         images = [image.quantize(palette=palette) for image in images]
         options = {'optimize': True}
     first, *rest = images
-    duration = round(1000.0 / fps)
-    first.save(path, save_all=True, append_images=rest, duration=duration, loop=0, **options)
+    durations = _durations(count, fps, _UNITS[path.suffix])
+    first.save(path, save_all=True, append_images=rest, duration=durations, loop=0, **options)
+
+
+def _kept_every(fps: float) -> int:
+    """One of how many pictures can be shown."""
+    return math.ceil(fps * _SHORTEST_MS / 1000.0)
+
+
+def _durations(count: int, fps: float, unit: int) -> list[int]:
+    """Milliseconds of the pictures kept of `count`, in units; what is rounded never adds up."""
+    begins = np.append(np.arange(0, count, _kept_every(fps)), count) * (1000.0 / fps)
+    lengths = np.diff(np.rint(begins / unit).astype(int) * unit)
+    return [max(_SHORTEST_MS, length) for length in lengths.tolist()]
 
 
 def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:

@@ -46,9 +46,17 @@ class Studio:
             yield self.picture(recording, index)
 
     def picture(self, recording: Recording, index: int) -> Picture:
-        """Returns the picture of one frame; negative indices count from the end."""
+        """Returns the picture of one frame; negative indices count from the end.
+
+        Raises:
+            ValueError: If there is no such frame, or the model has no such camera.
+            RuntimeError: If there is no OpenGL.
+        """
         frames = recording.frames
-        index = index % len(frames)
+        count = len(frames)
+        if not -count <= index < count:
+            raise ValueError(f'{recording.title}: frame {index}; allowed: {-count} ... {count - 1}')
+        index %= count
         trail = [tracked_position(f) for f in frames[max(0, index - _TRAIL_TICKS) : index + 1]]
         return self._renderer(recording.spec.name).render(frames[index], trail)
 

@@ -53,9 +53,9 @@ def load_recording(path: Path) -> Recording:
     """
     arrays = load_episode(path)
     ticks = len(arrays) + 1
-    spec = arrays.spec
+    task = arrays.record.task
     messages = read_messages(path)
-    joints = _vectors(messages, spec, 'joint_states', ticks)[:, : len(spec.robot.joints)]
+    joints = _vectors(messages, task, 'joint_states', ticks)[:, : len(task.robot.joints)]
     poses = _object_poses(messages, arrays, ticks)
     achieved, desired = arrays.observations['achieved_goal'], arrays.goals
     frames = [
@@ -77,15 +77,15 @@ def _object_poses(messages: MessageFile, arrays: EpisodeArrays, ticks: int) -> A
         return None
     if arrays.spec.goal is GoalKind.POSE:
         return arrays.observations['achieved_goal']
-    return _vectors(messages, arrays.spec, 'object_pose', ticks)
+    return _vectors(messages, arrays.record.task, 'object_pose', ticks)
 
 
-def _vectors(messages: MessageFile, spec: TaskSpec, name: str, ticks: int) -> Array:
-    """The vectors (ticks, size) of a topic that every tick has."""
+def _vectors(messages: MessageFile, task: TaskSpec, name: str, ticks: int) -> Array:
+    """The vectors (ticks, size) of a topic that every tick has; `task` names the joints."""
     resolved = next((each for each in messages.offsets if each.rpartition('/')[2] == name), name)
     try:
         rows = messages.rows(resolved).data[:ticks]
-        return TopicCodec(topic(spec, name)).decode_many(rows)[1]
+        return TopicCodec(topic(task, name)).decode_many(rows)[1]
     except (ValueError, KeyError) as error:
         raise EpisodeReadError(f'{messages.path}: no readable {name}: {error}') from error
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -106,6 +107,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._episode_steps = max_episode_steps or self.spec_of_task.episode_ticks
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
+        self._seeds: list[int | None] = [None] * num_envs
         self._pictures = Pictures(self.simulation, width, height, default_camera_config)
         self.set_thresholds(distance_threshold, rotation_threshold)
 
@@ -133,14 +135,11 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         """
         mask = self._reset_mask(options)
         ids = np.flatnonzero(mask)
-        seeds = seed
-        if seed is not None and not isinstance(seed, int | np.integer):
-            if len(seed) != self.num_envs:
-                raise ValueError(
-                    f'{self.num_envs} environments take as many seeds, not {len(seed)}'
-                )
-            seeds = [seed[i] for i in ids.tolist()]
-        observation = self.simulation.reset(seed=seeds, ids=ids)
+        seeds = self._each_seed(seed)
+        observation = self.simulation.reset(seed=[seeds[i] for i in ids.tolist()], ids=ids)
+        for index in ids.tolist():
+            if seeds[index] is not None:
+                self._seeds[index] = seeds[index]
         self._elapsed[mask] = 0
         self._ended[mask] = False
         return observation, {}
@@ -199,6 +198,11 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             **_masked(values, ~ended),
             **_masked({'final_obs': final, 'final_info': _masked(values, ended)}, ended),
         }
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """The seed of every environment's random generator, (N,); -1 before its first episode."""
+        return tuple(-1 if seed is None else seed for seed in self._seeds)
 
     def render(self) -> tuple[Any, ...] | None:
         """Returns a picture of every environment; None without a render mode.
@@ -261,6 +265,23 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         """Frees the renderer."""
         self._pictures.close()
 
+    def _each_seed(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        """The seed of each environment; None where its random generator goes on."""
+        if isinstance(seed, bool) or not isinstance(
+            seed, int | np.integer | Sequence | np.ndarray | None
+        ):
+            raise TypeError(f'a seed is an integer, a sequence of integers or None, not {seed!r}')
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + i for i in range(self.num_envs)]
+        each = [None] * self.num_envs if seed is None else list(seed)
+        if len(each) != self.num_envs:
+            raise ValueError(f'{self.num_envs} environments take as many seeds, not {len(each)}')
+        # Who never had a seed draws one that can be told.
+        return [
+            seeding.np_random()[1] if new is None and old is None else new
+            for new, old in zip(each, self._seeds, strict=True)
+        ]
+
     def _reset_mask(self, options: Any) -> Flags:
         check_reset_options(options, allowed=('reset_mask',))
         if not options:
@@ -275,7 +296,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
 _SETTABLE = ('reward_type', 'distance_threshold', 'rotation_threshold')
 # What each environment has for itself.
-_OF_EACH = {
+_OF_EACH: dict[str, Callable[[FetchHandVectorEnv], Sequence[Any]]] = {
+    'np_random_seed': lambda batch: batch.np_random_seed,
     'goal': lambda batch: list(batch.simulation.goals.copy()),
     'data': lambda batch: [batch.simulation.data(i) for i in range(batch.num_envs)],
 }

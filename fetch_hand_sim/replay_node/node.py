@@ -92,8 +92,11 @@ class ReplayNode(Node):
                 self._serve(executor)
                 self._publish_due()
         finally:
+            deadline = time.monotonic() + _LAST_WORDS_TIMEOUT
             for publisher in self._publishers_by_topic.values():
-                publisher.wait_for_all_acked(Duration(seconds=_LAST_WORDS_TIMEOUT))
+                # A killed subscriber never acknowledges: together, not each, they get a second.
+                left = max(0.0, deadline - time.monotonic())
+                publisher.wait_for_all_acked(Duration(seconds=left))
             executor.remove_node(self)
 
     def _wait_for_commander(self, executor: SingleThreadedExecutor, stop: StopSignals) -> None:
@@ -105,7 +108,7 @@ class ReplayNode(Node):
         if not self._settings['wait_for_commands']:
             return
         listeners = Listeners(self, self._publishers_by_topic.values())
-        commands = f'{self._schedule.namespace}/commands'
+        commands = self.resolve_topic_name(f'{self._schedule.namespace}/commands')
         own = int(commands in self._publishers_by_topic)
         had_commander = False
         while not stop and not (had_commander and listeners.are_connected()):

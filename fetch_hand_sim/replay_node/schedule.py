@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,6 +14,11 @@ from fetch_hand_sim.episode_log.episode_record import parse_control_hz
 from fetch_hand_sim.episode_log.ticks import logged_topics
 from msgs_spec.schemas import deserialize
 from msgs_spec.topics import TopicSpec
+
+# What ROS takes for a resolved name; `rmw` sets the length.
+_TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
+_LONGEST_NAME = 247
+_SHOWN = 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +54,15 @@ class ReplaySchedule:
         namespace: ROS namespace of the recorded robot, '' for the root.
 
     Raises:
-        EpisodeReadError: If the file is damaged, or holds what is no message of its type.
+        EpisodeReadError: If the file is damaged, or holds what is no message of its type, or topics
+            that have no names of ROS.
         ValueError: If the episode has no topic of a given name.
     """
 
     def __init__(self, path: Path, topics: Iterable[str] = (), with_inputs: bool = False) -> None:
         episode = read_episode(path)
         specs = logged_topics(episode)
+        _require_names(episode)
         wanted = _wanted(specs, list(topics), with_inputs)
         self.topics = {name: specs[name] for name in episode.topics if name in wanted}
         self.messages = sorted(
@@ -108,6 +116,15 @@ def _period_ns(episode: Episode) -> int:
         return round(1e9 / parse_control_hz(episode.metadata))
     except ValueError as error:
         raise EpisodeReadError(f'{episode.path}: {error}') from error
+
+
+def _require_names(episode: Episode) -> None:
+    for name in episode.topics:
+        if len(name) > _LONGEST_NAME or not _TOPIC_NAME.fullmatch(name):
+            raise EpisodeReadError(
+                f'{episode.path}: topic {name[:_SHOWN]!r}; allowed: names of ROS, '
+                f'up to {_LONGEST_NAME} characters'
+            )
 
 
 def _require_readable(path: Path, spec: TopicSpec, message: ReplayMessage) -> None:

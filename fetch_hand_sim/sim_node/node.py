@@ -36,6 +36,7 @@ from msgs_spec.parameters import SIM_NODE
 from msgs_spec.ros import (
     BEAT,
     EventLoop,
+    NodeFailure,
     StopSignals,
     UsageError,
     declare_parameters,
@@ -172,7 +173,11 @@ class SimNode(Node):
     # Running
 
     def run(self, stop: StopSignals) -> None:
-        """Runs episodes until all are done or the signals say stop."""
+        """Runs episodes until all are done or the signals say stop.
+
+        Raises:
+            NodeFailure: If all are done and not all could be logged.
+        """
         loop = EventLoop(self)
         self.get_logger().info(self._introduction())
         try:
@@ -188,6 +193,13 @@ class SimNode(Node):
         finally:
             self._close(stop)
             loop.close()
+        if self._robot.runner.is_done and self._has_log_failed:
+            # Of a number of episodes that was asked for, some are on no disk.
+            raise NodeFailure(f'not all episodes are in {self._settings["episode_dir"]}')
+
+    @property
+    def _has_log_failed(self) -> bool:
+        return self._recorder is not None and self._recorder.has_failed
 
     def _introduction(self) -> str:
         """What is simulated, how fast, where to find it and who is to command it."""
@@ -205,8 +217,9 @@ class SimNode(Node):
 
     def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
         """Lets nothing move until there is a commander who hears everything."""
-        watch = self._watch
-        while not stop and not (watch.commanders.names and watch.is_heard()):
+        watch, runner = self._watch, self._robot.runner
+        # Steps are taken meanwhile, and may be all there are.
+        while not (stop or runner.is_done or (watch.commanders.names and watch.is_heard())):
             loop.wait(BEAT)
             watch.update()
             self._beat_when_due()
@@ -310,8 +323,8 @@ class SimNode(Node):
         self._publish([(REAL_TIME_FACTOR, factor)])
 
     def _surroundings(self) -> Surroundings:
-        recorder, directory, watch = self._recorder, self._settings['episode_dir'], self._watch
-        has_failed = recorder is not None and recorder.has_failed
+        directory, watch = self._settings['episode_dir'], self._watch
+        has_failed = self._has_log_failed
         names = watch.commanders.names
         return Surroundings(
             commanders=names,

@@ -130,7 +130,6 @@ class Simulation:
         self.goals = np.zeros((num_envs, self.spec.goal.size))
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._all = np.arange(num_envs)
-        self._pushes: Array | None = None
         self._is_pushed = False
 
     @property
@@ -289,8 +288,6 @@ class Simulation:
         number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY.value, body)
         if number < 1 or not self.model.body_weldid[number]:
             raise ValueError(f'no body {body[:40]!r} that can move')
-        if self._pushes is None:
-            self._pushes = self._task.batch.bind('xfrc_applied')
         self._pushes[index, number] = values
         self._is_pushed = True
 
@@ -316,6 +313,7 @@ class Simulation:
             'goals': self.goals.copy(),
             'generators': self._generators,
             'divergences': self.divergences,
+            'is_pushed': self._is_pushed,
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -331,10 +329,18 @@ class Simulation:
         self.goals[:] = state['goals']
         self._generators = state['generators']
         self.divergences = state['divergences']
+        # The push itself is part of the physics; copies made by 1.0 do not say that it ends.
+        self._is_pushed = state.get('is_pushed', False)
 
     def observe_from(self, readings: Readings) -> Observation:
         """The observation of what `readings` returned."""
         return self._observation(*self._task.observe_from(readings))
+
+    @property
+    def _pushes(self) -> Array:
+        """What bodies are pushed by, (N, bodies, 6), live."""
+        pushes: Array = self._task.batch.bind('xfrc_applied')
+        return pushes
 
     def _advance(self, commands: NDArray[np.floating]) -> NDArray[np.bool_]:
         self._task.apply_commands(commands)
@@ -343,7 +349,7 @@ class Simulation:
             failed = np.zeros(self.num_envs, dtype=bool)
         except SimulationError as error:
             failed = np.isin(self._all, error.ids)
-        if self._is_pushed and self._pushes is not None:
+        if self._is_pushed:
             self._pushes[:] = 0.0
             self._is_pushed = False
         diverged = failed | self._has_diverged()

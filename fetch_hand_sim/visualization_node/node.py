@@ -64,6 +64,7 @@ class VisualizationNode(Node):
     def __init__(self) -> None:
         super().__init__(NODE_NAME)
         settings = declare_parameters(self, VISUALIZATION_NODE)
+        self._robot: tuple[str, str] | None = None
         self._scene: Scene | None = None
         self._transforms: Transforms | None = None
         self._scalars: Scalars | None = None
@@ -120,7 +121,10 @@ class VisualizationNode(Node):
     def _on_status(self, status: EpisodeStatus) -> None:
         spec = self._watch.spec
         assert spec is not None
-        if self._scene is None or self._scene.spec.name != spec.name:
+        # The description names the joints.
+        robot = status.task, status.joint_prefix
+        if robot != self._robot:
+            self._robot = robot
             self._begin(spec)
         if self._scalars is None or self._success_rule != status.success_rule:
             self._success_rule = status.success_rule
@@ -182,7 +186,7 @@ class VisualizationNode(Node):
         if self._has_newcomer and self._listeners.are_connected():
             self._has_newcomer = False
             # Nothing is said in the name of a robot that is gone.
-            if self.count_publishers('joint_states'):
+            if self.count_publishers(self.resolve_topic_name('joint_states')):
                 self._on_tick(self._latest)
 
     def _take_photo(self, scene: Scene, tick: SeenTick, wanted: list[str]) -> None:

@@ -54,7 +54,12 @@ class Health:
         self._responder = None
 
     def report(
-        self, now: float, robots: int, is_paused: bool = False, elsewhere: Sequence[str] = ()
+        self,
+        now: float,
+        robots: int,
+        is_paused: bool = False,
+        elsewhere: Sequence[str] = (),
+        missing: Sequence[str] = (),
     ) -> Report:
         """Closes a period and reports on it.
 
@@ -63,6 +68,7 @@ class Health:
             robots: How many publish `episode_status`.
             is_paused: Whether the robot says that it is paused.
             elsewhere: Namespaces of other robots, told where there is none here.
+            missing: Topics of the robot that nobody publishes, so that it cannot be answered.
         """
         if self._responder is None:
             report = Report(self._name, '', {'robots': str(robots)}, 'waits for a robot')
@@ -73,6 +79,8 @@ class Health:
                 f'no robot here: there is one in {", ".join(elsewhere)}; join it with '
                 f'--ros-args -r __ns:={elsewhere[0]}'
             )
+        if robots and missing:
+            report.warn(f'no state: nobody publishes {", ".join(missing)}')
         if robots > 1:
             report.warn(f'{robots} robots publish here; give each a namespace')
         return report

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -38,7 +38,8 @@ from policy_node.policies.loading import TaskMissing, load_policy
 from policy_node.policies.policy import LoadedPolicy
 
 _WARN_PERIOD = 1.0
-# Seconds a robot may take to appear before others are named; discovery takes a moment.
+# Seconds a robot may take to appear before others are named, and its topics before those that are
+# missing are; discovery takes a moment.
 _PATIENCE = 3.0
 _SERVED_AT_ONCE = 1000
 _ANY_TASK = next(iter(TASKS.values()))
@@ -113,23 +114,32 @@ class PolicyNode(Node):
         """Begins to answer the robot that was found."""
         try:
             commander = Commander(self._load_for(status), status.control_hz)
+            responder = Responder(commander, status, self._send)
         except ValueError as error:
             raise NodeFailure(str(error)) from None
-        self._responder = responder = Responder(commander, status, self._send)
-        self._answered_status = status
-        for source in responder.topics:
-            receive = self._receiver(responder, source.name)
-            self._of_robot.append(self._subscribe(source, receive, STATE, raw=True))
-        while not stop and not all(self.count_publishers(s.name) for s in responder.topics):
+        self._responder, self._answered_status = responder, status
+        state = [
+            self._subscribe(source, self._receiver(responder, source.name), STATE, raw=True)
+            for source in responder.topics
+        ]
+        self._of_robot += state
+        began = time.monotonic()
+        while missing := self._unpublished(state):
             loop.wait(BEAT)
-            if self._has_robot_changed():
+            if stop or self._has_robot_changed() or self._is_replaced:
                 return
+            self._report_when_due(missing if time.monotonic() > began + _PATIENCE else ())
         self._announce(commander)
         # Last of all: its appearance tells the robot that everything before it is in place.
         self._commands = self._publisher(topic(commander.spec, 'commands'))
         self._of_robot.append(self._commands)
         self._health.start(responder, status)
         self.get_logger().info(f'{commander.spec.name}: commands come from {commander.description}')
+
+    def _unpublished(self, subscriptions: list[Subscription]) -> list[str]:
+        """Topics that nobody publishes, by their names on the graph, where they may be remapped."""
+        names = [each.topic_name for each in subscriptions]
+        return [name for name in names if not self.count_publishers(name)]
 
     def _load_for(self, status: EpisodeStatus) -> LoadedPolicy:
         """Returns the policy for a robot.
@@ -146,12 +156,7 @@ class PolicyNode(Node):
 
     def _has_robot_changed(self) -> bool:
         before, now = self._answered_status, self._status
-        if before is None or now is None:
-            return False
-        return any(
-            getattr(now, name) != getattr(before, name)
-            for name in ('task', 'control_hz', 'joint_prefix')
-        )
+        return before is not None and now is not None and not now.is_of_same_robot(before)
 
     def _take_policy(self, parameters: list[Parameter]) -> SetParametersResult:
         """Loads another policy at once, so that who sets it hears whether there is one."""
@@ -247,23 +252,27 @@ class PolicyNode(Node):
         except ValueError as error:
             self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=_WARN_PERIOD)
             return
-        if self._responder is not None and status.phase == 'waiting':
+        stamp = message_stamp(message)
+        # A robot that was started again, or an episode that is replayed again.
+        if self._responder is not None and (
+            status.phase == 'waiting' or stamp < self._status_stamp
+        ):
             self._responder.forget()
-        self._status, self._status_stamp = status, message_stamp(message)
+        self._status, self._status_stamp = status, stamp
 
     def _on_diagnostics(self, message: Any) -> None:
         is_paused = read_pause(message, self.get_namespace())
         if is_paused is not None:
             self._is_paused = is_paused
 
-    def _report_when_due(self) -> None:
+    def _report_when_due(self, missing: Sequence[str] = ()) -> None:
         now = time.monotonic()
         if now < self._report_due:
             return
         self._report_due = max(self._report_due + REPORT_PERIOD, now)
         robots = self.count_publishers(self._status_name)
         elsewhere = [] if robots or now < self._elsewhere_from else self._robots_elsewhere()
-        report = self._health.report(now, robots, self._is_paused, elsewhere)
+        report = self._health.report(now, robots, self._is_paused, elsewhere, missing)
         self._diagnostics.publish(encode_reports(report))
         for line in self._health.news(report):
             self.get_logger().warning(line)

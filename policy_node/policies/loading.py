@@ -61,7 +61,7 @@ def load_policy(
     name = str(name)
     if name in (RANDOM, RESTING):
         return _untrained(name, task)
-    path = _named(name) if name else _shipped(task)
+    path = actor_path(name, (RANDOM, RESTING)) if name else _shipped(task)
     loaded = _read(path, task, trust)
     _try_out(loaded, task_spec(loaded.task))
     return loaded
@@ -71,13 +71,6 @@ def _untrained(name: str, task: str | None) -> LoadedPolicy:
     size = task_spec(_require_task(name, task)).robot.action_size
     policy: Policy = RandomPolicy(size) if name == RANDOM else RestingPolicy(size)
     return LoadedPolicy(policy, _require_task(name, task), f'a {name} policy')
-
-
-def _named(name: str) -> Path:
-    try:
-        return actor_path(name)
-    except ValueError as error:
-        raise ValueError(f'{error}, {RANDOM!r} or {RESTING!r}') from None
 
 
 def _shipped(task: str | None) -> Path:

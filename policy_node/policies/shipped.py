@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+
+from msgs_spec.hints import did_you_mean
+
+# What a run of `train_her` leaves, and how the files of actors end.
+_BEST_OF_A_RUN = 'best.safetensors'
+_ENDINGS = ('.safetensors', '.onnx', '.zip')
 
 
 def shipped_actors() -> dict[str, Path]:
@@ -13,17 +20,36 @@ def shipped_actors() -> dict[str, Path]:
     return {path.stem: path for path in files if '.' not in path.stem}
 
 
-def actor_path(name_or_path: str | Path) -> Path:
+def actor_path(name_or_path: str | Path, besides: Sequence[str] = ()) -> Path:
     """Returns the file called `name_or_path`: the name of a shipped actor, or a file.
 
+    Args:
+        name_or_path: The name or the file.
+        besides: Names of what is no file and would have been taken as well, for the error.
+
     Raises:
-        ValueError: If there is neither; the message lists the shipped actors.
+        ValueError: If there is neither; the message lists the shipped actors, or names the actor
+            in a folder that is a run.
     """
     shipped = shipped_actors()
     if str(name_or_path) in shipped:
         return shipped[str(name_or_path)]
-    path = Path(name_or_path)
-    if path.is_file():
-        return path
+    path, reason = Path(name_or_path), ''
+    try:
+        if path.is_file():
+            return path
+        is_run = (path / _BEST_OF_A_RUN).is_file()
+    except OSError as error:
+        # Of a name that is too long, or a folder that may not be entered.
+        is_run, reason = False, f' ({error.strerror})'
+    if is_run:
+        raise ValueError(f'no actor but a run: {path}; its best actor is {path / _BEST_OF_A_RUN}')
+    if path.suffix in _ENDINGS:
+        raise ValueError(f'no actor {str(path)!r}: there is no such file{reason}')
     names = ', '.join(shipped) or 'none'
-    raise ValueError(f'no actor {str(name_or_path)!r}; shipped: {names}; or the path of a file')
+    others = f', {" or ".join(map(repr, besides))}' if besides else ''
+    hint = did_you_mean(str(name_or_path), [*shipped, *besides])
+    raise ValueError(
+        f'no actor {str(name_or_path)!r}{reason}; shipped: {names}; '
+        f'or the path of a file{others}{hint}'
+    )

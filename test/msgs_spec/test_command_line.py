@@ -181,3 +181,17 @@ def test_numbers_out_of_range_are_one_line(text, capsys):
     error = capsys.readouterr().err
     assert error == f'tool: argument --count: {text!r} given; allowed: 1 ... 6\n'
     assert parser.parse_args(['--count', '6']).count == 6
+
+
+def test_a_mistyped_choice_is_answered_with_what_was_probably_meant(capsys):
+    parser = CommandParser(prog='tool')
+    parser.add_argument('-t', '--task', nargs='+', choices=['FetchPush', 'HandReach'])
+    parser.add_argument('--count', type=int, choices=[1, 2])
+    for given, hint in (('fetchpsh', "; did you mean 'FetchPush'?"), ('zzz', ')')):
+        with pytest.raises(SystemExit):
+            parser.parse_args(['--task', 'HandReach', given])
+        error = capsys.readouterr().err
+        assert error.endswith(f'{hint}\n') and error.count('\n') == 1
+    with pytest.raises(SystemExit):
+        parser.parse_args(['--count', '3'])
+    assert 'invalid choice: 3' in capsys.readouterr().err

@@ -94,6 +94,8 @@ def test_thirteen_tasks_and_their_names():
     assert all(task_spec(name).name == name for name in TASKS)
     with pytest.raises(ValueError, match=r"unknown task 'Fetch'; allowed: FetchReach, .*PenFull"):
         task_spec('Fetch')
+    with pytest.raises(ValueError, match=r"; did you mean 'FetchPush'\?$"):
+        task_spec('fetchpush')
 
 
 def test_fetch_command_is_the_clipped_action_of_any_float_type():

@@ -157,6 +157,20 @@ def test_unreadable_status_is_refused(change, message):
         EpisodeStatus.from_values(values)
 
 
+@pytest.mark.parametrize(
+    ('change', 'is_same'),
+    [
+        ({'tick': 2, 'episode': 4, 'reward_type': 'sparse'}, True),
+        ({'task': 'FetchSlide'}, False),
+        ({'control_hz': 25.0}, False),
+        ({'joint_prefix': 'rh_'}, False),
+    ],
+)
+def test_another_robot_is_one_whose_messages_mean_something_else(change, is_same):
+    status = episode_status(TASKS['FetchPush'])
+    assert status.is_of_same_robot(dataclasses.replace(status, **change)) == is_same
+
+
 def test_unknown_topic_is_named():
     with pytest.raises(ValueError, match="FetchReach has no topic 'tf'; allowed: /clock, joint"):
         topic(TASKS['FetchReach'], 'tf')

@@ -289,6 +289,15 @@ def test_pause_step_and_reset(start_process: Start) -> None:
         assert robot.statuses()[-1].tick == 0
 
 
+def test_steps_may_be_all_there_is_of_a_run_that_waits_for_commands(start_process: Start) -> None:
+    arguments = ros_args(episodes=1, mode='lockstep', wait_for_commands=True)
+    sim = start_process(*SIM_NODE, *arguments)
+    with client(REACH) as robot:
+        for _ in range(1 + REACH.episode_ticks):
+            assert robot.call(Trigger, 'sim_node/step').success
+        assert finish(sim)[0] == 0
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_signals_close_the_running_episode(
     start_process: Start, tmp_path: Path, number: signal.Signals
@@ -336,6 +345,7 @@ def test_bad_parameters_end_with_one_line_and_code_2(start_process: Start) -> No
         ({'seed': 'seven'}, '0 ... 4294967295'),
         ({'mode': 'warp'}, "'realtime', 'lockstep'"),
         ({'real_time_factor': -1.0}, '0 or 0.01 ... 1000'),
+        ({'use_sim_time': 1}, "'use_sim_time' to '1' of type 'INTEGER', expecting type 'BOOL'"),
     ]
     nodes = [start_process(*SIM_NODE, *ros_args(**parameters)) for parameters, _ in lines]
     for node, (parameters, line) in zip(nodes, lines, strict=True):

@@ -14,7 +14,7 @@ from test_nodes import episodes_in, finish
 
 from support import ROOT
 from support.graph import POLICY_NODE, SIM_NODE, ros_args
-from support.shell_lines import commands, shell_lines
+from support.shell_lines import commands, python_blocks, shell_lines
 
 Start = Callable[..., subprocess.Popen[str]]
 EXAMPLE = ROOT / 'examples' / 'fetch_reach_oriented'
@@ -94,6 +94,50 @@ def test_it_is_shown(site: Path) -> None:
         f'{TASK} is a task of another package. The goal turns green when it is reached.',
         'True',
     ], result.stderr
+
+
+ANOTHER_REWARD = """
+import gymnasium, numpy as np
+from fetch_hand_sim.commands.main import main
+from fetch_hand_sim.view.page.introduction import introduction
+from msgs_spec.tasks import task_spec
+
+env = gymnasium.make('fetch_hand_sim:fetch_hand_sim/FetchPushNear-v0')
+env.reset(seed=1)
+observation, reward, *_ = env.step(np.zeros(4, np.float32))
+far = np.linalg.norm(observation['achieved_goal'] - observation['desired_goal'])
+print(abs(reward + far / 0.3) < 1e-12, introduction(task_spec('FetchPushNear'))[:13])
+policy = ['--policy', 'random', '--task', 'FetchPushNear', '--episodes', '2']
+assert main(['episodes', 'generate', *policy, '--output', 'episodes']) == 0
+assert main(['episodes', 'check', 'episodes']) == 0
+training = ['--task', 'FetchPushNear', '--steps', '50', '--num-envs', '1', '--random-steps', '0']
+fast = ['--batch-size', '8', '--updates-per-cycle', '1', '--evaluation-episodes', '1']
+assert main(['train', *training, *fast, '--output', 'run']) == 0
+"""
+
+
+def test_the_pages_other_reward_trains_and_is_checked(tmp_path: Path) -> None:
+    specification, simulation = python_blocks((ROOT / 'docs' / 'own_task.md').read_text())
+    package, names = tmp_path / 'near', tmp_path / 'near-1.dist-info'
+    for folder in (package, names):
+        folder.mkdir()
+    (package / '__init__.py').touch()
+    (package / 'specification.py').write_text(specification)
+    (package / 'simulation.py').write_text(simulation)
+    (names / 'METADATA').write_text('Metadata-Version: 2.1\nName: near\nVersion: 1\n')
+    (names / 'entry_points.txt').write_text(
+        '[fetch_hand_sim_tasks.specification]\nFetchPushNear = near.specification:SPECIFICATION\n'
+        '[fetch_hand_sim_tasks.simulation]\nFetchPushNear = near.simulation:FetchPushNear\n'
+    )
+    result = subprocess.run(
+        [sys.executable, '-c', ANOTHER_REWARD],
+        cwd=tmp_path,
+        env=environment(tmp_path),
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith('True FetchPushNear')
 
 
 GYMNASIUM = """

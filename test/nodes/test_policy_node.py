@@ -11,11 +11,15 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from std_srvs.srv import SetBool
 
-from msgs_spec.codecs import decode_status
+from msgs_spec.codecs import build_status, decode_status
+from msgs_spec.schemas import serialize
 from msgs_spec.tasks import task_spec
+from msgs_spec.tick import EpisodeStatus
+from msgs_spec.topics import topic
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,
+    Client,
     Start,
     client,
     end,
@@ -133,6 +137,64 @@ def test_robots_in_other_namespaces_are_named(start_process: Start) -> None:
     assert 'no robot here: there is one in /arm1; join it with --ros-args -r __ns:=/arm1' in line
     end(policy)
     end(sim)
+
+
+def test_a_robot_whose_topics_have_other_names_is_found(start_process: Start) -> None:
+    arguments = ros_args(episodes=1, mode='lockstep', wait_for_commands=True)
+    names = ['joint_states:=/arm/joints', 'commands:=/arm/goals', 'policy_status:=/arm/policy']
+    remapped = [word for name in names for word in ('-r', name)]
+    policy = start_process(*POLICY_NODE, '--ros-args', *remapped)
+    code, output = finish(start_process(*SIM_NODE, *arguments, *remapped))
+    assert code == 0, output
+    end(policy)
+
+
+def publish_status(robot: Client, **values: str) -> None:
+    """What a robot says of itself that publishes nothing else."""
+    status = topic(REACH, 'episode_status')
+    said = EpisodeStatus(
+        task='FetchReach',
+        episode=0,
+        seed=0,
+        tick=0,
+        phase='waiting',
+        control_hz=25.0,
+        reward_type='sparse',
+        success_rule='gymnasium',
+        episode_return=0.0,
+        is_success=False,
+    )
+    message = build_status(status, 0, 'episode', said.to_values() | values)
+    robot.publish(status.name, serialize(status.type_name, message))
+
+
+def test_topics_that_a_robot_lacks_are_named(start_process: Start) -> None:
+    policy = start_process(*POLICY_NODE)
+    with client(REACH) as robot:
+        publish_status(robot)
+        robot.subscribe('/diagnostics')
+
+        def line() -> str:
+            reports = robot.reports('/policy_node')
+            return str(reports[-1].message) if reports else ''
+
+        robot.spin_until(lambda: 'nobody publishes /joint_states, ' in line(), 'report')
+    output = end(policy)
+    assert 'no state: nobody publishes /joint_states, ' in output
+    assert 'commands come from' not in output
+
+
+@pytest.mark.parametrize('control_hz', ['30.0', '0', 'nan'])
+def test_a_robot_of_an_impossible_rate_is_refused(start_process: Start, control_hz: str) -> None:
+    """By a policy for any rate, too."""
+    policy = start_process(*POLICY_NODE, *ros_args(policy='random'))
+    with client(REACH) as robot:
+        publish_status(robot, control_hz=control_hz)
+        robot.spin_until(lambda: policy.poll() is not None, 'end of the policy')
+    code, output = finish(policy)
+    assert code == 1
+    assert f'policy_node: control_hz {float(control_hz):g} is not' in output
+    assert 'Traceback' not in output
 
 
 @pytest.mark.alone

@@ -254,8 +254,10 @@ def test_who_comes_while_the_robot_stands_still_sees_the_last_tick(start_process
     from sensor_msgs.msg import Image
     from std_srvs.srv import SetBool
 
-    robot = start_process(*SIM_NODE, *ros_args(task='FetchReach'))
-    node = start_process(*VISUALIZATION, *ros_args(camera_width=64, camera_height=48))
+    # Under whatever name its state is published.
+    other = ('-r', 'joint_states:=/arm/joints')
+    robot = start_process(*SIM_NODE, *ros_args(task='FetchReach'), *other)
+    node = start_process(*VISUALIZATION, *ros_args(camera_width=64, camera_height=48), *other)
     (distance, *_) = scalar_topics(REACH)
     kinds = {
         name: ros_message_class(type_name)
@@ -317,13 +319,18 @@ def test_who_comes_while_the_robot_stands_still_sees_the_last_tick(start_process
 def test_another_robot_in_the_same_place_is_followed(
     start_process: Start, simulated_time: bool
 ) -> None:
-    """Its goals come on the same topics with another type."""
+    """Its goals come on the same topics with another type, or its joints have other names."""
     from std_msgs.msg import String
 
     node = start_process(*VISUALIZATION, *ros_args(use_sim_time=simulated_time))
-    for task in ('HandReach', 'FetchPush', 'HandManipulateEggFull'):
-        spec = task_spec(task)
-        robot = start_process(*SIM_NODE, *ros_args(task=task))
+    for task, names in (
+        ('HandReach', {}),
+        ('HandReach', {'joint_prefix': 'rh_'}),
+        ('FetchPush', {}),
+        ('HandManipulateEggFull', {}),
+    ):
+        spec = task_spec(task, **names)
+        robot = start_process(*SIM_NODE, *ros_args(task=task, **names))
         with client(spec) as connection:
             connection.subscribe('joint_states')
             stamps, descriptions = [], []

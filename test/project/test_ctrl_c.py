@@ -46,13 +46,13 @@ def interrupt(command: Sequence[str | Path], imports: int, after: str = GUARD) -
     return process.wait(60), ''.join(said)
 
 
-def interrupt_at_once(command: Sequence[str | Path]) -> tuple[int, str]:
-    """As `interrupt`, after the first module.
+def interrupt_in_time(command: Sequence[str | Path], imports: int) -> tuple[int, str]:
+    """As `interrupt`, of a short command.
 
-    On a busy machine a short command may be over before the signal reaches it: then again.
+    On a busy machine it may be over before the signal reaches it: then again.
     """
     for _ in range(3):
-        answer = interrupt(command, 1)
+        answer = interrupt(command, imports)
         if answer[0] not in (0, 2):
             break
     return answer
@@ -73,13 +73,13 @@ def test_the_names_of_executables_are_known():
 
 @pytest.mark.parametrize('name', sorted(EXECUTABLES))
 def test_a_program_that_has_hardly_begun(name, programs):
-    assert interrupt_at_once([programs / name]) == (130, f'{name}: stopping\n')
+    assert interrupt_in_time([programs / name], 1) == (130, f'{name}: stopping\n')
 
 
 @pytest.mark.parametrize('module', started_as_modules())
 def test_a_module_that_has_hardly_begun(module):
     name = module.rpartition('.')[2]
-    assert interrupt_at_once(['-m', module]) == (130, f'{name}: stopping\n')
+    assert interrupt_in_time(['-m', module], 1) == (130, f'{name}: stopping\n')
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_a_module_that_has_hardly_begun(module):
 )
 @pytest.mark.parametrize('imports', [60, 200, 400])
 def test_a_command_at_any_moment(name, words, imports, programs, tmp_path):
-    code, said = interrupt([programs / name, *words], imports)
+    code, said = interrupt_in_time([programs / name, *words], imports)
     assert (code, said) == (130, f'{name}: stopping\n')
 
 

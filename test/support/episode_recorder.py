@@ -20,6 +20,7 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.actions import command_from_action
 from msgs_spec.cdr import TopicCodec
+from msgs_spec.tasks import Timing
 from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import TopicSpec, topic
 
@@ -36,8 +37,14 @@ class RecordedTick:
 class Recorder:
     """Runs episodes of a task under random commands and writes them."""
 
-    def __init__(self, task: str, control_hz: float = 25.0, first_seed: int = 0) -> None:
-        self.simulation = Simulation(task, num_threads=1, control_hz=control_hz)
+    def __init__(
+        self,
+        task: str,
+        control_hz: float = 25.0,
+        first_seed: int = 0,
+        timing: Timing = 'seconds',
+    ) -> None:
+        self.simulation = Simulation(task, num_threads=1, control_hz=control_hz, timing=timing)
         self.spec = self.simulation.spec
         self.runner = EpisodeRunner(self.simulation, first_seed=first_seed)
         self.commands = topic(self.spec, 'commands')
@@ -52,6 +59,7 @@ class Recorder:
             reward_type='sparse',
             success_rule='gymnasium',
             control_hz=self.simulation.control_hz,
+            timing=self.simulation.timing,
             model_sha256=model_sha256(self.simulation.model),
             source_revision='12e4567',
             started=started,

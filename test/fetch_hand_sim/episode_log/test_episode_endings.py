@@ -169,6 +169,14 @@ def test_a_disk_that_is_full_from_the_start(start_process, mount):
     assert list(disk.iterdir()) == []
 
 
+def test_episodes_that_were_asked_for_and_not_logged_are_a_failure(start_process, mount):
+    disk = mount('size=8m')
+    arguments = ros_args(episode_dir=disk, episodes=1, real_time_factor=0.0)
+    code, output = finish(start_process(*SIM_NODE, *arguments))
+    assert code == 1 and 'Traceback' not in output
+    assert output.splitlines()[-1] == f'sim_node: not all episodes are in {disk}'
+
+
 def test_a_read_only_disk(start_process, mount):
     disk = mount('size=100m', 'ro')
     robot = start_process(*SIM_NODE, *ros_args(episode_dir=disk / 'episodes'))
@@ -193,7 +201,8 @@ def test_a_directory_that_is_removed_while_it_is_written(start_process, tmp_path
 
 
 def test_a_terminated_robot_completes_its_episode(start_process, tmp_path):
-    robot = start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path))
+    # Slow, so that no episode ends by itself just then.
+    robot = start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path, real_time_factor=0.2))
     with client(REACH) as listener:
         listener.subscribe('reward')
         listener.spin_until(lambda: len(listener.received['reward']) > 5, 'ticks')

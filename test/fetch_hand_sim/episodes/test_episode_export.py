@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.commands import export_episodes
-from fetch_hand_sim.episode_log import load_episodes
+from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
 from policy_node.training import generate_episodes
+from support.episode_recorder import Recorder
 
 TASK = 'FetchPush'
 
@@ -75,6 +76,68 @@ def test_minari_holds_every_value_and_recovers_the_environment(episodes, tmp_pat
     for key, values in observation.items():
         np.testing.assert_array_equal(values, first[key][0])
     environment.close()
+
+
+@pytest.mark.parametrize(('timing', 'steps'), [('seconds', 100), ('ticks', 50)])
+def test_episodes_of_the_recovered_environment_are_as_long_as_those_logged(
+    timing, steps, tmp_path, monkeypatch
+):
+    minari = pytest.importorskip('minari')
+    pytest.importorskip('pyarrow')
+    monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path))
+    path = Recorder('FetchReach', 50.0, timing=timing).record(EpisodeDirectory(tmp_path / 'logged'))
+    assert export_episodes.main([str(path), '--to', 'minari', '--output', str(tmp_path)]) == 0
+    dataset = minari.load_dataset('FetchReach/logged-v0')
+    assert dataset.total_steps == steps
+    environment = dataset.recover_environment()
+    assert environment.spec.max_episode_steps == steps
+    environment.reset(seed=0)
+    ends = [environment.step(environment.action_space.sample())[3] for _ in range(steps)]
+    assert ends == [False] * (steps - 1) + [True]
+    environment.close()
+
+
+@pytest.mark.parametrize('format_', ['parquet', 'minari'])
+def test_a_full_disk_leaves_nothing_that_stands_in_the_way(episodes, tmp_path, format_, capsys):
+    pytest.importorskip({'parquet': 'pyarrow', 'minari': 'minari'}[format_])
+    code = (
+        'import resource, sys\n'
+        'resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n'
+        'from fetch_hand_sim.commands.export_episodes import main\n'
+        'sys.exit(main(sys.argv[1:]))'
+    )
+    arguments = [str(episodes), '--to', format_, '--output', str(tmp_path)]
+    run = subprocess.run([sys.executable, '-c', code, *arguments], capture_output=True, text=True)
+    (line,) = run.stderr.splitlines()
+    assert run.returncode == 1 and 'File too large' in line
+    assert list(tmp_path.iterdir()) == []
+    assert export_episodes.main(arguments) == 0, capsys.readouterr()
+    assert not [path for path in tmp_path.rglob('*') if path.name.startswith('.')]
+
+
+def test_of_two_tables_none_is_written_beside_one_that_is_there(episodes, tmp_path, capsys):
+    pytest.importorskip('pyarrow')
+    there = tmp_path / f'{TASK}_episodes.parquet'
+    there.write_text('mine')
+    assert export_episodes.main([str(episodes), '--to', 'parquet', '--output', str(tmp_path)]) == 1
+    assert f'{there.name} exists' in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [there] and there.read_text() == 'mine'
+
+
+def test_minari_datasets_in_folders_of_folders_stand_beside_each_other(
+    episodes, tmp_path, monkeypatch
+):
+    minari = pytest.importorskip('minari')
+    pytest.importorskip('pyarrow')
+    monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path / 'minari'))
+    # A relative path, as people write it.
+    monkeypatch.chdir(tmp_path)
+    names = ('logged-v0', 'me/logged-v0', 'me/logged-v1')
+    for name in names:
+        arguments = [str(episodes), '--to', 'minari', '--output', 'minari', '--name', name]
+        assert export_episodes.main(arguments) == 0
+    assert sorted(minari.list_local_datasets()) == [f'{TASK}/{name}' for name in names]
+    assert export_episodes.main(arguments) == 1
 
 
 @pytest.mark.parametrize(('format_', 'module'), [('parquet', 'pyarrow'), ('minari', 'minari')])

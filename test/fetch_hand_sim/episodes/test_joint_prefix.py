@@ -11,6 +11,7 @@ from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes, read_epi
 from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.films.recording import load_recording
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import decode_status
@@ -67,6 +68,17 @@ def test_logs_of_renamed_joints_are_checked_and_loaded_as_the_others(
     assert one.spec is other.spec is TASKS[task]
     for name, values in one.observations.items():
         assert values.tobytes() == other.observations[name].tobytes()
+
+
+@pytest.mark.parametrize('task', ['FetchPush', 'HandReach'])
+def test_films_of_renamed_joints_show_what_those_of_the_others_show(task, simulations, tmp_path):
+    plain, _ = record(simulations[task], tmp_path / 'plain', JOINT_PREFIX)
+    renamed, _ = record(simulations[task], tmp_path / 'renamed', 'rh_')
+    one, other = load_recording(plain).frames, load_recording(renamed).frames
+    assert len(one) == len(other) == TICKS
+    for mine, its in zip(one, other, strict=True):
+        np.testing.assert_array_equal(mine.joint_position, its.joint_position)
+        np.testing.assert_array_equal(mine.object_pose, its.object_pose)
 
 
 def test_status_tells_a_prefix_that_is_not_the_usual_one(simulations):

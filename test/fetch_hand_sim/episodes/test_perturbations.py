@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,26 @@ def test_a_push_moves_the_object_during_one_tick_and_nothing_remains(simulation)
     np.testing.assert_array_equal(pushed[:3], plain[:3])
     assert np.abs(pushed[4:] - plain[4:]).max() > 1e-5
     np.testing.assert_array_equal(object_path(simulation, {}), plain)
+
+
+def test_a_copy_of_a_pushed_simulation_is_pushed_during_one_tick_too(simulation):
+    simulation.reset(seed=0)
+    simulation.perturb('object0', [15.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    twin, still = copy.deepcopy(simulation), np.zeros((1, 4))
+    for _ in range(12):
+        expected = simulation.step(still).observation['observation']
+        np.testing.assert_array_equal(twin.step(still).observation['observation'], expected)
+    assert not twin.data(0).xfrc_applied.any()
+
+
+def test_copies_made_by_1_0_can_be_loaded(simulation):
+    state = simulation.__getstate__()
+    del state['is_pushed']
+    twin = Simulation.__new__(Simulation)
+    twin.__setstate__(state)
+    np.testing.assert_array_equal(
+        twin.observe()['observation'], simulation.observe()['observation']
+    )
 
 
 @pytest.mark.parametrize('task', ['FetchReach', 'HandReach', 'HandManipulatePenFull'])

@@ -48,6 +48,31 @@ def test_animations_hold_every_picture(kind, tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
 
 
+@pytest.mark.parametrize('kind', ['.gif', '.webp'])
+@pytest.mark.parametrize(
+    ('fps', 'shown'),
+    [(0.25, 51), (30.0, 51), (50.0, 51), (62.5, 26), (125.0, 17), (500.0, 6), (50_000.0, 1)],
+)
+def test_animations_last_as_long_as_asked_at_rates_that_browsers_show(kind, fps, shown, tmp_path):
+    path = tmp_path / f'film{kind}'
+    # Files keep equal neighbours as one.
+    pictures = np.kron(np.eye(51, dtype=np.uint8) * 255, np.ones((8, 8), dtype=np.uint8))
+    write_film(path, iter(np.repeat(pictures.reshape(51, 8, 408, 1), 3, axis=3)), fps)
+    with Image.open(path) as image:
+        assert image.n_frames == shown
+        if shown == 1:
+            return
+        durations = []
+        for number in range(shown):
+            image.seek(number)
+            image.load()
+            durations.append(image.info['duration'])
+    assert min(durations) >= 20
+    # The last picture may be too short to be shown.
+    assert abs(sum(durations) - 51_000.0 / fps) < 20.0
+    assert np.ptp(durations[:-1]) <= (10 if kind == '.gif' else 1)
+
+
 def test_mp4_holds_every_picture(tmp_path):
     pytest.importorskip('imageio_ffmpeg')
     import imageio.v3 as imageio
@@ -123,12 +148,39 @@ def test_command_writes_a_film_and_a_picture(folder, tmp_path, capsys):
             assert image.size == ((130, 98) if more[0] == '--grid' else (64, 48))
 
 
+@pytest.mark.parametrize('number', [51, 1000, -52])
+def test_a_frame_that_is_not_there_is_one_line(folder, tmp_path, number, capsys):
+    out = ['--out', str(tmp_path / 'x.png'), '--frame', str(number)]
+    assert render_episode([str(folder), *out]) == 2
+    assert capsys.readouterr().err == (
+        f'render_episode: FetchReach_000000_seed0: frame {number}; allowed: -51 ... 50\n'
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures('opengl')
+@pytest.mark.parametrize('number', [-51, 50])
+def test_the_first_frame_and_the_last_are_there(folder, tmp_path, number):
+    out = tmp_path / 'x.png'
+    arguments = [str(folder), '--out', str(out), '--frame', str(number), '--size', '64x48']
+    assert render_episode(arguments) == 0 and out.exists()
+
+
 @pytest.mark.usefixtures('opengl')
 @pytest.mark.parametrize('more', [['--camera', 'nosuch'], ['--size', '0x7'], ['--size', '9999x7']])
 def test_bad_usage_is_one_line(folder, tmp_path, more, capsys):
     code = render_episode([str(folder), '--out', str(tmp_path / 'x.png'), *more])
     error = capsys.readouterr().err
     assert code == 2 and error.count('\n') == 1 and 'allowed' in error
+
+
+@pytest.mark.parametrize('size', ['100', '100x', '4x4x4'])
+def test_a_size_is_two_numbers(folder, size, capsys):
+    with pytest.raises(SystemExit) as caught:
+        render_episode([str(folder), '--out', 'x.png', '--size', size])
+    error = capsys.readouterr().err
+    assert caught.value.code == 2 and error.count('\n') == 1
+    assert f'{size!r} given; allowed: two numbers with an x' in error
 
 
 def test_without_opengl_it_says_what_to_install(folder, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import pickle
 
@@ -170,6 +171,32 @@ def test_a_masked_reset_starts_only_the_masked():
     ]
 
 
+def test_seeds_are_told_as_gymnasiums_vectorisation_tells_them():
+    env = make_vec('FetchReach', 3)
+    members = [lambda: gymnasium.make(environment_id('FetchReach'))] * 3
+    reference = gymnasium.vector.SyncVectorEnv(members)
+    one = np.array([False, True, False])
+    for arguments, expected in (
+        ({'seed': 5}, (5, 6, 7)),
+        ({}, (5, 6, 7)),
+        ({'seed': [3, None, 9]}, (3, 6, 9)),
+        ({'seed': 20, 'options': {'reset_mask': one}}, (3, 21, 9)),
+        ({'seed': [1, 2, 4], 'options': {'reset_mask': one}}, (3, 2, 9)),
+    ):
+        for each in (env, reference):
+            # Gymnasium takes the mask out of the dictionary.
+            each.reset(**copy.deepcopy(arguments))
+            assert each.np_random_seed == each.unwrapped.get_attr('np_random_seed') == expected
+
+
+def test_a_seed_that_nobody_gave_is_told_too():
+    env = make_vec('FetchReach', 2)
+    assert env.np_random_seed == (-1, -1)
+    first, _ = env.reset()
+    assert min(env.np_random_seed) >= 0
+    assert_same(make_vec('FetchReach', 2).reset(seed=env.np_random_seed)[0], first)
+
+
 def test_a_diverged_environment_is_truncated_and_starts_again():
     env = make_vec('FetchPush', 3)
     env.reset(seed=0)
@@ -198,6 +225,7 @@ BAD_RESETS = {
         r'shape \(2,\), not \(3,\)',
     ),
     'negative seed': ({'seed': -5}, ValueError, 'must not be negative'),
+    'seed that is none': ({'seed': True}, TypeError, 'a seed is an integer, a .* not True'),
     'too many seeds': ({'seed': [1, 2, 3]}, ValueError, '2 environments take as many seeds, not 3'),
 }
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 import itertools
 import shutil
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +31,7 @@ from support.graph import POLICY_NODE, SIM_NODE, TIMEOUT, client, ros_args
 from support.ros_messages import from_ros
 
 REPLAY_NODE = (*SIM_NODE[:2], 'fetch_hand_sim.replay_node')
+LISTENER = Path(__file__).parents[2] / 'support' / 'topic_listener.py'
 REACH = task_spec('FetchReach')
 # Real time: a slow machine may fall 0.4 s behind, ten messages, before one is lost.
 RATE = 1.0
@@ -224,6 +229,43 @@ def test_interrupt_ends_a_replay_without_a_word(start_process, episode):
         assert finish(replay) == (0, '')
 
 
+@pytest.mark.alone
+def test_a_listener_that_hangs_holds_up_the_end_for_a_second(start_process, episode):
+    """Not for one per topic."""
+    nowhere = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}
+    replay = start_process(*REPLAY_NODE, *ros_args(path=episode, loop=True))
+    listener = start_process(sys.executable, LISTENER, 'FetchReach', 10**6, **nowhere)
+    with client(REACH) as watcher:
+        names = [spec.name for spec in topics(REACH) if spec.direction == 'published']
+        for name in names:
+            watcher.spin_until(lambda: watcher.node.count_subscribers(name) == 2, name)  # noqa: B023
+        watcher.spin(0.5)
+        listener.send_signal(signal.SIGSTOP)
+        watcher.spin(1.5)
+        replay.send_signal(signal.SIGINT)
+        began = time.monotonic()
+        assert finish(replay) == (0, '')
+    assert time.monotonic() - began < 6.0
+
+
+def test_a_replay_begins_with_commands_of_another_name(start_process, episode):
+    commands = ('-r', '/commands:=/arm/goals')
+    arguments = ros_args(path=episode, wait_for_commands=True, rate=10.0)
+    replay = start_process(*REPLAY_NODE, *arguments, *commands)
+    start_process(*POLICY_NODE, '--ros-args', *commands)
+    assert finish(replay) == (0, '')
+
+
+def test_a_policy_goes_on_when_less_than_a_second_is_replayed_again(start_process, episode):
+    with client(REACH) as listener:
+        received = collect(listener, 'commands')
+        arguments = ros_args(path=episode, loop=True, start_offset=1.5, wait_for_commands=True)
+        start_process(*REPLAY_NODE, *arguments)
+        start_process(*POLICY_NODE)
+        # A round has 13 ticks.
+        listener.spin_until(lambda: len(received) > 30, 'commands of a third round')
+
+
 @pytest.mark.parametrize(
     ('parameters', 'line'),
     [
@@ -266,6 +308,18 @@ def test_an_episode_with_unreadable_messages_is_refused(episode, tmp_path):
     with pytest.raises(EpisodeReadError, match=r'broken'):
         ReplaySchedule(path)
     shutil.rmtree(path)
+
+
+@pytest.mark.parametrize('namespace', ['/a b', '/1st', '/a//b', '/ä', '/{node}', '/' + 300 * 'x'])
+def test_an_episode_whose_topics_have_no_names_of_ros_is_refused(episode, tmp_path, namespace):
+    from fetch_hand_sim.episode_log import EpisodeReadError, EpisodeWriter
+
+    whole = read_episode(episode)
+    writer = EpisodeWriter(tmp_path, 'odd', whole.metadata, namespace=namespace)
+    for tick in split_ticks(whole)[:3]:
+        writer.write_tick(tick.stamp_ns, [(m.topic, m.data) for m in tick.published])
+    with pytest.raises(EpisodeReadError, match=r'odd_0.mcap: topic .*; allowed: names of ROS'):
+        ReplaySchedule(writer.finish({}))
 
 
 @pytest.mark.alone

@@ -31,7 +31,7 @@ def error_of(capsys, arguments):
     try:
         code = main([str(word) for word in arguments])
     except SystemExit as exit_:
-        # As argparse ends, which prints the usage before its line.
+        # As argparse ends.
         code = exit_.code
     output, error = capsys.readouterr()
     assert 'page is at' not in output and 'Traceback' not in error
@@ -61,10 +61,15 @@ def test_a_file_of_a_task_that_is_not_installed(capsys, tmp_path):
     assert 'FetchWalk' in line and 'FetchReach' in line, 'what was given and what is allowed'
 
 
+def test_a_mistyped_task_is_one_line(capsys):
+    code, (line,) = error_of(capsys, ['--task', 'fetchpush'])
+    assert code == 2 and line.endswith("; did you mean 'FetchPush'?")
+
+
 def test_a_file_and_a_task_exclude_each_other(capsys, episode):
     code, lines = error_of(capsys, [episode, '--task', 'FetchPush'])
     assert code == 2
-    assert lines[-1] == 'view: error: a file and --task or --robot exclude each other'
+    assert lines[-1] == 'view: a file and --task or --robot exclude each other'
 
 
 def test_a_port_that_is_in_use(capsys, episode):
