@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from types import FrameType
@@ -21,10 +22,13 @@ if TYPE_CHECKING:
     from rclpy.executors import Executor
     from rclpy.node import Node
     from rclpy.parameter import Parameter
+    from rclpy.publisher import Publisher
     from rclpy.qos import QoSProfile
 
 # Seconds between looks at what no callback announces: signals, the graph.
 BEAT = 0.1
+# Seconds for what was said last to be heard.
+_LAST_WORDS_SECONDS = 1.0
 # Enough for any node on a busy machine: 0.3 s are usual.
 _DESTROY_SECONDS = 10.0
 
@@ -54,6 +58,21 @@ def rclpy_profile(spec: QosSpec) -> QoSProfile:
         reliability=QoSReliabilityPolicy.get_from_short_key(spec.reliability),
         durability=QoSDurabilityPolicy.get_from_short_key(spec.durability),
     )
+
+
+def count_publishers(node: Node, topic: str) -> int:
+    """Returns how many publish a topic, under the name to which this node's is remapped."""
+    return int(node.count_publishers(node.resolve_topic_name(topic)))
+
+
+def await_acknowledgements(publishers: Iterable[Publisher]) -> None:
+    """Gives what was said last a second to be heard; a killed subscriber never acknowledges."""
+    from rclpy.duration import Duration
+
+    deadline = time.monotonic() + _LAST_WORDS_SECONDS
+    for publisher in publishers:
+        left = max(0.0, deadline - time.monotonic())
+        publisher.wait_for_all_acked(Duration(seconds=left))
 
 
 class EventLoop:

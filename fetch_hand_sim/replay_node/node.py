@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -21,6 +20,7 @@ from msgs_spec.parameters import REPLAY_NODE
 from msgs_spec.ros import (
     StopSignals,
     UsageError,
+    await_acknowledgements,
     declare_parameters,
     rclpy_profile,
     ros_message_class,
@@ -29,7 +29,6 @@ from msgs_spec.ros import (
 
 # Seconds between looks at the stop flag while nothing is due.
 _SPIN = 0.1
-_LAST_WORDS_TIMEOUT = 1.0
 _CLOCK = '/clock'
 
 
@@ -92,11 +91,7 @@ class ReplayNode(Node):
                 self._serve(executor)
                 self._publish_due()
         finally:
-            deadline = time.monotonic() + _LAST_WORDS_TIMEOUT
-            for publisher in self._publishers_by_topic.values():
-                # A killed subscriber never acknowledges: together, not each, they get a second.
-                left = max(0.0, deadline - time.monotonic())
-                publisher.wait_for_all_acked(Duration(seconds=left))
+            await_acknowledgements(self._publishers_by_topic.values())
             executor.remove_node(self)
 
     def _wait_for_commander(self, executor: SingleThreadedExecutor, stop: StopSignals) -> None:

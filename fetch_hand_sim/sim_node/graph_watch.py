@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from fetch_hand_sim.sim_node.commanders import CommanderWatch, Endpoint
 from msgs_spec.listeners import Listeners
+from msgs_spec.ros import count_publishers
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topics
 
@@ -74,7 +75,7 @@ class GraphWatch:
 
     def will_introduce(self) -> bool:
         """Whether somebody publishes `policy_status`."""
-        return bool(self._node.count_publishers('policy_status'))
+        return count_publishers(self._node, 'policy_status') > 0
 
     def _found(self, topic_name: str) -> list[Endpoint]:
         return [

@@ -10,7 +10,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -39,6 +38,7 @@ from msgs_spec.ros import (
     NodeFailure,
     StopSignals,
     UsageError,
+    await_acknowledgements,
     declare_parameters,
     rclpy_profile,
     ros_message_class,
@@ -56,7 +56,6 @@ _SERVED_FIRST = 100
 _INTRODUCTION_TIME = 1.0
 # Seconds between two lines about what a robot waits for, and before the first command of all.
 _WAITING_PERIOD = 5.0
-_LAST_WORDS_TIMEOUT = 1.0
 
 
 class SimNode(Node):
@@ -305,11 +304,7 @@ class SimNode(Node):
     def _close(self, stop: StopSignals) -> None:
         if self._recorder is not None:
             self._recorder.close(stop.received or 'end of the run')
-        deadline = time.monotonic() + _LAST_WORDS_TIMEOUT
-        for publisher in self._outputs.values():
-            # A killed subscriber never acknowledges: together, not each, they get a second.
-            left = max(0.0, deadline - time.monotonic())
-            publisher.wait_for_all_acked(Duration(seconds=left))
+        await_acknowledgements(self._outputs.values())
 
     # Reports
 

@@ -9,7 +9,7 @@ from msgs_spec.topics import LATEST_TICKS_PER_SECOND
 
 # Seconds between two frames that only follow the robot, and so between two pictures of it.
 FOLLOWING = 1.0 / LATEST_TICKS_PER_SECOND
-# The same of a robot that is faster than real time, whose ticks no eye follows one by one.
+# The same of a robot that is far faster than real time, whose ticks no eye follows one by one.
 OVERLOOKING = 1.0 / 12.0
 # Seconds after the last touch for which frames come as fast as the viewer makes them.
 _ATTENTION = 0.5

@@ -7,7 +7,7 @@ viewer that hangs leaves nothing for the robot to send again.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from rclpy.clock import Clock
@@ -20,7 +20,7 @@ from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode_status
 from msgs_spec.latest_tick import split_messages
 from msgs_spec.robots import JOINT_PREFIX
-from msgs_spec.ros import rclpy_profile, ros_message_class
+from msgs_spec.ros import count_publishers, rclpy_profile, ros_message_class
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
@@ -28,6 +28,8 @@ from msgs_spec.topics import LATEST_TICK, QosSpec, TopicSpec, topic
 
 # Nothing is sent twice for a viewer.
 WATCHING = QosSpec(depth=5, reliability='best_effort', durability='volatile')
+# Of every tick: two seconds of a robot at 25 Hz while the viewer gets no processor.
+_FOLLOWING = replace(WATCHING, depth=50)
 ANY_TASK = next(iter(TASKS.values()))
 # What a tick consists of, as it is published. The first step leads to the first reward and command:
 # `episode_status` is the last that is said of the tick before it.
@@ -37,6 +39,8 @@ _STATE = (*_NEEDED, 'reward', _LAST)
 # Seconds between leaving the topics of a robot and subscribing to those of another: until a topic
 # is let go of, which the executor does after the callback, it cannot have another type.
 _CHANGE_TIME = 0.2
+# What a codec says of messages without one.
+_NO_STAMP = 0
 # Seconds between two looks at whether there is `latest_tick`.
 _CHOICE_PERIOD = 0.5
 
@@ -165,7 +169,7 @@ class RobotWatch:
             self._follow(self.spec)
 
     def _has_latest(self) -> bool:
-        return not self._every_tick and self._node.count_publishers(LATEST_TICK.name) > 0
+        return not self._every_tick and count_publishers(self._node, LATEST_TICK.name) > 0
 
     def _follow(self, spec: TaskSpec) -> None:
         self._values = {}
@@ -189,12 +193,13 @@ class RobotWatch:
         self._end_change()
         names = [*_STATE, *(['object_pose'] if spec.has_object else [])]
         self._codecs = {name: TopicCodec(topic(spec, name)) for name in names}
-        inputs = {each.topic: self._collector(each) for each in self._codecs.values()}
         self._takes_latest = self._has_latest()
         if self._takes_latest:
-            inputs = {LATEST_TICK: self._take_latest}
+            self._subscriptions = [self.subscribe(LATEST_TICK, WATCHING, self._take_latest, True)]
+            return
         self._subscriptions = [
-            self.subscribe(source, WATCHING, take, raw=True) for source, take in inputs.items()
+            self.subscribe(each.topic, _FOLLOWING, self._collector(each), raw=True)
+            for each in self._codecs.values()
         ]
 
     def _collector(self, codec: TopicCodec) -> Callable[[bytes], None]:
@@ -209,6 +214,10 @@ class RobotWatch:
                 # Of the tick before, where its last message was lost.
                 self._finish_tick()
                 self._values, self._stamp_ns = {}, stamp
+            elif stamp not in (_NO_STAMP, self._stamp_ns):
+                # Of a tick whose first message was lost, which must not pass for this one's.
+                self._finish_tick()
+                self._values = {}
             self._values[source.name] = values
             if source.name == _LAST:
                 self._finish_tick()

@@ -34,6 +34,7 @@ from msgs_spec.ros import (
     BEAT,
     EventLoop,
     StopSignals,
+    count_publishers,
     declare_parameters,
     rclpy_profile,
     ros_message_class,
@@ -186,7 +187,7 @@ class VisualizationNode(Node):
         if self._has_newcomer and self._listeners.are_connected():
             self._has_newcomer = False
             # Nothing is said in the name of a robot that is gone.
-            if self.count_publishers(self.resolve_topic_name('joint_states')):
+            if count_publishers(self, 'joint_states'):
                 self._on_tick(self._latest)
 
     def _take_photo(self, scene: Scene, tick: SeenTick, wanted: list[str]) -> None:

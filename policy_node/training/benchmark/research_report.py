@@ -28,7 +28,6 @@ from policy_node.training.benchmark.results import (
     Band,
     Curve,
     aggregate,
-    by_arm,
     curve_rows,
     draw,
     machine,
@@ -89,18 +88,17 @@ def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -
     """
     output.mkdir(parents=True, exist_ok=True)
     found = [curve_of(job) for job in jobs]
-    runs = [measure_run(job, curve) for job, curve in zip(jobs, found, strict=True)]
-    groups = by_arm(jobs, runs)
-    order = [arm.name for arm in study.arms]
-    arms = [sum_up(group[name]) for group in groups.values() for name in order if name in group]
-    for name, rows in ((_RUNS, runs), (_ARMS, arms), (_CURVES, curve_rows(jobs, found))):
-        write_csv(_with_other_tasks(study, rows, output / name), output / name)
+    measured = [measure_run(job, curve) for job, curve in zip(jobs, found, strict=True)]
+    runs = _with_other_tasks(study, measured, output / _RUNS)
+    curves = _with_other_tasks(study, curve_rows(jobs, found), output / _CURVES)
+    arms = _arms(study, runs)
     about = _about(study, jobs, command, output / _ABOUT)
+    for name, rows in ((_RUNS, runs), (_ARMS, arms), (_CURVES, curves)):
+        write_csv(rows, output / name)
     (output / _ABOUT).write_text(json.dumps(about, indent=2) + '\n')
     labels = {arm.name: arm.label for arm in study.arms}
-    bands = _bands(read_rows(output / _CURVES))
-    draw(bands, labels, output / 'figure.png', paper_epochs=False)
-    _renew(output / 'README.md', format_table(study, read_rows(output / _ARMS)))
+    draw(_bands(curves), labels, output / 'figure.png', paper_epochs=False)
+    _renew(output / 'README.md', format_table(study, arms))
 
 
 def read_rows(path: Path) -> Rows:
@@ -135,6 +133,18 @@ def _with_other_tasks(study: Study, rows: Rows, path: Path) -> Rows:
     return sorted([*kept, *rows], key=lambda row: order.get(row['task'], len(order)))
 
 
+def _arms(study: Study, runs: Rows) -> Rows:
+    """The rows of `arms.csv`: by task, in the order of the study's arms, those of before last."""
+    order = {arm.name: index for index, arm in enumerate(study.arms)}
+    return [
+        sum_up(group)
+        for of_task in _grouped(runs, 'task').values()
+        for (arm,), group in sorted(
+            _grouped(of_task, 'arm').items(), key=lambda item: order.get(item[0][0], len(order))
+        )
+    ]
+
+
 def _bands(rows: Rows) -> dict[str, dict[str, Band]]:
     """Median and quartiles over seeds, by task and arm, of the rows of `curves.csv`."""
     bands: dict[str, dict[str, Band]] = {}
@@ -142,7 +152,7 @@ def _bands(rows: Rows) -> dict[str, dict[str, Band]]:
         curves = [
             Curve(
                 env_steps=np.array([row['env_steps'] for row in run], np.float64),
-                success=np.array([row['success'] for row in run], np.float64),
+                success=np.array([float(row['success']) for row in run]),
                 episodes=0,
             )
             for run in _grouped(points, 'seed').values()

@@ -131,30 +131,21 @@ def _clock(seconds: float) -> str:
 
 
 def _rows_until(path: Path, env_steps: int) -> list[dict[str, str]]:
-    """Rows of a log up to `env_steps`."""
+    """Rows of a log up to `env_steps`, as they were written."""
     if env_steps == 0 or not path.is_file():
         return []
-    return [row for row in _whole_rows(path) if float(row['env_steps']) <= env_steps]
-
-
-def _whole_rows(path: str | Path) -> list[dict[str, str]]:
-    """Rows of a log but those that a killed run has cut short."""
     with open(path, newline='') as file:
-        return [row for row in csv.DictReader(file) if _is_whole(row)]
+        rows = [(row, _numbers(row)) for row in csv.DictReader(file)]
+    return [row for row, numbers in rows if numbers and numbers['env_steps'] <= env_steps]
 
 
-def _is_whole(row: dict[str, str]) -> bool:
-    """Whether every column is there and empty or a number."""
-    texts = row.values()
-    return None not in texts and all(not text or _is_number(text) for text in texts)
-
-
-def _is_number(text: str) -> bool:
+def _numbers(row: dict[str, str]) -> dict[str, float] | None:
+    """The numbers of a row; None if a killed run has cut it short."""
     try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+        # A column that is missing is None, an empty one is left out.
+        return {name: float(text) for name, text in row.items() if text != ''}
+    except (TypeError, ValueError):
+        return None
 
 
 def _tensorboard(output: Path, resumed_steps: int) -> Any:
@@ -167,8 +158,9 @@ def _tensorboard(output: Path, resumed_steps: int) -> Any:
 
 def read_progress(path: str | Path) -> list[dict[str, float]]:
     """Reads `progress.csv`; empty columns are left out of a row, and rows that were cut short."""
-    rows = _whole_rows(path)
-    return [{name: float(text) for name, text in row.items() if text} for row in rows]
+    with open(path, newline='') as file:
+        rows = map(_numbers, csv.DictReader(file))
+        return [row for row in rows if row is not None]
 
 
 def draw_curve(rows: Sequence[dict[str, float]], title: str, path: str | Path) -> None:
