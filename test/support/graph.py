@@ -9,6 +9,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from msgs_spec.topics import MONITORING, TopicSpec, topic, topics
 SIM_NODE = (sys.executable, '-m', 'fetch_hand_sim.sim_node')
 POLICY_NODE = (sys.executable, '-m', 'policy_node.node')
 TIMEOUT = 30.0
+# Messages a client keeps until it is served, which takes seconds on a busy machine: none is lost.
+_KEPT = 1000
 Start = Callable[..., subprocess.Popen[str]]
 
 
@@ -86,7 +89,7 @@ class Client:
                 ros_message_class(source.type_name),
                 name,
                 self._collector(name),
-                rclpy_profile(source.qos),
+                rclpy_profile(replace(source.qos, depth=_KEPT)),
             )
 
     def publish(self, name: str, message: Any) -> None:
