@@ -1,13 +1,21 @@
-"""Layouts for rviz2 and Foxglove show topics that there are."""
+"""Layouts for rviz2, Foxglove and PlotJuggler show topics that there are."""
 
 from __future__ import annotations
 
 import json
+import math
 import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import fields, is_dataclass
+from types import SimpleNamespace
 
+import numpy as np
+import pytest
 import yaml
 
-from msgs_spec.tasks import TASKS
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.codecs import build_message
+from msgs_spec.tasks import TASKS, GoalKind
 from msgs_spec.topics import MONITORING, topics
 from msgs_spec.view_topics import view_topics
 from support import ROOT
@@ -79,3 +87,89 @@ def test_foxglove_gets_what_its_panels_read():
         if isinstance(child, dict):
             assert child['direction'] in ('row', 'column')
             children += [child['first'], child['second']]
+
+
+def curves(name, message):
+    """The numbers of a message by the names that PlotJuggler 3.17.2 was seen to give them."""
+    if name == '/joint_states':
+        return {
+            f'{name}/{joint}/{part}': value
+            for part in ('position', 'velocity', 'effort')
+            for joint, value in zip(message.name, getattr(message, part), strict=True)
+        }
+    if is_dataclass(message):
+        parts = [(f'{name}/{each.name}', getattr(message, each.name)) for each in fields(message)]
+    elif isinstance(message, list | np.ndarray):
+        parts = [(f'{name}[{index}]', each) for index, each in enumerate(message)]
+    else:
+        return {name: message}
+    return {key: value for part in parts for key, value in curves(*part).items()}
+
+
+def logged_vectors(task):
+    """Different numbers for every published topic; unit quaternions."""
+    random = np.random.default_rng(0)
+    found = {}
+    for spec in topics(task):
+        if spec.layout and spec.direction == 'published':
+            parts = [random.normal(size=part.size) for part in spec.layout]
+            parts = [part / np.linalg.norm(part) if part.size == 4 else part for part in parts]
+            found[spec] = np.concatenate(parts)
+    return found
+
+
+def plotjuggler():
+    """Plotted curves; functions by name: Lua text, sources."""
+    root = ElementTree.parse(ROOT / 'config/plotjuggler_layout.xml').getroot()
+    functions = {
+        each.get('name'): (
+            each.findtext('function'),
+            [
+                each.findtext('linked_source'),
+                *(v.text for v in each.iterfind('additional_sources/*')),
+            ],
+        )
+        for each in root.iter('snippet')
+    }
+    return {each.get('name') for each in root.iter('curve')}, functions
+
+
+def lua(text, values):
+    """What a function of the layout returns."""
+    names = {'math': SimpleNamespace(sqrt=math.sqrt, acos=math.acos, min=min, max=max)}
+    names |= {'value': values[0]} | {f'v{i}': each for i, each in enumerate(values[1:], start=1)}
+    return eval(text.removeprefix('return ').replace('^', '**'), names)
+
+
+@pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
+def test_plotjuggler_shows_curves_of_every_task(task):
+    """A function whose first source is missing stays empty; a later one would be an error."""
+    plotted, functions = plotjuggler()
+    vectors = logged_vectors(task)
+    logged = {}
+    for spec, vector in vectors.items():
+        logged |= curves(f'/{spec.name}', build_message(spec, 0, vector))
+    found = {
+        name: lua(text, [logged[each] for each in sources])
+        for name, (text, sources) in functions.items()
+        if sources[0] in logged
+    }
+    assert set(functions) <= plotted <= set(functions) | set(logged)
+
+    goals = {spec.name: vector for spec, vector in vectors.items()}
+    (kind,) = (name for name in found if name.startswith('distance/'))
+    distance, rotation = GoalMetric(task).distances(goals['achieved_goal'], goals['desired_goal'])
+    if task.position_counts:
+        assert found[kind] == pytest.approx(float(distance))
+    assert ('rotation/HandManipulate' in found) == (task.goal is GoalKind.POSE)
+    if task.goal is GoalKind.POSE and not task.ignores_z_rotation:
+        assert found['rotation/HandManipulate'] == pytest.approx(float(rotation))
+
+    commands = [part.name for part in task.robot.command]
+    shown = {name: found[name] for name in found if name.partition('/')[2] == 'command'}
+    shown |= {name: found[name] for name in found if name.startswith('command/')}
+    assert len(shown) == (4 if task.robot.has_gripper_command else 6)
+    for name, value in shown.items():
+        which = name.replace('command', '').strip('/')
+        index = commands.index(which if which in commands else f'robot0:{which}')
+        assert value == logged[f'/applied_command/data[{index}]']
