@@ -76,6 +76,10 @@ def test_foxglove_gets_what_its_panels_read():
     sizes = {'target': 3, 'targetOffset': 3, 'targetOrientation': 4}
     camera = panels['3D!robot']['cameraState']
     assert {name: len(camera[name]) for name in sizes} == sizes
+    # It follows `world`, and then moves by the offset alone.
+    assert camera['target'] == [0, 0, 0] and camera['targetOffset'] != [0, 0, 0]
+    # The default turns STL files of URDFs by 90 degrees.
+    assert panels['3D!robot']['scene']['meshUpAxis'] == 'z_up'
     for plot in (config for name, config in panels.items() if name.startswith('Plot')):
         for path in plot['paths']:
             has_stamp = path['value'].startswith('/scalars/')
