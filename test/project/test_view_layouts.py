@@ -81,10 +81,15 @@ def test_foxglove_gets_what_its_panels_read():
     # The default turns STL files of URDFs by 90 degrees.
     assert panels['3D!robot']['scene']['meshUpAxis'] == 'z_up'
     for plot in (config for name, config in panels.items() if name.startswith('Plot')):
+        assert plot['foxglovePanelTitle'] == plot['lichtblickPanelTitle'] != ''
         for path in plot['paths']:
-            has_stamp = path['value'].startswith('/scalars/')
-            assert path['timestampMethod'] == ('headerStamp' if has_stamp else 'receiveTime')
+            # Stamps are simulated time, far away from a recording or a bridge on wall time.
+            assert path['timestampMethod'] == 'receiveTime'
             assert path['enabled'] is True
+            # All values of a slice would be one line.
+            assert ':' not in path['value']
+    sizes_of_commands = [task.robot.action_size for task in TASKS.values()]
+    assert len(panels['Plot!command']['paths']) == max(sizes_of_commands)
     children = [layout['layout']]
     while children:
         child = children.pop()
