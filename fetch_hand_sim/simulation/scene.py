@@ -168,6 +168,29 @@ class Scene:
         width = 0.004 if self.spec.robot.has_gripper_command else 0.0012
         return [*shapes, *_line(trail, width)]
 
+    def object_markers(self, frame: Frame) -> list[Marker]:
+        """The object, for who draws neither it nor the model."""
+        if self._object is None or frame.object_pose is None:
+            return []
+        joint = self.model.joint(f'{self.spec.object_name}:joint')
+        (body,) = self.model.jnt_bodyid[[joint.id]]
+        first = int(self.model.body_geomadr[body])
+        count = int(self.model.body_geomnum[body])
+        return [self._geom_marker(geom, frame.object_pose) for geom in range(first, first + count)]
+
+    def _geom_marker(self, geom: int, pose: Array) -> Marker:
+        """A geom of the body that has this pose (7,)."""
+        model = self.model
+        position, quaternion = np.zeros(3), np.zeros(4)
+        mujoco.mju_mulPose(
+            position, quaternion, pose[:3], pose[3:], model.geom_pos[geom], model.geom_quat[geom]
+        )
+        material = int(model.geom_matid[geom])
+        color = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+        red, green, blue, opacity = map(float, color)
+        shape, size = int(model.geom_type[geom]), model.geom_size[geom].copy()
+        return Marker(shape, size, position, (red, green, blue, opacity), quaternion)
+
     def _shell(self, frame: Frame, color: Color) -> list[Marker]:
         """A tinted skin around the ghost."""
         geom = self.model.geom(GHOST)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from io import BytesIO
 
 import mujoco
@@ -25,9 +25,12 @@ _SHAPES = {
     _GEOM.mjGEOM_SPHERE.value: Marker.SPHERE,
     _GEOM.mjGEOM_ELLIPSOID.value: Marker.SPHERE,
     _GEOM.mjGEOM_BOX.value: Marker.CUBE,
+    _GEOM.mjGEOM_CYLINDER.value: Marker.CYLINDER,
     # There is no capsule.
     _GEOM.mjGEOM_CAPSULE.value: Marker.CYLINDER,
 }
+# Their sizes are a radius and half a length.
+_ROUND_RODS = (_GEOM.mjGEOM_CYLINDER.value, _GEOM.mjGEOM_CAPSULE.value)
 
 _JPEG_QUALITY = 85
 # As `compressed_image_transport` has it: encoding of the raw picture; that of the decoded one.
@@ -55,13 +58,22 @@ def transform_messages(transforms: Iterable[Transform], stamp_ns: int) -> list[T
     return messages
 
 
-def marker_array(shapes: Sequence[Shape], stamp_ns: int) -> MarkerArray:
-    """Returns shapes as markers; those of earlier messages are removed."""
+def marker_array(shapes: Mapping[str, Sequence[Shape]], stamp_ns: int) -> MarkerArray:
+    """Returns shapes as markers; those of earlier messages are removed.
+
+    Args:
+        shapes: By the namespace of their markers. What ROS has no shape for, such as a mesh, is
+            left out.
+        stamp_ns: Of the tick.
+    """
     header = Header(stamp=stamp(stamp_ns), frame_id=ROOT)
     first = Marker(header=header, action=Marker.DELETEALL)
     markers = [first]
-    for number, shape in enumerate(shapes, start=1):
-        marker = Marker(header=header, ns='goal', id=number, type=_SHAPES[shape.shape])
+    drawn = [(ns, shape) for ns, group in shapes.items() for shape in group]
+    for number, (ns, shape) in enumerate(drawn, start=1):
+        if shape.shape not in _SHAPES:
+            continue
+        marker = Marker(header=header, ns=ns, id=number, type=_SHAPES[shape.shape])
         x, y, z = shape.position.tolist()
         marker.pose.position = Point(x=x, y=y, z=z)
         marker.pose.orientation = _quaternion(shape.quaternion)
@@ -129,7 +141,7 @@ def _quaternion(wxyz: Array) -> Quaternion:
 def _scale(shape: Shape) -> Vector3:
     """Full lengths, where MuJoCo has radii and half lengths."""
     size = shape.size
-    if shape.shape == _GEOM.mjGEOM_CAPSULE.value:
+    if shape.shape in _ROUND_RODS:
         size = np.array([size[0], size[0], size[1]])
     x, y, z = (2.0 * size).tolist()
     return Vector3(x=x, y=y, z=z)

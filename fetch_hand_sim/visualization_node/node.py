@@ -169,7 +169,8 @@ class VisualizationNode(Node):
             return
         tick, self._unmarked = self._unmarked, None
         if tick is not None and self._has_listener('goal_markers'):
-            markers = marker_array(scene.markers(tick.frame), tick.stamp_ns)
+            shapes = {'goal': scene.markers(tick.frame), 'object': scene.object_markers(tick.frame)}
+            markers = marker_array(shapes, tick.stamp_ns)
             self._outputs['goal_markers'].publish(markers)
         tick = self._undrawn
         if tick is None or not self._camera.is_due:

@@ -73,16 +73,33 @@ def test_transforms_put_every_frame_where_mujoco_has_it(task, namespace):
 @pytest.mark.parametrize('task', TASKS)
 def test_markers_are_the_shapes_of_the_scene(task):
     scene, frame = Scene(task), moved_frame(task)
-    shapes = scene.markers(frame)
-    array = deserialize_message(serialize_message(marker_array(shapes, STAMP)), MarkerArray)
+    drawn = {'goal': scene.markers(frame), 'object': scene.object_markers(frame)}
+    shapes = [shape for group in drawn.values() for shape in group]
+    array = deserialize_message(serialize_message(marker_array(drawn, STAMP)), MarkerArray)
     assert array.markers[0].action == Marker.DELETEALL
     assert len(array.markers) == len(shapes) + 1 > 1
+    assert [marker.ns for marker in array.markers].count('object') == len(drawn['object'])
     for marker, shape in zip(array.markers[1:], shapes, strict=True):
         assert marker.header.frame_id == ROOT
         p = marker.pose.position
         np.testing.assert_allclose([p.x, p.y, p.z], shape.position)
         assert min(marker.scale.x, marker.scale.y, marker.scale.z) > 0.0
     assert len({marker.id for marker in array.markers[1:]}) == len(shapes)
+
+
+@pytest.mark.parametrize('task', [name for name, spec in TASKS.items() if spec.has_object])
+def test_the_object_is_drawn_where_mujoco_has_it(task):
+    scene, frame = Scene(task), moved_frame(task)
+    scene.show(frame)
+    mujoco.mj_kinematics(scene.model, scene.data)
+    geom = scene.data.geom(scene.spec.object_name)
+    marker = scene.object_markers(frame)[0]
+    np.testing.assert_allclose(marker.position, geom.xpos, atol=1e-9)
+    matrix = quaternion_to_matrix(marker.quaternion)
+    np.testing.assert_allclose(matrix.ravel(), geom.xmat, atol=1e-6)
+    (message,) = marker_array({'object': [marker]}, STAMP).markers[1:]
+    longest = max(message.scale.x, message.scale.y, message.scale.z)
+    assert longest == pytest.approx(2.0 * scene.model.geom(geom.id).size.max())
 
 
 def test_an_image_keeps_its_pixels():
