@@ -27,8 +27,6 @@ from msgs_spec.topics import MONITORING, TopicSpec, topic, topics
 SIM_NODE = (sys.executable, '-m', 'fetch_hand_sim.sim_node')
 POLICY_NODE = (sys.executable, '-m', 'policy_node.node')
 TIMEOUT = 30.0
-# Messages a client keeps until it is served, which takes seconds on a busy machine: none is lost.
-_KEPT = 1000
 Start = Callable[..., subprocess.Popen[str]]
 
 
@@ -82,14 +80,15 @@ class Client:
         self._publishers: dict[str, Any] = {}
         self._service_clients: dict[str, Any] = {}
 
-    def subscribe(self, *names: str) -> None:
+    def subscribe(self, *names: str, depth: int | None = None) -> None:
+        """Subscribes to topics, or to all; keeps `depth` messages until served."""
         for name in names or [s.name for s in topics(self.spec) if s.direction == 'published']:
             source = self._topic(name)
             self.node.create_subscription(
                 ros_message_class(source.type_name),
                 name,
                 self._collector(name),
-                rclpy_profile(replace(source.qos, depth=_KEPT)),
+                rclpy_profile(replace(source.qos, depth=depth or source.qos.depth)),
             )
 
     def publish(self, name: str, message: Any) -> None:
