@@ -51,7 +51,7 @@ def interrupt_in_time(command: Sequence[str | Path], imports: int) -> tuple[int,
 
     On a busy machine it may be over before the signal reaches it: then again.
     """
-    for _ in range(3):
+    for _ in range(10):
         answer = interrupt(command, imports)
         if answer[0] not in (0, 2):
             break
