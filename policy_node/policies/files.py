@@ -32,7 +32,7 @@ def write_file(path: Path, data: bytes) -> None:
     """Writes a file under a temporary name and moves it into place.
 
     Raises:
-        OSError: If that fails; nothing is left behind.
+        OSError: If that fails, and names the file; nothing is left behind.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f'.{path.name}.partial')
@@ -42,8 +42,11 @@ def write_file(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
-    except BaseException:
+    except BaseException as error:
         partial.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            # Of a full disk Python names no file, and of others the partial one.
+            raise type(error)(error.errno, error.strerror, str(path)) from None
         raise
 
 

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 _NAME = 'train_her'
 # Fields that say which recipe there is to start from.
 _OWN_OPTIONS = ('task', 'recipe')
+# What networks are made of: a run cannot go on with others.
+_OF_NETWORKS = 'hidden_sizes layer_norm goal_features algorithm critics norm advantage'.split()
 # A process that a signal ended returns 128 + its number, as shells say it.
 EXIT_SIGNAL = 128
 
@@ -83,13 +85,22 @@ def _resumed_config(options: argparse.Namespace, overrides: dict[str, Any]) -> T
         raise ValueError(f'--output excludes --resume: the run goes on in {options.resume}')
     if overrides.get('init_from'):
         raise ValueError('--init-from excludes --resume: a run goes on with its own networks')
+    if not (options.resume / STATE_FILE).is_file():
+        raise ValueError(f'{options.resume} is no folder of a run to go on with: no {STATE_FILE}')
     stored = read_state(options.resume / STATE_FILE).extra['config']
     for name in _OWN_OPTIONS:
         chosen = (getattr(options, name), overrides.get(name))
         wrong = [value for value in chosen if value not in (None, stored.get(name))]
         if wrong:
             raise ValueError(f'{options.resume} is a run of {stored.get(name)}, not of {wrong[0]}')
-    return config_from_dict({**stored, **overrides})
+    before, config = config_from_dict(stored), config_from_dict({**stored, **overrides})
+    for name in _OF_NETWORKS:
+        old, new = getattr(before, name), getattr(config, name)
+        if old != new:
+            raise ValueError(
+                f'{options.resume} has networks of {name} {old}, which stay; not {new}'
+            )
+    return config
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -122,7 +122,7 @@ def require_allowed(config: ConfigFields) -> None:
     for name, lowest, highest in RANGES:
         value = getattr(config, name)
         if not lowest <= value <= highest:
-            raise ValueError(f'{name} {value}; allowed: {lowest:.6g} ... {highest:.6g}')
+            raise ValueError(f'{name} {value}; allowed: {_number(lowest)} ... {_number(highest)}')
     goal_features(config.goal_features, spec)
     if config.goals:
         parse_mixture(config.goals)
@@ -132,6 +132,11 @@ def require_allowed(config: ConfigFields) -> None:
         raise ValueError(reason)
     if not config.hidden_sizes or min(config.hidden_sizes) < 1:
         raise ValueError(f'hidden_sizes {config.hidden_sizes}; allowed: one or more widths >= 1')
+
+
+def _number(value: float) -> str:
+    """A limit as text; a whole one to its last digit."""
+    return f'{value:.6g}' if isinstance(value, float) else str(value)
 
 
 def unusual_networks(config: ConfigFields) -> list[str]:

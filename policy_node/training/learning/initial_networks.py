@@ -131,7 +131,10 @@ def read_initial_networks(name: str) -> InitialNetworks:
     if path.is_dir():
         return _of_run(path)
     if ',' in name and not path.exists():
-        return mean_of([read_initial_networks(part.strip()) for part in name.split(',')])
+        names = [part.strip() for part in name.split(',')]
+        if not all(names):
+            raise ValueError(f'init_from {name!r} has an empty name beside a comma')
+        return mean_of([read_initial_networks(part) for part in names])
     return _of_actor(name, actor_path(name))
 
 

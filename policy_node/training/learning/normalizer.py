@@ -51,6 +51,16 @@ class RunningStatistics:
         return {'count': self.count, 'total': self.total, 'total_square': self.total_square}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continues from sums that `state` returned."""
+        """Continues from sums that `state` returned.
+
+        Raises:
+            KeyError: If one is missing.
+            ValueError: If one has another size; nothing may be stretched to fit.
+        """
         for name, value in self.state().items():
-            value.copy_(state[name])
+            given = state[name]
+            if given.shape != value.shape:
+                raise ValueError(
+                    f'{name} of inputs is {tuple(given.shape)}, not {tuple(value.shape)}'
+                )
+            value.copy_(given)

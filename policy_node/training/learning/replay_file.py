@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
@@ -40,6 +41,23 @@ def load_replay(path: Path, replay: EpisodeReplay) -> None:
     try:
         tensors = load_file(path)
         episodes = Episodes(**{name: tensors[name] for name in Episodes.__slots__})
+        _require_whole(episodes)
         replay.add(episodes.last(replay.capacity))
-    except (OSError, SafetensorError, KeyError, IndexError, ValueError) as error:
+    except (OSError, SafetensorError, KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(f'{path} is no replay of this run: {error}') from None
+
+
+def _require_whole(episodes: Episodes) -> None:
+    """Refuses what would be learnt from wrongly, or end every part of the run.
+
+    Raises:
+        ValueError: If a value is no finite float32, or an array has other episodes than the rest.
+    """
+    for name in Episodes.__slots__:
+        array = getattr(episodes, name)
+        if array.dtype != np.float32:
+            raise ValueError(f'{name} is {array.dtype}, not float32')
+        if array.shape[:1] != episodes.action.shape[:1]:
+            raise ValueError(f'{name} is {array.shape}, action {episodes.action.shape}')
+        if not np.isfinite(array).all():
+            raise ValueError(f'{name} has a value that is not finite')

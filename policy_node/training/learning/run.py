@@ -85,13 +85,20 @@ def train_run(
         try:
             ending = _train(trainer, output, command)
         except (TrainingError, OSError) as error:
-            raise CommandError(f'{error}; the last checkpoint is kept in {output}') from None
+            raise CommandError(f'{error}; {_kept(output)}') from None
         finally:
             leave_workers(workers)
         if workers.is_first:
             title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
             draw_curve(read_progress(output / 'progress.csv'), title, output / 'curve.png')
         return ending
+
+
+def _kept(output: Path) -> str:
+    """What is left of a run that failed."""
+    if (output / STATE_FILE).is_file():
+        return f'the last checkpoint is kept in {output}'
+    return f'{output} has no checkpoint to go on from'
 
 
 def _train(trainer: Trainer, output: Path, command: str) -> Ending:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -134,18 +134,30 @@ def _rows_until(path: Path, env_steps: int) -> list[dict[str, str]]:
     """Rows of a log up to `env_steps`, as they were written."""
     if env_steps == 0 or not path.is_file():
         return []
-    with open(path, newline='') as file:
-        rows = [(row, _numbers(row)) for row in csv.DictReader(file)]
-    return [row for row, numbers in rows if numbers and numbers['env_steps'] <= env_steps]
+    return [row for row, numbers in _whole_rows(path) if numbers['env_steps'] <= env_steps]
+
+
+def _whole_rows(path: str | Path) -> Iterator[tuple[dict[str, str], dict[str, float]]]:
+    """Rows of a log as text and as numbers; what is no row is left out, whatever it is."""
+    with open(path, newline='', encoding='utf-8', errors='replace') as file:
+        try:
+            for row in csv.DictReader(file):
+                numbers = _numbers(row)
+                if numbers is not None:
+                    yield row, numbers
+        except csv.Error:
+            # Binary where a line should end: nothing after it is a row either.
+            return
 
 
 def _numbers(row: dict[str, str]) -> dict[str, float] | None:
-    """The numbers of a row; None if a killed run has cut it short."""
+    """The numbers of a row; None if a killed run has cut it short, or a disk has damaged it."""
     try:
         # A column that is missing is None, an empty one is left out.
-        return {name: float(text) for name, text in row.items() if text != ''}
+        numbers = {name: float(text) for name, text in row.items() if text != ''}
     except (TypeError, ValueError):
         return None
+    return numbers if 'env_steps' in numbers else None
 
 
 def _tensorboard(output: Path, resumed_steps: int) -> Any:
@@ -157,10 +169,8 @@ def _tensorboard(output: Path, resumed_steps: int) -> Any:
 
 
 def read_progress(path: str | Path) -> list[dict[str, float]]:
-    """Reads `progress.csv`; empty columns are left out of a row, and rows that were cut short."""
-    with open(path, newline='') as file:
-        rows = map(_numbers, csv.DictReader(file))
-        return [row for row in rows if row is not None]
+    """Reads `progress.csv`; empty columns are left out of a row, and rows that are damaged."""
+    return [numbers for _, numbers in _whole_rows(path)]
 
 
 def draw_curve(rows: Sequence[dict[str, float]], title: str, path: str | Path) -> None:
@@ -169,10 +179,11 @@ def draw_curve(rows: Sequence[dict[str, float]], title: str, path: str | Path) -
 
     figure = Figure(figsize=(6.4, 4.0), layout='constrained')
     axes = figure.add_subplot()
+    explored = [row for row in rows if 'train_success' in row]
     evaluated = [row for row in rows if 'eval_success' in row]
     axes.plot(
-        [row['env_steps'] for row in rows],
-        [row['train_success'] for row in rows],
+        [row['env_steps'] for row in explored],
+        [row['train_success'] for row in explored],
         color='tab:gray',
         alpha=0.5,
         label='while exploring',

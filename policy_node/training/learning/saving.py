@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 
 from msgs_spec.command_line import complain
+from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
-from policy_node.policies.checkpoint import read_info
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
 from policy_node.training.evaluation.evaluator import success_rate
 from policy_node.training.learning.actor_critic import ActorCritic
@@ -54,11 +54,18 @@ class Saver:
         """Lets the best actor in the folder stay, which a killed run may have saved last.
 
         An actor of fewer episodes, by another rule or without a measured return decides nothing.
+        Where it is gone or damaged, the next one that is evaluated takes its place: a run must not
+        end with a success that no file has.
         """
         file = self.folder.path / BEST_FILE
         try:
-            found = read_info(file).success if file.is_file() else {}
-        except ValueError:
+            if counters.best_success >= 0 and not file.is_file():
+                raise ValueError(f'{file} is gone')
+            found = checkpoint.load(file)[1].success if file.is_file() else {}
+        except ValueError as error:
+            if self._workers.is_first:
+                complain(NAME, f'{error}; the best actor is looked for anew')
+            counters.best_success, counters.best_return = Counters().best_success, -1e9
             return
         enough = found.get('episodes', 0) >= self._config.evaluation_episodes
         if enough and found.get('rule') == self._config.success_rule and 'mean_return' in found:

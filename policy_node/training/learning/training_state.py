@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,11 @@ from policy_node.policies.tensor_file import (
 )
 from policy_node.training.learning.actor_critic import ActorCritic
 from policy_node.training.learning.normalizer import RunningStatistics
+from policy_node.training.learning.state_checks import (
+    require_adam,
+    require_counters,
+    require_finite,
+)
 
 FORMAT = 'fetch_hand_training'
 FORMAT_VERSION = 1
@@ -123,6 +128,10 @@ def read_state(path: Path) -> TrainingState:
     arrays, metadata = read_tensors(path)
     counters, extra = _described(path, metadata)
     tensors = {name: torch.tensor(values) for name, values in arrays.items()}
+    try:
+        require_finite(tensors)
+    except ValueError as error:
+        raise ValueError(f'{path} is damaged: {error}') from None
     return TrainingState(tensors, counters, extra)
 
 
@@ -131,10 +140,12 @@ def _described(path: Path, metadata: dict[str, str]) -> tuple[Counters, dict[str
     if found != (FORMAT, str(FORMAT_VERSION)):
         raise ValueError(f'{path} is no training state of version {FORMAT_VERSION}: {found}')
     try:
-        counters = Counters(**json.loads(metadata['counters']))
+        known = asdict(Counters())
+        counters = Counters(**require_counters(json.loads(metadata['counters']), known))
         extra = dict(json.loads(metadata['extra']))
-        if not isinstance(extra['config'], dict):
-            raise TypeError('config is no object')
+        for name in ('config', 'init_from'):
+            if not isinstance(extra[name] if name == 'config' else extra.get(name, {}), dict):
+                raise TypeError(f'{name} is no object')
     except KeyError as error:
         raise ValueError(f'{path} lacks {error.args[0]!r} in its metadata') from None
     except (ValueError, TypeError, RecursionError) as error:
@@ -156,11 +167,19 @@ def load_state(
         load_networks(state.tensors, learner, statistics)
         for part, optimizer in learner.optimizers().items():
             _load_optimizer(optimizer, part_of(state.tensors, part))
-    except (RuntimeError, KeyError, TypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f'{path} does not fit this configuration: {reason}') from None
+        if state.counters.updates > 0 and not part_of(state.tensors, 'critic_optimizer'):
+            raise ValueError('critic_optimizer is missing')
+    except (RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f'{path} does not fit this configuration: {_reason(error)}') from None
     learner.updates = state.counters.updates
     return state
+
+
+def _reason(error: Exception) -> str:
+    """What was wrong, in one line; torch says on its first one only where."""
+    if isinstance(error, KeyError):
+        return f'{error.args[0]} is missing'
+    return ' '.join(line.strip() for line in str(error).splitlines()[:2])
 
 
 def load_networks(
@@ -208,5 +227,6 @@ def _load_optimizer(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> 
     for key, value in tensors.items():
         index, name = key.split('.')
         state.setdefault(int(index), {})[name] = value
+    require_adam(optimizer, state)
     groups = optimizer.state_dict()['param_groups']
     optimizer.load_state_dict({'state': state, 'param_groups': groups})

@@ -1,0 +1,238 @@
+"""Runs whose files are damaged, or well-formed and wrong: one line, or the run goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file, save_file
+
+from policy_node.policies import files
+from policy_node.policies.tensor_file import read_tensors, write_tensors
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.initial_networks import read_initial_networks
+from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.learning.run_log import read_progress
+from policy_node.training.learning.trainer import Trainer
+from policy_node.training.learning.training_state import read_counters
+from policy_node.training.train_her import main
+
+torch.set_num_threads(1)
+
+SMALL: dict[str, Any] = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64}
+SMALL |= {'evaluation_episodes': 8, 'simulation_threads': 1, 'torch_threads': 1}
+SMALL |= {'evaluate_every': 400, 'hidden_sizes': (16, 16)}
+STATE, REPLAY, BEST = 'training_state.safetensors', 'replay.safetensors', 'best.safetensors'
+
+
+@pytest.fixture(scope='module')
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('trained') / 'run'
+    config = recipe_config('FetchReach', 'best', **SMALL, total_steps=1_200)
+    Trainer(config, folder, Workers()).train()
+    return folder
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A run of 1,200 steps, to be damaged."""
+    return shutil.copytree(trained, tmp_path / 'run')
+
+
+def change_state(
+    run: Path,
+    change: Callable[[dict[str, np.ndarray]], object] = lambda tensors: None,
+    counters: dict[str, Any] | None = None,
+    **extra: Any,
+) -> None:
+    tensors, metadata = read_tensors(run / STATE)
+    tensors = dict(tensors)
+    change(tensors)
+    metadata['counters'] = json.dumps(json.loads(metadata['counters']) | (counters or {}))
+    metadata['extra'] = json.dumps(json.loads(metadata['extra']) | extra)
+    write_tensors(run / STATE, tensors, metadata)
+
+
+def refusal(run: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
+    assert main(['--resume', str(run), '--steps', '1600', *more]) == 2
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1
+    return error
+
+
+@pytest.mark.parametrize(
+    ('counters', 'message'),
+    [
+        ({'env_steps': 'abc'}, "counter env_steps is 'abc'; allowed: 0 ... 2**53"),
+        ({'env_steps': -400}, 'counter env_steps is -400'),
+        ({'env_steps': 1200.5}, 'counter env_steps is 1200.5'),
+        ({'updates': 10**30}, 'counter updates is 1000000'),
+        ({'next_evaluation': [1]}, 'counter next_evaluation is [1]'),
+        ({'episodes': True}, 'counter episodes is True'),
+        ({'seconds': None}, 'counter seconds is None; allowed: a finite number'),
+        ({'best_success': float('nan')}, 'counter best_success is nan'),
+        ({'zzz': 1}, "counter 'zzz' is not known; allowed: env_steps, "),
+    ],
+)
+def test_counters_that_are_none_are_refused(
+    run: Path, counters: dict[str, Any], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change_state(run, counters=counters)
+    error = refusal(run, capsys)
+    assert message in error and str(run / STATE) in error
+    with pytest.raises(ValueError, match='unreadable metadata: counter'):
+        read_counters(run / STATE)
+
+
+def test_an_origin_that_is_none_is_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change_state(run, init_from=[1])
+    assert 'init_from is no object' in refusal(run, capsys)
+
+
+def nan_in(name: str) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(tensors: dict[str, np.ndarray]) -> None:
+        tensors[name] = np.full_like(tensors[name], np.nan)
+
+    return change
+
+
+def shorter(name: str) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(tensors: dict[str, np.ndarray]) -> None:
+        tensors[name] = tensors[name][:1]
+
+    return change
+
+
+def without(prefix: str) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(tensors: dict[str, np.ndarray]) -> None:
+        for name in [name for name in tensors if name.startswith(prefix)]:
+            del tensors[name]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        (nan_in('actor.network.output.bias'), 'actor.network.output.bias has a value that is not'),
+        # Adam's fused step would write beyond the end of these.
+        (shorter('critic_optimizer.0.exp_avg'), 'exp_avg of parameter 0 is (1, 17) torch.float32'),
+        (shorter('observation_statistics.total'), 'total of inputs is (1,), not (10,)'),
+        (without('critic_optimizer.1.step'), 'moments of parameter 1 are'),
+        (without('critic_optimizer.'), 'critic_optimizer is missing'),
+        (without('goal_statistics.count'), 'count is missing'),
+        (shorter('actor.network.output.bias'), 'Actor: size mismatch for network.output.bias'),
+    ],
+)
+def test_tensors_that_cannot_be_gone_on_from_are_refused(
+    run: Path,
+    change: Callable[[dict[str, np.ndarray]], None],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    change_state(run, change)
+    assert message in refusal(run, capsys)
+
+
+def test_networks_that_are_not_finite_are_nothing_to_start_from(run: Path) -> None:
+    change_state(run, nan_in('critic.network.output.bias'))
+    with pytest.raises(ValueError, match=r'is damaged: critic\.network\.output\.bias has a value'):
+        read_initial_networks(str(run))
+
+
+@pytest.mark.parametrize(
+    ('name', 'change', 'message'),
+    [
+        ('observation', lambda a: np.full_like(a, np.nan), 'observation has a value that is not'),
+        ('observation', lambda a: a.astype(np.int32), 'observation is int32, not float32'),
+        # NumPy would give the one goal to every episode.
+        ('desired_goal', lambda a: a[:1], 'desired_goal is (1, 3), action (24, 50, 4)'),
+        ('action', lambda a: np.zeros((), np.float32).reshape(1)[0:1], 'observation is (24, 51'),
+    ],
+)
+def test_a_replay_that_would_teach_nonsense_is_collected_anew(
+    run: Path,
+    name: str,
+    change: Callable[[np.ndarray], np.ndarray],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    tensors = load_file(run / REPLAY)
+    save_file(tensors | {name: change(tensors[name])}, run / REPLAY)
+    assert main(['--resume', str(run), '--steps', '1600']) == 0
+    error = capsys.readouterr().err
+    assert f'is no replay of this run: {message}' in error
+    assert '1,200 steps fill the replay before learning goes on' in error
+
+
+@pytest.mark.parametrize(
+    'content', [bytes(range(256)) * 10, b'a,b\n1,2\n', b'\xff' * 200_000, b'env_steps\n9999\n']
+)
+def test_a_log_that_is_none_does_not_stop_a_run(
+    run: Path, content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / 'progress.csv').write_bytes(content)
+    assert main(['--resume', str(run), '--steps', '1600']) == 0
+    assert [row['env_steps'] for row in read_progress(run / 'progress.csv')] == [1_600]
+    assert 'Traceback' not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('gone', [True, False])
+def test_a_best_actor_that_is_lost_is_looked_for_anew(
+    run: Path, gone: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change_state(run, counters={'best_success': 1.0, 'best_return': 0.0})
+    (run / BEST).unlink() if gone else (run / BEST).write_bytes(b'damaged')
+    assert main(['--resume', str(run), '--steps', '1600']) == 0
+    assert 'the best actor is looked for anew' in capsys.readouterr().err
+    assert read_tensors(run / BEST)[1]['task'] == '"FetchReach"'
+
+
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        (['--hidden-sizes', '8,8'], 'has networks of hidden_sizes (16, 16), which stay; not (8, 8'),
+        (['--critics', '2'], 'has networks of critics 1, which stay; not 2'),
+        (['--goal-features', 'relative'], 'has networks of goal_features plain, which stay'),
+    ],
+)
+def test_networks_stay_as_they_are(
+    run: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert message in refusal(run, capsys, *options)
+
+
+def test_what_is_no_run_is_said_to_be_none(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert 'best.safetensors is no folder of a run' in refusal(run / BEST, capsys)
+    assert 'nothere is no folder of a run' in refusal(run / 'nothere', capsys)
+
+
+def test_a_comma_with_nothing_beside_it_is_no_origin() -> None:
+    with pytest.raises(ValueError, match=r"init_from 'FetchReach,' has an empty name"):
+        read_initial_networks('FetchReach,')
+
+
+@pytest.mark.parametrize('resumed', [True, False])
+def test_a_full_disk_is_said_with_the_file_and_what_is_left(
+    run: Path, resumed: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(files, 'os', type('Os', (), {'fsync': full, 'replace': os.replace}))
+    fields = [f'--set={name}={value}' for name, value in SMALL.items() if name != 'hidden_sizes']
+    fresh = ['--task', 'FetchReach', '--output', str(run.parent / 'new'), *fields]
+    where = ['--resume', str(run)] if resumed else fresh
+    assert main([*where, '--steps', '1600']) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "No space left on device: '" in said and "safetensors'; " in said
+    kept = f'the last checkpoint is kept in {run}'
+    none = f'{run.parent / "new"} has no checkpoint to go on from'
+    assert said.endswith(kept if resumed else none)
