@@ -44,11 +44,13 @@ def export(source: Path, target: Path) -> float:
     Raises:
         ValueError: If the checkpoint cannot be used.
         CommandError: If actions differ.
+        OSError: If it cannot be written.
     """
     actor, info = checkpoint.load(source)
     shape = actor.shape
     sizes = (shape.observation_size, shape.goal_size)
     batch = torch.export.Dim('batch')
+    target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent) as folder:
         partial = Path(folder) / target.name
         with warnings.catch_warnings():

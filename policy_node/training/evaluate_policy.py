@@ -37,6 +37,7 @@ from policy_node.training.policy_options import (
     add_reward_options,
     load_chosen_policy,
     make_chosen_simulation,
+    require_writable,
 )
 
 _NAME = 'evaluate_policy'
@@ -76,6 +77,9 @@ def _run(options: argparse.Namespace) -> int:
         simulation = make_chosen_simulation(options, loaded)
     except ValueError as error:
         raise UsageError(str(error)) from None
+    for file in (options.json, options.csv):
+        if file not in (None, _STDOUT):
+            require_writable(file)
     outcomes, code = _evaluate(options, simulation, loaded.policy)
     report = {
         'policy': options.policy or loaded.task,

@@ -16,6 +16,7 @@ from typing import Any
 
 from msgs_spec.command_line import (
     EXIT_SUCCESS,
+    CommandError,
     CommandParser,
     UsageError,
     run_command,
@@ -23,9 +24,14 @@ from msgs_spec.command_line import (
 )
 from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
+from policy_node.policies.files import write_file
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
-from policy_node.training.policy_options import add_policy_options, load_chosen_policy
+from policy_node.training.policy_options import (
+    add_policy_options,
+    load_chosen_policy,
+    require_writable,
+)
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -87,6 +93,7 @@ def _run(options: argparse.Namespace) -> int:
     seeds = range(options.first_seed, options.first_seed + options.episodes)
     if spec.reference_id is None:
         raise UsageError(f'{spec.name} is no task of Gymnasium-Robotics')
+    report = _report_to_add_to(options.json)
     successes = success_in_reference(loaded.policy, spec.reference_id, spec.episode_ticks, seeds)
     lower, upper = wilson_interval(successes, options.episodes)
     result = {
@@ -98,9 +105,30 @@ def _run(options: argparse.Namespace) -> int:
     }
     print(f'{spec.reference_id}: {result["success"]:.4f} ({lower:.4f} ... {upper:.4f})')
     if options.json is not None:
-        report = json.loads(options.json.read_text()) if options.json.is_file() else {}
-        options.json.write_text(json.dumps({**report, 'reference': result}, indent=2) + '\n')
+        text = json.dumps({**report, 'reference': result}, indent=2) + '\n'
+        try:
+            write_file(options.json, text.encode())
+        except OSError as error:
+            raise CommandError(str(error)) from None
     return EXIT_SUCCESS
+
+
+def _report_to_add_to(file: Path | None) -> dict[str, Any]:
+    """What a JSON file holds, read before hours of episodes are played for it.
+
+    Raises:
+        UsageError: If it cannot be written, or holds something else.
+    """
+    if file is None:
+        return {}
+    require_writable(file)
+    try:
+        report = json.loads(file.read_text()) if file.is_file() else {}
+    except ValueError as error:
+        raise UsageError(f'{file} is no JSON: {error}') from None
+    if not isinstance(report, dict):
+        raise UsageError(f'{file} holds no JSON object that a result could be added to')
+    return report
 
 
 if __name__ == '__main__':

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+from pathlib import Path
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.command_line import FormerOption, UsageError, complain, whole_number
@@ -79,3 +81,19 @@ def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) ->
         success_rule=options.success_rule,
         control_hz=loaded.control_hz or DEFAULT_CONTROL_HZ,
     )
+
+
+def require_writable(file: Path) -> None:
+    """Makes the folder of a file that will be written, so that no work is done for nothing.
+
+    Raises:
+        UsageError: If it could not be written.
+    """
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f'{file} cannot be written: {error.strerror}') from None
+    if file.is_dir():
+        raise UsageError(f'{file} cannot be written: it is a folder')
+    if not os.access(file if file.exists() else file.parent, os.W_OK):
+        raise UsageError(f'{file} cannot be written: it is read-only')

@@ -9,6 +9,7 @@ from typing import Any
 
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies import checkpoint
+from policy_node.policies.files import write_file
 from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, summarize
 from policy_node.training.evaluation.table import print_table
 from policy_node.training.learning.run_folder import (
@@ -19,6 +20,9 @@ from policy_node.training.learning.run_folder import (
 )
 from policy_node.training.learning.run_log import draw_curve, read_progress
 from policy_node.training.learning.training_state import TrainingState, read_state, write_state
+
+# What decides which of two actors is better, the first first.
+_BETTER = ('success_gymnasium', 'mean_return')
 
 
 def ship(
@@ -46,14 +50,22 @@ def ship(
         Whether the actor of the run is the shipped one now.
 
     Raises:
-        ValueError: If there is no such actor, or no log beside it.
+        ValueError: If there is no such actor, no log beside it, a file of either folder is damaged,
+            or the shipped actor was evaluated on more episodes: a few may all succeed by chance.
     """
     actor, info = checkpoint.load(run / name)
-    progress = _progress_of(run)
+    progress, has_state = _progress_of(run), (run / STATE_FILE).is_file()
+    state = read_state(run / STATE_FILE) if has_state else None
     shipped, digest = actors / f'{info.task}.json', checkpoint.checkpoint_hash(run / name)
-    old = json.loads(shipped.read_text()) if shipped.is_file() else {}
+    old = _evaluation_in(shipped)
     if (old.get('run_sha256'), old.get('episodes')) == (digest, episodes):
+        print(f'ship_actor: the actor in {actors} is this one; nothing changed')
         return True
+    if old and old['episodes'] > episodes:
+        raise ValueError(
+            f'the actor in {actors} was evaluated on {old["episodes"]} episodes, this one would be '
+            f'on {episodes}: give --episodes {old["episodes"]} or more'
+        )
     simulation = Simulation(
         info.task,
         num_envs=min(num_envs, episodes),
@@ -78,15 +90,33 @@ def ship(
         'source_revision': info.source_revision,
         **summary,
     }
-    if (run / STATE_FILE).is_file():
-        ship_critic(run / STATE_FILE, target)
+    if state is not None:
+        ship_critic(state, target)
     title = f'{info.task}, {info.config["recipe"]} recipe, seed {info.seed}'
     curve = target.with_suffix('.png')
     # A mean of networks, taken as it is, has no curve of its own: that of a part stays.
     if progress[-1].get('updates') or not curve.is_file():
         draw_curve(progress, title, curve)
-    shipped.write_text(json.dumps(report, indent=2) + '\n')
+    write_file(shipped, (json.dumps(report, indent=2) + '\n').encode())
+    print(f'ship_actor: {target} is the actor of {run} now')
     return True
+
+
+def _evaluation_in(file: Path) -> dict[str, Any]:
+    """What lies beside a shipped actor; empty where none is shipped.
+
+    Raises:
+        ValueError: If it is no evaluation.
+    """
+    if not file.is_file():
+        return {}
+    try:
+        found = json.loads(file.read_text())
+        for key in (*_BETTER, 'episodes'):
+            float(found[key])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f'{file} is no evaluation of an actor: {error!r}') from None
+    return dict(found)
 
 
 def _progress_of(run: Path) -> list[dict[str, float]]:
@@ -101,12 +131,11 @@ def _progress_of(run: Path) -> list[dict[str, float]]:
     return progress
 
 
-def ship_critic(state_file: Path, actor: Path) -> None:
+def ship_critic(state: TrainingState, actor: Path) -> None:
     """Puts the critic of a run beside its shipped actor, so that training can go on from there.
 
     The actor holds its normalisers itself; optimisers start fresh.
     """
-    state = read_state(state_file)
     tensors = {name: value for name, value in state.tensors.items() if name.startswith('critic.')}
     extra = {'config': state.extra['config'], 'actor_sha256': checkpoint.checkpoint_hash(actor)}
     write_state(companion_file(actor), TrainingState(tensors, state.counters, extra))
@@ -121,5 +150,4 @@ def commands_of(run: Path) -> str:
 
 def is_better(new: dict[str, Any], old: dict[str, Any]) -> bool:
     """Whether an evaluation is better: by last-step success, then by return."""
-    keys = ('success_gymnasium', 'mean_return')
-    return [new[key] for key in keys] > [old[key] for key in keys]
+    return [new[key] for key in _BETTER] > [old[key] for key in _BETTER]

@@ -33,7 +33,7 @@ REACH = task_spec('FetchReach')
 
 @pytest.fixture(scope='module')
 def onnx_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp('onnx') / 'reach.onnx'
+    path = tmp_path_factory.mktemp('onnx') / 'new' / 'reach.onnx'
     assert export_actor(['FetchReach', str(path)]) == 0
     return path
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -210,6 +212,9 @@ def test_former_names_work_and_say_what_they_are_called_now(
         (['--policy', 'random'], 'random needs a task; allowed: FetchReach, '),
         ([], '--policy is missing; allowed: a shipped actor'),
         (['--policy', 'FetchReach', '--task', 'FetchPush'], 'trained on FetchReach, not on Fetch'),
+        # Before the episodes are played, not after.
+        (['--policy', 'FetchReach', '--json', '/dev/null/a.json'], 'a.json cannot be written: '),
+        (['--policy', 'FetchReach', '--csv', '/dev'], '/dev cannot be written: it is a folder'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(
@@ -241,3 +246,22 @@ def test_ctrl_c_reports_the_episodes_that_are_finished(
     arguments = ['--policy', 'resting', '--task', 'FetchReach', '--episodes', '9', '--json']
     assert main([*arguments, '--num-envs', '3', '--threads', '1']) == 130
     assert json.loads(capsys.readouterr().out)['episodes'] == 3
+
+
+@pytest.mark.parametrize(
+    ('content', 'message'),
+    [('{', 'is no JSON: '), ('[1]', 'holds no JSON object'), (None, 'cannot be written: ')],
+)
+def test_what_the_reference_cannot_add_to_is_said_before_it_plays(
+    tmp_path: Path, content: str | None, message: str
+) -> None:
+    file = tmp_path / 'report.json'
+    if content is None:
+        file.mkdir()
+    else:
+        file.write_text(content)
+    module = 'policy_node.training.evaluate_reference'
+    command = [sys.executable, '-O', '-m', module, '--policy', 'FetchReach', '--json', str(file)]
+    found = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert found.returncode == 2 and message in found.stderr
+    assert found.stderr.count('\n') == 1 and not found.stdout

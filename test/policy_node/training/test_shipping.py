@@ -1,0 +1,86 @@
+"""What is shipped, what is not, and that a folder of actors is never left half changed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.learning.run_log import RunLog
+from policy_node.training.learning.trainer import Trainer
+from policy_node.training.ship_actor import main
+
+torch.set_num_threads(1)
+
+SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
+SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'total_steps': 800, 'evaluate_every': 400}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = tmp_path / 'run'
+    folder.mkdir()
+    trainer = Trainer(recipe_config('FetchReach', 'best', **SMALL), folder, Workers())
+    log = RunLog(folder, 800, 0.0)
+    trainer.train(log)
+    log.close()
+    return folder
+
+
+def ship(run: Path, actors: Path, episodes: int) -> int:
+    options = ['--episodes', str(episodes), '--threads', '1', '--actors', str(actors)]
+    return main([str(run), *options])
+
+
+def test_what_was_done_is_said_and_a_few_episodes_replace_no_longer_evaluation(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One lucky episode has a success of 1, better than any actor of 2,000."""
+    actors = tmp_path / 'actors'
+    assert ship(run, actors, 4) == 0
+    said = f'ship_actor: {actors / "FetchReach.safetensors"} is the actor of {run} now\n'
+    assert capsys.readouterr().out.endswith(said)
+    before = {file.name: file.read_bytes() for file in actors.iterdir()}
+    assert ship(run, actors, 3) == 2
+    error = capsys.readouterr().err
+    assert 'evaluated on 4 episodes, this one would be on 3: give --episodes 4 or more' in error
+    assert ship(run, actors, 4) == 0
+    assert 'is this one; nothing changed' in capsys.readouterr().out
+    assert {file.name: file.read_bytes() for file in actors.iterdir()} == before
+
+
+@pytest.mark.parametrize('content', ['{', '[]', '{"episodes": 1}', '{"success_gymnasium": "x"}'])
+def test_an_evaluation_that_is_none_is_one_line(
+    run: Path, tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    actors = tmp_path / 'actors'
+    actors.mkdir()
+    (actors / 'FetchReach.json').write_text(content)
+    assert ship(run, actors, 2) == 2
+    error = capsys.readouterr().err
+    assert 'FetchReach.json is no evaluation of an actor' in error and error.count('\n') == 1
+    assert [file.name for file in actors.iterdir()] == ['FetchReach.json']
+
+
+@pytest.mark.parametrize('name', ['progress.csv', 'training_state.safetensors'])
+def test_a_damaged_run_changes_no_actor(
+    run: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    actors = tmp_path / 'actors'
+    (run / name).write_bytes(b'\xff\xfe,a\n1,2\n')
+    assert ship(run, actors, 2) == 2
+    error = capsys.readouterr().err
+    assert name in error and error.count('\n') == 1
+    assert not actors.exists()
+
+
+def test_json_and_actor_are_of_one_run(run: Path, tmp_path: Path) -> None:
+    """A curve without the success while exploring, as of a log from elsewhere, is drawn too."""
+    rows = (run / 'progress.csv').read_text().splitlines()
+    (run / 'progress.csv').write_text('env_steps,updates\n400,4\n')
+    assert len(rows) > 1 and ship(run, tmp_path / 'actors', 2) == 0
+    assert json.loads((tmp_path / 'actors' / 'FetchReach.json').read_text())['episodes'] == 2
