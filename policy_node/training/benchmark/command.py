@@ -30,7 +30,6 @@ from msgs_spec.command_line import (
     EXIT_SUCCESS,
     CommandParser,
     UsageError,
-    complain,
     given_command,
     require_extra,
     run_command,
@@ -39,15 +38,13 @@ from msgs_spec.command_line import (
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.jobs import ARMS, Job
+from policy_node.training.benchmark.reporting import report, require_readable, ship_all
 from policy_node.training.benchmark.research import FINAL_EPISODES, STUDIES, research_jobs
-from policy_node.training.benchmark.research_report import require_all_runs, write_study
-from policy_node.training.benchmark.results import write_report
+from policy_node.training.benchmark.research_report import require_all_runs
 from policy_node.training.benchmark.studies import best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
-from policy_node.training.evaluation.shipping import ship
 from policy_node.training.learning.config_rules import RECIPES
 from policy_node.training.learning.config_values import parse_assignment
-from policy_node.training.learning.run_folder import BEST_FILE
 
 _NAME = 'benchmark'
 ACTORS_TABLE = 'actors.md'
@@ -191,16 +188,24 @@ def _run(options: argparse.Namespace, command: str) -> int:
         jobs = jobs_from_arguments(options)
         if options.study in STUDIES:
             require_all_runs(jobs, _report_folder(options))
-        _output(options).mkdir(parents=True, exist_ok=True)
+        finished = [job for job in jobs if job.is_finished]
     except (ValueError, TypeError) as error:
         raise UsageError(str(error)) from None
-    except OSError as error:
-        raise UsageError(f'{_output(options)} cannot hold runs: {error.strerror}') from None
+    _make_folder(_output(options), 'runs')
+    _make_folder(_report_folder(options), 'a report')
+    require_readable(finished)
     try:
         whole = _run_where_asked(options, jobs, command)
     finally:
-        _report(options, jobs, command)
-    return EXIT_SUCCESS if whole else EXIT_FAILURE
+        shipped = _report(options, jobs, command)
+    return EXIT_SUCCESS if whole and shipped else EXIT_FAILURE
+
+
+def _make_folder(folder: Path, content: str) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f'{folder} cannot hold {content}: {error.strerror}') from None
 
 
 def _run_where_asked(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> bool:
@@ -219,31 +224,19 @@ def _run_where_asked(options: argparse.Namespace, jobs: Sequence[Job], command: 
 def _report_study(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> None:
     """Renews the pages of a study: a machine that is lost after this loses one run at most."""
     finished = [job for job in jobs if job.is_finished]
-    if finished:
-        write_study(STUDIES[options.study], finished, _report_folder(options), command)
+    report(finished, STUDIES.get(options.study), _report_folder(options), command)
 
 
-def _report(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> None:
-    """Draws, prints and ships what is finished, and says what is not."""
-    finished = [job for job in jobs if job.is_finished]
-    report = _report_folder(options)
-    if options.study in STUDIES:
-        _report_study(options, jobs, command)
-    elif finished:
-        write_report(finished, report, command)
+def _report(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> bool:
+    """Draws, prints and ships what is finished, says what is not; whether nothing failed."""
+    finished, whole = [job for job in jobs if job.is_finished], True
+    report(finished, STUDIES.get(options.study), _report_folder(options), command)
     if options.study == 'best':
         actors = options.actors or _output(options) / 'actors'
-        _ship(finished, actors, options.episodes or 2000)
-        if actors.is_dir():
-            (report / ACTORS_TABLE).write_text(actors_table(actors) + '\n')
+        whole = ship_all(finished, actors, options.episodes or 2000)
+        if whole and actors.is_dir():
+            table = _report_folder(options) / ACTORS_TABLE
+            table.write_text(actors_table(actors) + '\n')
     if len(finished) < len(jobs):
         print(f'{len(finished)} of {len(jobs)} jobs are finished; the same command goes on')
-
-
-def _ship(jobs: Sequence[Job], actors: Path, episodes: int) -> None:
-    """Evaluates best actors that were not evaluated before, and keeps the better ones."""
-    for job in jobs:
-        if not (job.folder / BEST_FILE).is_file():
-            complain(_NAME, f'{job.name} has no best actor: no evaluation was whole')
-            continue
-        ship(job.folder, actors, episodes=episodes)
+    return whole

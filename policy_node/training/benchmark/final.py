@@ -44,7 +44,11 @@ def measure_final(config: TrainConfig, folder: Path, episodes: int) -> None:
     write_file(folder / FINAL_FILE, (json.dumps(found, indent=2) + '\n').encode())
 
 
-def read_final(folder: Path) -> dict[str, Any]:
-    """What `measure_final` wrote."""
-    found: dict[str, Any] = json.loads((folder / FINAL_FILE).read_text())
-    return found
+def read_final(folder: Path) -> dict[str, Any] | None:
+    """What `measure_final` wrote; None if it has not, or if what is there is damaged."""
+    try:
+        found = json.loads((folder / FINAL_FILE).read_text())
+    except (OSError, ValueError):
+        return None
+    whole = isinstance(found, dict) and found.keys() >= {'success', 'episodes'}
+    return found if whole else None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from policy_node.training.benchmark.final import FINAL_FILE, read_final
+from policy_node.training.benchmark.final import read_final
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.config_values import config_from_dict
 from policy_node.training.learning.run_folder import STATE_FILE
@@ -91,8 +91,8 @@ class Job:
     def _is_measured(self) -> bool:
         if not self.final_episodes:
             return True
-        measured = (self.folder / FINAL_FILE).is_file()
-        return measured and read_final(self.folder)['episodes'] == self.final_episodes
+        found = read_final(self.folder)
+        return found is not None and found['episodes'] == self.final_episodes
 
     @property
     def is_trained(self) -> bool:

@@ -45,7 +45,7 @@ def measure_run(job: Job, curve: Curve) -> dict[str, Any]:
         job: A finished job.
         curve: Its evaluations, steps in units of 40 ms.
     """
-    final, last = read_final(job.folder), read_progress(job.folder / PROGRESS_FILE)[-1]
+    final, last = read_final(job.folder) or {}, read_progress(job.folder / PROGRESS_FILE)[-1]
     reached = curve.steps_to(GOOD_SUCCESS)
     total = round(job.config.total_steps / ticks_of_40_ms(job.config.control_hz))
     samples = last['updates'] * job.config.batch_size

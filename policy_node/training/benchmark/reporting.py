@@ -1,0 +1,84 @@
+"""Reports of jobs: all that is finished, or one line that says which job cannot be told of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from msgs_spec.command_line import CommandError, complain
+from policy_node.policies.checkpoint import read_info
+from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
+from policy_node.training.benchmark.measures import curve_of, measure_run
+from policy_node.training.benchmark.research import Study
+from policy_node.training.benchmark.research_report import write_study
+from policy_node.training.benchmark.results import read_curve, write_report
+from policy_node.training.evaluation.shipping import ship
+from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE
+
+
+def report(jobs: Sequence[Job], study: Study | None, output: Path, command: str) -> None:
+    """Writes what finished jobs gave; where none is finished, nothing.
+
+    Args:
+        jobs: Finished jobs.
+        study: The study of `docs/research`; None is the paper's comparison, or `best`.
+        output: Folder.
+        command: Command line, for the record.
+
+    Raises:
+        CommandError: If a job's files are damaged, since a report without it would lose what an
+            earlier one tells of it; or if the report cannot be written.
+    """
+    require_readable(jobs)
+    try:
+        if jobs and study is not None:
+            write_study(study, jobs, output, command)
+        elif jobs:
+            write_report(jobs, output, command)
+    except (OSError, ValueError) as error:
+        raise CommandError(f'no report in {output}: {error}') from None
+
+
+def require_readable(jobs: Sequence[Job]) -> None:
+    """Refuses finished jobs that no report can tell of.
+
+    Raises:
+        CommandError: If there is one; the line says why, and what to do.
+    """
+    for job in jobs:
+        why = _damage(job)
+        if why:
+            raise CommandError(f'{job.name}: {why}; without {job.folder} it is run again')
+
+
+def _damage(job: Job) -> str:
+    """Why a report could not tell of a finished job; empty if it can."""
+    try:
+        read_curve(job.folder / PROGRESS_FILE)
+        read_info(job.folder / LATEST_FILE)
+        if job.final_episodes:
+            measure_run(job, curve_of(job))
+    except KeyError as error:
+        return f'its files lack {error}'
+    except (OSError, ValueError) as error:
+        return str(error)
+    return ''
+
+
+def ship_all(jobs: Sequence[Job], actors: Path, episodes: int) -> bool:
+    """Evaluates best actors that were not evaluated before, and keeps the better ones.
+
+    Returns:
+        Whether none of them was in the way of that.
+    """
+    whole = True
+    for job in jobs:
+        if not (job.folder / BEST_FILE).is_file():
+            complain('benchmark', f'{job.name} has no best actor: no evaluation was whole')
+            continue
+        try:
+            ship(job.folder, actors, episodes=episodes)
+        except (OSError, ValueError) as error:
+            complain('benchmark', f'{job.name} is not shipped: {error}')
+            whole = False
+    return whole
