@@ -81,7 +81,14 @@ class RestingPolicy:
 
 
 def _action_shape(observation: Observation, action_size: int) -> tuple[int, ...]:
+    _require_mapping(observation, 'observation')
     return (*np.shape(observation['observation'])[:-1], action_size)
+
+
+def _require_mapping(observation: object, key: str) -> None:
+    if not isinstance(observation, Mapping):
+        given = type(observation).__name__
+        raise TypeError(f'an observation is a mapping with {key!r}, not of type {given}')
 
 
 def observation_part(observation: Observation, key: str, size: int) -> NDArray[np.float32]:
@@ -89,7 +96,9 @@ def observation_part(observation: Observation, key: str, size: int) -> NDArray[n
 
     Raises:
         ValueError: If it is missing or has the wrong length.
+        TypeError: If the observation is no mapping, as one that was flattened.
     """
+    _require_mapping(observation, key)
     if key not in observation:
         raise ValueError(f'observation has no {key!r}; given: {", ".join(observation)}')
     values = np.asarray(observation[key], dtype=np.float32)

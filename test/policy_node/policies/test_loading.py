@@ -153,3 +153,10 @@ def test_acting_needs_no_torch(name: str) -> None:
         f"load_policy({name!r}, 'FetchReach').policy.predict(ones)"
     )
     assert 'torch' not in _modules_after(code)
+
+
+@pytest.mark.parametrize('name', ['FetchReach', 'random'])
+def test_an_observation_that_was_flattened_is_said_to_be_no_mapping(name: str) -> None:
+    policy = load_policy(name, 'FetchReach').policy
+    with pytest.raises(TypeError, match=r"is a mapping with 'observation', not of type ndarray"):
+        policy.predict(np.zeros(16))  # type: ignore[arg-type]
