@@ -12,6 +12,7 @@ from types import FrameType
 
 from fetch_hand_sim.episodes.context import source_revision
 from msgs_spec.command_line import CommandError, UsageError, complain, require_extra
+from policy_node.policies.files import one_line
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.devices import choose_device
 from policy_node.training.learning.distributed import is_first_worker, join_workers, leave_workers
@@ -82,6 +83,8 @@ def train_run(
                 trainer.add_experience(experience)
         except ValueError as error:
             raise UsageError(str(error)) from None
+        except (MemoryError, RuntimeError) as error:
+            raise _without_memory(error) from None
         try:
             ending = _train(trainer, output, command)
         except (TrainingError, OSError) as error:
@@ -99,6 +102,14 @@ def _kept(output: Path) -> str:
     if (output / STATE_FILE).is_file():
         return f'the last checkpoint is kept in {output}'
     return f'{output} has no checkpoint to go on from'
+
+
+def _without_memory(error: MemoryError | RuntimeError) -> Exception:
+    """What to raise where a run is larger than the machine; torch has no class for that."""
+    if isinstance(error, RuntimeError) and 'allocate' not in str(error):
+        return error
+    fields = 'replay_transitions, num_envs and hidden_sizes decide how much is needed'
+    return UsageError(f'not enough memory; {fields}: {one_line(error)}')
 
 
 def _train(trainer: Trainer, output: Path, command: str) -> Ending:

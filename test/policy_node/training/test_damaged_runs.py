@@ -236,3 +236,22 @@ def test_a_full_disk_is_said_with_the_file_and_what_is_left(
     kept = f'the last checkpoint is kept in {run}'
     none = f'{run.parent / "new"} has no checkpoint to go on from'
     assert said.endswith(kept if resumed else none)
+
+
+@pytest.mark.parametrize(
+    'field', ['replay_transitions=10000000000000', 'hidden_sizes=9999999,9999999']
+)
+def test_a_run_larger_than_the_memory_is_one_line(
+    tmp_path: Path, field: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [
+        '--task',
+        'FetchReach',
+        '--set',
+        'simulation_threads=1',
+        '--set',
+        'torch_threads=1',
+    ]
+    assert main([*arguments, '--set', field, '--output', str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert 'not enough memory; replay_transitions, num_envs and' in error and error.count('\n') == 1

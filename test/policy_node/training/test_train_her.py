@@ -495,7 +495,7 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
             'algorithm ppo excludes --from-episodes',
         ),
         (['--task', 'FetchReach', '--strategy', 'past'], "strategy 'past'; allowed: "),
-        (['--resume', 'nowhere'], 'nowhere/training_state.safetensors is no file'),
+        (['--resume', 'nowhere'], 'nowhere is no folder of a run to go on with'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(
