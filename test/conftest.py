@@ -8,10 +8,14 @@ import socket
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import pytest
 
 from support.run_guard import DOMAIN_LOCK_PORT, start_guard
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 # Low domains are what people set by hand; above 101 the ports of DDS meet Linux' ephemeral ones.
 DOMAINS = range(40, 102)
@@ -92,6 +96,18 @@ def soak_seconds(pytestconfig: pytest.Config) -> float:
 def ros_environment() -> dict[str, str]:
     """A copy of the environment nodes are started with, for a test to add to."""
     return os.environ | {'PYTHONUNBUFFERED': '1'}
+
+
+@pytest.fixture
+def node() -> Iterator[Node]:
+    """A node of this process, in a context of rclpy that ends with the test."""
+    import rclpy
+
+    rclpy.init()
+    node = rclpy.create_node('tested')
+    yield node
+    node.destroy_node()
+    rclpy.shutdown()
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from msgs_spec.ros import (
     StopSignals,
     UsageError,
     await_acknowledgements,
+    count_publishers,
     declare_parameters,
     rclpy_profile,
     ros_message_class,
@@ -103,12 +104,12 @@ class ReplayNode(Node):
         if not self._settings['wait_for_commands']:
             return
         listeners = Listeners(self, self._publishers_by_topic.values())
-        commands = self.resolve_topic_name(f'{self._schedule.namespace}/commands')
+        commands = f'{self._schedule.namespace}/commands'
         own = int(commands in self._publishers_by_topic)
         had_commander = False
         while not stop and not (had_commander and listeners.are_connected()):
             executor.spin_once(timeout_sec=_SPIN)
-            has_commander = self.count_publishers(commands) > own
+            has_commander = count_publishers(self, commands) > own
             if has_commander and not had_commander:
                 listeners.expect_more()
             had_commander = has_commander

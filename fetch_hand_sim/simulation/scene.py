@@ -172,10 +172,8 @@ class Scene:
         """The object, for who draws neither it nor the model."""
         if self._object is None or frame.object_pose is None:
             return []
-        joint = self.model.joint(f'{self.spec.object_name}:joint')
-        (body,) = self.model.jnt_bodyid[[joint.id]]
-        first = int(self.model.body_geomadr[body])
-        count = int(self.model.body_geomnum[body])
+        body = self.model.body(self.spec.object_name)
+        first, count = int(body.geomadr[0]), int(body.geomnum[0])
         return [self._geom_marker(geom, frame.object_pose) for geom in range(first, first + count)]
 
     def _geom_marker(self, geom: int, pose: Array) -> Marker:

@@ -195,7 +195,8 @@ class RobotWatch:
         self._codecs = {name: TopicCodec(topic(spec, name)) for name in names}
         self._takes_latest = self._has_latest()
         if self._takes_latest:
-            self._subscriptions = [self.subscribe(LATEST_TICK, WATCHING, self._take_latest, True)]
+            latest = self.subscribe(LATEST_TICK, WATCHING, self._take_latest, raw=True)
+            self._subscriptions = [latest]
             return
         self._subscriptions = [
             self.subscribe(each.topic, _FOLLOWING, self._collector(each), raw=True)

@@ -69,10 +69,8 @@ def marker_array(shapes: Mapping[str, Sequence[Shape]], stamp_ns: int) -> Marker
     header = Header(stamp=stamp(stamp_ns), frame_id=ROOT)
     first = Marker(header=header, action=Marker.DELETEALL)
     markers = [first]
-    drawn = [(ns, shape) for ns, group in shapes.items() for shape in group]
+    drawn = [(ns, each) for ns, group in shapes.items() for each in group if each.shape in _SHAPES]
     for number, (ns, shape) in enumerate(drawn, start=1):
-        if shape.shape not in _SHAPES:
-            continue
         marker = Marker(header=header, ns=ns, id=number, type=_SHAPES[shape.shape])
         x, y, z = shape.position.tolist()
         marker.pose.position = Point(x=x, y=y, z=z)

@@ -33,7 +33,7 @@ _NAME = 'train_her'
 # Fields that say which recipe there is to start from.
 _OWN_OPTIONS = ('task', 'recipe')
 # What networks are made of: a run cannot go on with others.
-_OF_NETWORKS = 'hidden_sizes layer_norm goal_features algorithm critics norm advantage'.split()
+_FIXED_FIELDS = 'hidden_sizes layer_norm goal_features algorithm critics norm advantage'.split()
 # A process that a signal ended returns 128 + its number, as shells say it.
 EXIT_SIGNAL = 128
 
@@ -94,7 +94,7 @@ def _resumed_config(options: argparse.Namespace, overrides: dict[str, Any]) -> T
         if wrong:
             raise ValueError(f'{options.resume} is a run of {stored.get(name)}, not of {wrong[0]}')
     before, config = config_from_dict(stored), config_from_dict({**stored, **overrides})
-    for name in _OF_NETWORKS:
+    for name in _FIXED_FIELDS:
         old, new = getattr(before, name), getattr(config, name)
         if old != new:
             raise ValueError(

@@ -6,19 +6,9 @@ import sys
 import time
 
 import pytest
-import rclpy
 from std_msgs.msg import Float64
 
 from msgs_spec.ros import EventLoop
-
-
-@pytest.fixture
-def node():
-    rclpy.init()
-    node = rclpy.create_node('loop')
-    yield node
-    node.destroy_node()
-    rclpy.shutdown()
 
 
 def collect(node) -> tuple[list[float], object]:

@@ -210,7 +210,8 @@ def _make_folder(folder: Path, content: str) -> None:
 
 def _run_where_asked(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> bool:
     is_research = options.study in STUDIES
-    renew = partial(_report_study, options, jobs, command) if is_research else None
+    # Pages of a study after every run: a machine that is lost then loses one run at most.
+    renew = partial(_report_finished, options, jobs, command) if is_research else None
     if options.ray:
         return run_jobs(jobs, Ray(command), renew)
     cores = len(os.sched_getaffinity(0))
@@ -221,16 +222,16 @@ def _run_where_asked(options: argparse.Namespace, jobs: Sequence[Job], command: 
         return run_jobs(jobs, processes, renew)
 
 
-def _report_study(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> None:
-    """Renews the pages of a study: a machine that is lost after this loses one run at most."""
+def _report_finished(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> list[Job]:
+    """Reports on the jobs that are finished, and returns them."""
     finished = [job for job in jobs if job.is_finished]
     report(finished, STUDIES.get(options.study), _report_folder(options), command)
+    return finished
 
 
 def _report(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> bool:
     """Draws, prints and ships what is finished, says what is not; whether nothing failed."""
-    finished, whole = [job for job in jobs if job.is_finished], True
-    report(finished, STUDIES.get(options.study), _report_folder(options), command)
+    finished, whole = _report_finished(options, jobs, command), True
     if options.study == 'best':
         actors = options.actors or _output(options) / 'actors'
         whole = ship_all(finished, actors, options.episodes or 2000)

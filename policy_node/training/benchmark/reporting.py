@@ -7,11 +7,11 @@ from pathlib import Path
 
 from msgs_spec.command_line import CommandError, complain
 from policy_node.policies.checkpoint import read_info
-from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
+from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import curve_of, measure_run
 from policy_node.training.benchmark.research import Study
 from policy_node.training.benchmark.research_report import write_study
-from policy_node.training.benchmark.results import read_curve, write_report
+from policy_node.training.benchmark.results import write_report
 from policy_node.training.evaluation.shipping import ship
 from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE
 
@@ -54,10 +54,10 @@ def require_readable(jobs: Sequence[Job]) -> None:
 def _damage(job: Job) -> str:
     """Why a report could not tell of a finished job; empty if it can."""
     try:
-        read_curve(job.folder / PROGRESS_FILE)
+        curve = curve_of(job)
         read_info(job.folder / LATEST_FILE)
         if job.final_episodes:
-            measure_run(job, curve_of(job))
+            measure_run(job, curve)
     except KeyError as error:
         return f'its files lack {error}'
     except (OSError, ValueError) as error:

@@ -52,7 +52,7 @@ class Place(Protocol):
 
 
 def run_jobs(
-    jobs: Sequence[Job], place: Place, when_finished: Callable[[], None] | None = None
+    jobs: Sequence[Job], place: Place, when_finished: Callable[[], object] | None = None
 ) -> bool:
     """Runs what is not finished, each job after the one it starts from; whether all is now.
 

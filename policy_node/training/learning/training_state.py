@@ -143,8 +143,9 @@ def _described(path: Path, metadata: dict[str, str]) -> tuple[Counters, dict[str
         known = asdict(Counters())
         counters = Counters(**require_counters(json.loads(metadata['counters']), known))
         extra = dict(json.loads(metadata['extra']))
-        for name in ('config', 'init_from'):
-            if not isinstance(extra[name] if name == 'config' else extra.get(name, {}), dict):
+        objects = {'config': extra['config'], 'init_from': extra.get('init_from', {})}
+        for name, value in objects.items():
+            if not isinstance(value, dict):
                 raise TypeError(f'{name} is no object')
     except KeyError as error:
         raise ValueError(f'{path} lacks {error.args[0]!r} in its metadata') from None

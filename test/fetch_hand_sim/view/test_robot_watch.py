@@ -48,15 +48,6 @@ class Robot:
         return self._publishers[source.name]
 
 
-@pytest.fixture
-def node():
-    rclpy.init()
-    node = rclpy.create_node('watched')
-    yield node
-    node.destroy_node()
-    rclpy.shutdown()
-
-
 @pytest.mark.parametrize('every_tick', [True, False])
 def test_a_robot_that_comes_back_with_other_joint_names_is_followed(node, every_tick):
     simulation, seen = Simulation('FetchReach', num_threads=1), []
