@@ -146,6 +146,9 @@ class ConfigFields:
     """Critics learn values of states and advantages per 40 ms (DAU) instead of action values."""
     action_l2: float = 1.0
     """Weight of the mean squared action in the actor loss."""
+    temporal_smoothness: float = 0.0
+    """Weight in the actor loss of the mean squared change of its action from one tick to the next
+    (CAPS, arXiv 2012.06644)."""
     polyak: float = 0.95
     """Share of the old target network kept by a target update."""
     target_update_interval: int = 40
@@ -153,6 +156,9 @@ class ConfigFields:
     policy_delay: int = 1
     """Updates of the critic for each of the actor (TD3, arXiv 1802.09477): 2 takes three quarters
     of the time."""
+    target_noise: float = 0.0
+    """Standard deviation of noise, cut at 2.5 times it, on the actions that targets value (TD3):
+    actions close to each other are worth the same."""
     target: str = 'polyak'
     """Networks that targets are computed with: `polyak` (slow copies) or `none` (those that
     learn)."""

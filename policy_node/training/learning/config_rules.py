@@ -28,7 +28,7 @@ _ON_POLICY = {
             'noise_spread final_exploration random_steps moved_share ticks_after_drop '
             'first_distance first_rotation narrow_above goal_choice condition n_step discount '
             'advantage noise_seconds parameter_noise longest_hold subgoal_every subgoal_prior '
-            'critics norm target policy_delay'
+            'critics norm target policy_delay target_noise temporal_smoothness'
         ).split()
     },
 }
@@ -93,9 +93,11 @@ RANGES = (
     ('actor_average', 0, 1 - 1e-6),
     ('gamma', 0, 1 - 1e-6),
     ('action_l2', 0, _INFINITY),
+    ('temporal_smoothness', 0, _INFINITY),
     ('polyak', 0, 1),
     ('target_update_interval', 1, _INFINITY),
     ('policy_delay', 1, 1000),
+    ('target_noise', 0, 1),
     ('random_epsilon', 0, 1),
     ('noise_std', 0, _INFINITY),
     ('final_exploration', 0, 1),

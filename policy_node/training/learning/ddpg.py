@@ -26,6 +26,9 @@ from policy_node.training.learning.transitions import Transitions
 # Fields of `Transitions` that every batch has.
 _ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'discount')
 
+# TD3 clips noise of 0.2 at 0.5 (arXiv 1802.09477, appendix C).
+_NOISE_CUT = 2.5
+
 
 @dataclass(frozen=True, slots=True)
 class Known:
@@ -92,8 +95,17 @@ class DDPG(ActorCritic):
 
     def targets(self, reward: Tensor, discount: Tensor, next_features: Tensor) -> Tensor:
         """Targets (batch,) from reward, discount and the features of the next state."""
-        next_action = torch.tanh(self.target_actor(next_features))
+        next_action = self._target_action(next_features)
         return self._bootstrap(reward, discount, self.target_critic(next_features, next_action))
+
+    def _target_action(self, next_features: Tensor) -> Tensor:
+        """The slow actor's actions, with the noise that makes values smooth (TD3, equation 14)."""
+        action = torch.tanh(self.target_actor(next_features))
+        scale = self.config.target_noise
+        if scale == 0.0:
+            return action
+        noise = scale * torch.randn_like(action).clamp(-_NOISE_CUT, _NOISE_CUT)
+        return (action + noise).clamp(-1.0, 1.0)
 
     def _bootstrap(self, reward: Tensor, discount: Tensor, next_value: Tensor) -> Tensor:
         """Targets (batch,), clipped to the range of returns of rewards in [-1, 0].
@@ -158,7 +170,7 @@ class DDPG(ActorCritic):
         A batch normalisation would otherwise see next actions that its statistics do not know.
         """
         with torch.no_grad():
-            next_action = torch.tanh(self.target_actor(known.next_features))
+            next_action = self._target_action(known.next_features)
         self.critic.train()
         both = self.critic(
             torch.cat([known.features, known.next_features]),
@@ -201,10 +213,14 @@ class DDPG(ActorCritic):
 
     def _penalty(self, known: Known, action: Tensor) -> Tensor:
         """What the actor's actions cost beside their value."""
-        del known
         # How long an action holds costs nothing.
         moved = action[..., : self._action_size].float()
-        return self.config.action_l2 * moved.square().mean()
+        cost: Tensor = self.config.action_l2 * moved.square().mean()
+        if self.config.temporal_smoothness == 0.0:
+            return cost
+        then = self.actor(known.next_features)[..., : self._action_size].float()
+        change: Tensor = (then - moved).square().mean()
+        return cost + self.config.temporal_smoothness * change
 
     @torch.no_grad()
     def _move_targets(self) -> None:

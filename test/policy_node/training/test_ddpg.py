@@ -167,6 +167,35 @@ def test_action_l2_keeps_actions_small() -> None:
     assert sizes[1] < 0.1 < sizes[0]
 
 
+def test_temporal_smoothness_keeps_actions_of_neighbouring_states_alike() -> None:
+    changes = []
+    for weight in (0.0, 30.0):
+        learner = make_learner(temporal_smoothness=weight, action_l2=0.0, learning_rate=3e-3)
+        for seed in range(100):
+            learner.update(make_batch(seed=seed))
+        batch = make_batch(seed=1000)
+        now, then = (
+            learner.actor.predict({'observation': seen, 'desired_goal': batch.goal})[0]
+            for seen in (batch.observation, batch.next_observation)
+        )
+        changes.append(float(np.abs(now - then).mean()))
+    assert changes[1] < 0.3 * changes[0]
+
+
+def test_target_noise_is_cut_and_stays_within_the_actions() -> None:
+    torch.manual_seed(0)
+    learner = make_learner(target_noise=0.2)
+    features = learner._known(make_batch()).next_features
+    own = torch.tanh(learner.target_actor(features))
+    drawn = torch.stack([learner._target_action(features) for _ in range(400)])
+    assert drawn.abs().max() <= 1.0
+    assert (drawn - own).abs().max() <= 0.5 + 1e-6
+    inside = own.abs() < 0.4
+    spread = (drawn - own)[:, inside].std()
+    assert 0.18 < spread < 0.2
+    assert torch.equal(make_learner()._target_action(features), own)
+
+
 def test_under_bfloat16_the_output_layer_stays_float32() -> None:
     network = MLP(4, 1, SHAPE)
     with torch.no_grad():
