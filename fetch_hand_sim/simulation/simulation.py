@@ -14,6 +14,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from mujoco import mjtWarning
 from mujoco.batch import SimulationError
@@ -131,6 +132,7 @@ class Simulation:
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._all = np.arange(num_envs)
         self._is_pushed = False
+        self._is_started = np.zeros(num_envs, dtype=np.bool_)
 
     @property
     def task(self) -> Task:
@@ -158,6 +160,7 @@ class Simulation:
     def write_data(self, index: int, data: Any) -> None:
         """Lets simulation `index` go on from a `mujoco.MjData`, changed by whoever had it."""
         self._task.write_data(index, data)
+        self._is_started[index] = True
 
     def apply_model_changes(self) -> None:
         """Steps with `model` as it is now; the simulation keeps a copy of its own."""
@@ -200,6 +203,7 @@ class Simulation:
         Raises:
             ValueError: If the shape is wrong, or a value is not finite or out of range; nothing has
                 moved then.
+            gymnasium.error.ResetNeeded: If a simulation has never been reset.
         """
         checked = self._check_finite('actions', actions)
         if checked.size and (np.abs(checked) > 1.0).any():
@@ -218,6 +222,7 @@ class Simulation:
 
         Raises:
             ValueError: If the shape is wrong or a value is not finite.
+            gymnasium.error.ResetNeeded: If a simulation has never been reset.
         """
         return self._result(self.advance(commands))
 
@@ -314,6 +319,7 @@ class Simulation:
             'generators': self._generators,
             'divergences': self.divergences,
             'is_pushed': self._is_pushed,
+            'is_started': self._is_started.copy(),
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -331,6 +337,7 @@ class Simulation:
         self.divergences = state['divergences']
         # The push itself is part of the physics; copies made by 1.0 do not say that it ends.
         self._is_pushed = state.get('is_pushed', False)
+        self._is_started[:] = state.get('is_started', True)
 
     def observe_from(self, readings: Readings) -> Observation:
         """The observation of what `readings` returned."""
@@ -343,6 +350,9 @@ class Simulation:
         return pushes
 
     def _advance(self, commands: NDArray[np.floating]) -> NDArray[np.bool_]:
+        if not self._is_started.all():
+            waiting = np.flatnonzero(~self._is_started).tolist()
+            raise ResetNeeded(f'reset comes before the first step: simulations {waiting!s:.60}')
         self._task.apply_commands(commands)
         try:
             self._task.step()
@@ -387,6 +397,7 @@ class Simulation:
         """Begins episodes; what MuJoCo warned of before counts no more."""
         self.goals[ids] = self._task.reset(ids, [self._generator(i) for i in ids.tolist()])
         self._warnings = self._count_warnings()
+        self._is_started[ids] = True
 
     def _observation(self, observation: Array, achieved_goal: Array) -> Observation:
         return {

@@ -32,8 +32,9 @@ if TYPE_CHECKING:
 _NAME = 'train_her'
 # Fields that say which recipe there is to start from.
 _OWN_OPTIONS = ('task', 'recipe')
-# What networks are made of: a run cannot go on with others.
-_FIXED_FIELDS = 'hidden_sizes layer_norm goal_features algorithm critics norm advantage'.split()
+# What networks are made of, and what their values and the replay are of: they stay with a run.
+_NETWORK_FIELDS = 'hidden_sizes layer_norm goal_features algorithm critics norm advantage'.split()
+_EXPERIENCE_FIELDS = 'control_hz reward_type discount gamble'.split()
 # A process that a signal ended returns 128 + its number, as shells say it.
 EXIT_SIGNAL = 128
 
@@ -94,12 +95,11 @@ def _resumed_config(options: argparse.Namespace, overrides: dict[str, Any]) -> T
         if wrong:
             raise ValueError(f'{options.resume} is a run of {stored.get(name)}, not of {wrong[0]}')
     before, config = config_from_dict(stored), config_from_dict({**stored, **overrides})
-    for name in _FIXED_FIELDS:
+    kinds = {'networks': _NETWORK_FIELDS, 'experience': _EXPERIENCE_FIELDS}
+    for kind, name in ((kind, name) for kind in kinds for name in kinds[kind]):
         old, new = getattr(before, name), getattr(config, name)
         if old != new:
-            raise ValueError(
-                f'{options.resume} has networks of {name} {old}, which stay; not {new}'
-            )
+            raise ValueError(f'{options.resume} has {kind} of {name} {old}, which stay; not {new}')
     return config
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.actions import command_from_action
@@ -94,6 +96,18 @@ def test_without_a_seed_the_generators_go_on():
     again = [simulation.reset(seed=0)['desired_goal'], simulation.reset()['desired_goal']]
     assert not np.array_equal(goals[0], goals[1])
     assert np.array_equal(goals, again)
+
+
+def test_no_step_comes_before_the_first_reset():
+    simulation = Simulation('FetchReach', num_envs=3, num_threads=1)
+    simulation.reset(seed=0, ids=[0, 2])
+    with pytest.raises(ResetNeeded, match=r'before the first step: simulations \[1\]'):
+        simulation.step(np.zeros((3, 4)))
+    copied = copy.deepcopy(simulation)
+    with pytest.raises(ResetNeeded):
+        copied.step_commands(np.zeros((3, 4)))
+    copied.reset(seed=1, ids=[1])
+    copied.step(np.zeros((3, 4)))
 
 
 def test_returned_arrays_are_copies():

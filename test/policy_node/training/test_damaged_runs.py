@@ -201,9 +201,11 @@ def test_a_best_actor_that_is_lost_is_looked_for_anew(
         (['--hidden-sizes', '8,8'], 'has networks of hidden_sizes (16, 16), which stay; not (8, 8'),
         (['--critics', '2'], 'has networks of critics 1, which stay; not 2'),
         (['--goal-features', 'relative'], 'has networks of goal_features plain, which stay'),
+        (['--control-hz', '50'], 'has experience of control_hz 25.0, which stay; not 50.0'),
+        (['--reward-type', 'dense'], 'has experience of reward_type sparse, which stay; not dense'),
     ],
 )
-def test_networks_stay_as_they_are(
+def test_networks_and_what_they_learn_from_stay_as_they_are(
     run: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert message in refusal(run, capsys, *options)
