@@ -95,8 +95,9 @@ def _resumed_config(options: argparse.Namespace, overrides: dict[str, Any]) -> T
         if wrong:
             raise ValueError(f'{options.resume} is a run of {stored.get(name)}, not of {wrong[0]}')
     before, config = config_from_dict(stored), config_from_dict({**stored, **overrides})
-    kinds = {'networks': _NETWORK_FIELDS, 'experience': _EXPERIENCE_FIELDS}
-    for kind, name in ((kind, name) for kind in kinds for name in kinds[kind]):
+    fixed = {name: 'networks' for name in _NETWORK_FIELDS}
+    fixed |= {name: 'experience' for name in _EXPERIENCE_FIELDS}
+    for name, kind in fixed.items():
         old, new = getattr(before, name), getattr(config, name)
         if old != new:
             raise ValueError(f'{options.resume} has {kind} of {name} {old}, which stay; not {new}')

@@ -97,8 +97,8 @@ class ConfigFields:
     """Networks and normalisers to start from: a run folder, a shipped actor or the file of one;
     their mean where several are given with commas; empty starts from nothing."""
     critic_first: int = 0
-    """Updates of the critic alone before the actor learns too; 0 is 5,000 where `init_from` is an
-    actor without its critic, else none."""
+    """Updates of the critics alone before the actor learns too; 0 is 5,000 where `init_from` is an
+    actor without its critic, or with fewer than `critics`, else none."""
     total_steps: int = 5_000_000
     """Environment steps of the run."""
     time_limit: float = 0.0

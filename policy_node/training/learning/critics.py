@@ -14,6 +14,8 @@ from policy_node.training.learning.config import TrainConfig
 
 # Share of the running statistics that one batch replaces (CrossQ, arXiv 1902.05605: 0.01).
 _MOMENTUM = 0.01
+# Where an `Ensemble` has its critics.
+_MEMBERS = 'members.'
 
 Aggregate = Callable[[Tensor], Tensor]
 
@@ -67,6 +69,39 @@ class Ensemble(nn.Module):
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """Returns values (critics, batch), float32."""
         return torch.stack([member(features, action) for member in self.members])
+
+    def completed(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """These, and its own tensors for the members of which they have nothing."""
+        given = {_member_of(name) for name in tensors}
+        own = self.state_dict().items()
+        return {name: value for name, value in own if _member_of(name) not in given} | tensors
+
+
+def critic_tensors(tensors: dict[str, Tensor], critics: int) -> dict[str, Tensor]:
+    """Tensors of one critic or of several, by the names they have in another number of critics.
+
+    Args:
+        tensors: As `Critic` or `Ensemble` has them.
+        critics: How many there are to be; members beyond it are left out.
+    """
+    if not any(name.startswith(_MEMBERS) for name in tensors):
+        tensors = {f'{_MEMBERS}0.{name}': value for name, value in tensors.items()}
+    if critics == 1:
+        first = f'{_MEMBERS}0.'
+        return {n.removeprefix(first): v for n, v in tensors.items() if n.startswith(first)}
+    return {name: value for name, value in tensors.items() if _member_of(name) < critics}
+
+
+def count_critics(tensors: dict[str, Tensor]) -> int:
+    """How many critics these are tensors of."""
+    if not any(name.startswith(_MEMBERS) for name in tensors):
+        return 1 if tensors else 0
+    return len({_member_of(name) for name in tensors})
+
+
+def _member_of(name: str) -> int:
+    """The number of the critic that a tensor of an `Ensemble` is of."""
+    return int(name.removeprefix(_MEMBERS).split('.')[0])
 
 
 class AdvantageCritic(nn.Module):

@@ -14,6 +14,7 @@ from policy_node.policies import checkpoint
 from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.shipped import actor_path
+from policy_node.training.learning.actor_critic import ActorCritic
 from policy_node.training.learning.conditions import (
     ACTING_INPUT,
     first_weights,
@@ -23,13 +24,17 @@ from policy_node.training.learning.conditions import (
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.config_rules import unusual_networks
 from policy_node.training.learning.config_values import config_from_dict
+from policy_node.training.learning.critics import Ensemble, count_critics, critic_tensors
 from policy_node.training.learning.origins import steps_behind
 from policy_node.training.learning.run_folder import STATE_FILE, companion_file
 from policy_node.training.learning.training_state import part_of, read_state
 
-# Updates of the critic alone where it starts from nothing beside an actor that is already good:
+# Updates of the critics alone where one starts from nothing beside an actor that is already good:
 # the gradient of a critic that knows nothing would ruin it.
 CRITIC_FIRST = 5_000
+# Parts of a training state that are critics.
+_CRITICS = ('critic', 'target_critic')
+_PREFIXES = tuple(f'{part}.' for part in _CRITICS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +103,33 @@ class InitialNetworks:
         if config.condition != 'none':
             tensors = with_input(fitted.tensors, shape.feature_size)
             fitted = replace(fitted, tensors=tensors)
-        return fitted
+        return fitted.with_critics(config.critics)
+
+    @property
+    def critics(self) -> int:
+        """How many critics there are."""
+        return count_critics(part_of(self.tensors, 'critic'))
+
+    def with_critics(self, critics: int) -> InitialNetworks:
+        """The same with their critics named as so many are; there may be fewer of them."""
+        if critics == 1 == self.critics:
+            return self
+        tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
+        for part in _CRITICS:
+            named = critic_tensors(part_of(self.tensors, part), critics)
+            tensors |= {f'{part}.{name}': value for name, value in named.items()}
+        known = {'critics': min(critics, self.critics)}
+        return replace(self, tensors=tensors, origin=self.origin | known)
+
+    def completed(self, learner: ActorCritic) -> dict[str, Tensor]:
+        """The tensors, and the learner's own for critics of which there are none."""
+        tensors = dict(self.tensors)
+        for part, module in learner.modules().items():
+            given = part_of(tensors, part)
+            if given and isinstance(module, Ensemble):
+                completed = module.completed(given)
+                tensors |= {f'{part}.{name}': value for name, value in completed.items()}
+        return tensors
 
 
 def network_shape(config: TrainConfig) -> NetworkShape:
@@ -155,6 +186,8 @@ def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
                 f'no mean of {first.origin["name"]} and {part.origin["name"]}: they are '
                 f'{_described(first)} and {_described(part)}'
             )
+    most = max(1, *(part.critics for part in parts))
+    first, *_ = parts = [part.with_critics(most) for part in parts]
     shared = set.intersection(*(set(part.tensors) for part in parts))
     tensors = {
         name: torch.stack([part.tensors[name] for part in parts]).mean(dim=0)

@@ -86,7 +86,8 @@ class Trainer:
         self._build_simulations()
         self._build_learner()
         if init_from is not None:
-            load_networks(init_from.tensors, self.learner, self.experience.statistics)
+            tensors = init_from.completed(self.learner)
+            load_networks(tensors, self.learner, self.experience.statistics)
             self._let_critic_learn_first()
         self.counters = Counters()
         self._stop_reason = ''
@@ -153,8 +154,10 @@ class Trainer:
             complain(NAME, f'{self._refill:,} steps fill the replay before learning goes on')
 
     def _let_critic_learn_first(self) -> None:
-        """Holds an actor back that began without its critic."""
-        if not self._saver.folder.init_from.get('critic', True) and self.config.critic_first == 0:
+        """Holds an actor back that began without all its critics."""
+        origin, critics = self._saver.folder.init_from, self.config.critics
+        known = origin.get('critics', critics if origin.get('critic', True) else 0)
+        if known < critics and self.config.critic_first == 0:
             self.learner.critic_first = CRITIC_FIRST
 
     def add_experience(self, episodes: Episodes) -> None:

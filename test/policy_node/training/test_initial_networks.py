@@ -14,11 +14,12 @@ from policy_node.policies.loading import load_actor
 from policy_node.policies.shipped import shipped_actors
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.initial_networks import read_initial_networks
+from policy_node.training.learning.initial_networks import CRITIC_FIRST, read_initial_networks
 from policy_node.training.learning.origins import steps_behind
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.trainer import Trainer
+from policy_node.training.learning.training_state import part_of
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
 
@@ -189,6 +190,37 @@ def test_a_condition_is_new_to_networks_and_folded_when_others_start_from_them(
     after = read_initial_networks(str(tmp_path))
     follower = Trainer(tiny('HandManipulateBlockFull'), tmp_path, Workers(), init_from=after)
     torch.testing.assert_close(said(follower), said(run, acting))
+
+
+def test_a_second_critic_starts_from_nothing_and_both_go_on_or_one(
+    tmp_path: Path, block_run: Path
+) -> None:
+    task, runs = 'HandManipulateBlockRotateXYZ', [tmp_path / 'two', tmp_path / 'mean']
+    twins = ['--set=critics=2', '--set=aggregate=min', *SET]
+    arguments = ['--task', task, '--steps', '200', *twins, '--init-from', str(block_run)]
+    one = read_initial_networks(str(block_run))
+    config = tiny(task, critics=2, aggregate='min')
+    networks = one.fitted(config)
+    assert (one.critics, networks.critics) == (1, 1)
+    started = Trainer(config, tmp_path, Workers(), init_from=networks)
+    assert started.learner.critic_first == CRITIC_FIRST
+    first, second = started.learner.critic.members
+    assert same(first.state_dict(), part_of(one.tensors, 'critic'))
+    for part in (first, started.learner.target_critic.members[0]):
+        assert not same(part.state_dict(), second.state_dict())
+    assert same(started.learner.target_critic.members[1].state_dict(), second.state_dict())
+    assert main([*arguments, '--output', str(runs[0])]) == 0
+    two = read_initial_networks(str(runs[0]))
+    assert two.critics == 2
+    again = Trainer(config, tmp_path, Workers(), init_from=two.fitted(config)).learner
+    assert again.critic_first == 0
+    assert same(again.critic.state_dict(), part_of(two.tensors, 'critic'))
+    alone = Trainer(tiny(task), tmp_path, Workers(), init_from=two.fitted(tiny(task))).learner
+    assert same(alone.critic.state_dict(), part_of(two.tensors, 'critic.members.0'))
+    # A mean with one that has a single critic has that one.
+    arguments[-1] = f'{block_run},{runs[0]}'
+    assert main([*arguments, '--output', str(runs[1])]) == 0
+    assert read_initial_networks(arguments[-1]).critics == 1
 
 
 def test_where_it_started_is_kept_through_resume_and_shipped(

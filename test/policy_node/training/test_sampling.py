@@ -176,10 +176,6 @@ def test_an_actor_at_one_condition_is_an_actor_like_any_other() -> None:
         ({'condition': 'threshold', 'reward_type': 'dense'}, 'needs reward_type sparse'),
         ({'condition': 'horizon', 'importance': 'density'}, 'excludes goal_choice and importance'),
         ({'importance': 'density', 'strategy': 'none'}, 'needs goals chosen in hindsight'),
-        (
-            {'init_from': 'FetchReach', 'critics': 2},
-            'init_from excludes critics 2',
-        ),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(
