@@ -12,6 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_spec.rotations import quaternion_conjugate, quaternion_multiply
+from msgs_spec.tasks import GoalKind
 from policy_node.training.learning.replay import Array
 from policy_node.training.learning.subgoals import subgoals_of
 from policy_node.training.learning.transitions import Starts
@@ -21,8 +23,9 @@ SuccessFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[n
 
 # Where the goal of a transition comes from: the episode's own; a later achieved goal of the
 # episode; its last; any of it; any achieved goal of the replay; a desired goal of any episode; what
-# this very step achieved; what one of the next ten achieved.
-SOURCES = ('real', 'future', 'final', 'episode', 'random', 'actual', 'next', 'near')
+# this very step achieved; what one of the next ten achieved; what the state before it achieved,
+# displaced.
+SOURCES = ('real', 'future', 'final', 'episode', 'random', 'actual', 'next', 'near', 'displaced')
 _NEAR_TICKS = 10
 # One more, where there is a high level: what it had the actor pursue.
 _SUBGOAL = 'subgoal'
@@ -112,6 +115,8 @@ def _goals(starts: Starts, source: str, generator: np.random.Generator) -> Array
         return episodes.desired_goal.take(generator.integers(len(episodes), size=count), axis=0)
     if source == _SUBGOAL:
         return subgoals_of(starts)
+    if source == 'displaced':
+        return _displaced(starts, generator)
     if source == 'random':
         starts = replace(starts, row=generator.integers(len(episodes), size=count))
     tick, last = starts.tick, starts.last
@@ -127,6 +132,27 @@ def _goals(starts: Starts, source: str, generator: np.random.Generator) -> Array
         state = generator.integers(1, last + 1)
     achieved = flat(episodes.achieved_goal)
     return achieved.take(starts.row * (episodes.ticks + 1) + state, axis=0)
+
+
+def _displaced(starts: Starts, generator: np.random.Generator) -> Array:
+    """Goals near the achieved ones, which know nothing of where the transitions lead.
+
+    A goal that is chosen because a step led there tells the critic that such steps lead there;
+    where contacts decide, that is half luck. Here the state's achieved goal moves as far as any
+    other did within ten ticks of its episode.
+    """
+    episodes, count = starts.episodes, len(starts.row)
+    row = generator.integers(len(episodes), size=count)
+    span = generator.integers(1, min(_NEAR_TICKS, episodes.ticks) + 1, size=count)
+    tick = generator.integers(episodes.ticks + 1 - span)
+    achieved = episodes.achieved_goal
+    here = achieved[starts.row, starts.tick]
+    before, after = achieved[row, tick], achieved[row, tick + span]
+    moved: Array = here + (after - before)
+    if moved.shape[-1] == GoalKind.POSE.size:
+        turn = quaternion_multiply(after[:, 3:], quaternion_conjugate(before[:, 3:]))
+        moved[:, 3:] = quaternion_multiply(turn, here[:, 3:])
+    return moved
 
 
 def flat(values: Array) -> Array:

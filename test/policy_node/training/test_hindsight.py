@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
 import pytest
 
+from msgs_spec.rotations import quaternion_from_axis_angle
 from policy_node.training.learning.hindsight import (
     draw_sources,
     goal_mixture,
@@ -119,6 +121,44 @@ def test_futureactual_mixes_future_with_desired_goals_of_any_episode(episodes: E
     assert (goal[~is_desired, 1] > tick[~is_desired]).all()
     own = (goal[is_desired, 0] == 100 + row[is_desired]).mean()
     assert own == pytest.approx(1 / 3 + 2 / 3 / COUNT, abs=0.02)
+
+
+def test_displaced_goals_are_near_the_state_and_know_nothing_of_the_step(
+    episodes: Episodes,
+) -> None:
+    generator = np.random.default_rng(2)
+    row, tick = (generator.integers(limit, size=5_000) for limit in (COUNT, TICKS))
+    goal = relabelled(episodes, row, tick, {'displaced': 1.0}, generator)
+    # Each episode here moves by one a tick.
+    moved = goal - np.stack([row, tick], axis=1)
+    assert set(map(tuple, moved.tolist())) == {(0.0, float(span)) for span in range(1, 11)}
+    # The same draws where all these steps lead elsewhere: only what is drawn there differs.
+    changed = episodes.achieved_goal.copy()
+    changed[0, 5:] += 50.0
+    row, tick, drawn = np.zeros(2_000, np.int64), np.full(2_000, 4), []
+    for part in (episodes, dataclasses.replace(episodes, achieved_goal=changed)):
+        seeded = np.random.default_rng(4)
+        drawn.append(relabelled(part, row, tick, {'displaced': 1.0}, seeded))
+    assert (drawn[0] == drawn[1]).all(axis=1).mean() > 1 - 1 / COUNT
+
+
+def test_displaced_poses_are_turned_as_another_episode_turned() -> None:
+    angle = np.linspace(0.0, 1.0, TICKS + 1)
+    axes = np.eye(3)[:COUNT]
+    poses = np.zeros((3, TICKS + 1, 7))
+    poses[:, :, 3:] = quaternion_from_axis_angle(
+        np.broadcast_to(axes[:, None], (3, TICKS + 1, 3)), np.broadcast_to(angle, (3, TICKS + 1))
+    )
+    still = np.zeros((3, TICKS, 20))
+    episodes = Episodes(poses, poses, poses[:, -1], still)
+    generator = np.random.default_rng(3)
+    row, tick = (generator.integers(limit, size=500) for limit in (3, TICKS))
+    goal = relabelled(episodes, row, tick, {'displaced': 1.0}, generator)
+    np.testing.assert_allclose(np.linalg.norm(goal[:, 3:], axis=1), 1.0, rtol=1e-6)
+    turned = 2.0 * np.arccos((goal[:, 3:] * poses[row, tick, 3:]).sum(axis=1).clip(-1.0, 1.0))
+    steps = turned / (angle[1] - angle[0])
+    np.testing.assert_allclose(steps, steps.round(), atol=1e-4)
+    assert set(steps.round().astype(int).tolist()) == set(range(1, TICKS + 1))
 
 
 @pytest.mark.parametrize(
