@@ -17,7 +17,7 @@ RECIPES = ('paper', 'best')
 # Tasks that ignore their gripper action.
 GAMBLE_TASKS = ('FetchReach', 'FetchPush')
 _DEFAULTS = {field.name: field.default for field in dataclasses.fields(ConfigFields)}
-_OF_NETWORKS = 'algorithm norm longest_hold advantage subgoal_every'.split()
+_OF_NETWORKS = 'algorithm longest_hold advantage subgoal_every'.split()
 """Fields that decide what kind of networks there are; most runs have their defaults."""
 _ON_POLICY = {
     'overlap': False,

@@ -45,12 +45,14 @@ class InitialNetworks:
         tensors: Named as in a training state; without optimisers, counters and generators.
         shape: What they fit.
         goal_features: Their kind of inputs.
+        norm: What normalises hidden layers of the critic alone.
         origin: Where they come from, for the record: name, task, environment steps and command.
     """
 
     tensors: dict[str, Tensor]
     shape: NetworkShape
     goal_features: str
+    norm: str
     origin: dict[str, Any]
 
     @property
@@ -82,6 +84,8 @@ class InitialNetworks:
     def fitted(self, config: TrainConfig) -> InitialNetworks:
         """These networks for another run, in which other inputs may begin to count.
 
+        A critic whose hidden layers are normalised otherwise is left behind.
+
         Where the position of an object did not count, the goal's position was always about the
         object's own: networks have learnt nothing from it, and what they do elsewhere is chance (an
         actor that dropped 1 block in 200 dropped half of them). So they start blind to it: its
@@ -103,7 +107,14 @@ class InitialNetworks:
         if config.condition != 'none':
             tensors = with_input(fitted.tensors, shape.feature_size)
             fitted = replace(fitted, tensors=tensors)
+        if config.norm != self.norm:
+            return fitted._without_critic()
         return fitted.with_critics(config.critics)
+
+    def _without_critic(self) -> InitialNetworks:
+        """The actor and its normalisers alone."""
+        tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
+        return replace(self, tensors=tensors, origin=self.origin | {'critic': False})
 
     @property
     def critics(self) -> int:
@@ -186,6 +197,8 @@ def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
                 f'no mean of {first.origin["name"]} and {part.origin["name"]}: they are '
                 f'{_described(first)} and {_described(part)}'
             )
+    if any(part.norm != first.norm for part in parts):
+        parts = [part._without_critic() for part in parts]
     most = max(1, *(part.critics for part in parts))
     first, *_ = parts = [part.with_critics(most) for part in parts]
     shared = set.intersection(*(set(part.tensors) for part in parts))
@@ -249,7 +262,8 @@ def _of_run(folder: Path) -> InitialNetworks:
         'command': state.extra.get('command', ''),
         'init_from': state.extra.get('init_from', {}),
     }
-    return InitialNetworks(tensors, network_shape(config), config.goal_features, origin)
+    shape = network_shape(config)
+    return InitialNetworks(tensors, shape, config.goal_features, config.norm, origin)
 
 
 def _require_usual(config: TrainConfig, name: str) -> None:
@@ -270,12 +284,14 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
     beside = (companion_file(path), path.parent / STATE_FILE)
     source = next((file for file in beside if file.is_file()), None)
     digest = checkpoint.checkpoint_hash(path)
+    norm = 'none'
     if source is not None:
         state = read_state(source)
         if state.extra.get('actor_sha256', digest) != digest:
             raise ValueError(f'{source} is the critic of another actor than {path}')
         config = config_from_dict(state.extra['config'])
         _require_usual(config, str(source))
+        norm = config.norm
         critic = _unconditioned(part_of(state.tensors, 'critic'), config)
         tensors |= {f'critic.{key}': value for key, value in critic.items()}
     origin = {
@@ -287,7 +303,7 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         'sha256': digest,
         'init_from': info.init_from,
     }
-    return InitialNetworks(tensors, info.shape, info.goal_features, origin)
+    return InitialNetworks(tensors, info.shape, info.goal_features, norm, origin)
 
 
 def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str, Tensor]:

@@ -223,6 +223,21 @@ def test_a_second_critic_starts_from_nothing_and_both_go_on_or_one(
     assert read_initial_networks(arguments[-1]).critics == 1
 
 
+def test_a_critic_with_another_norm_starts_from_nothing(tmp_path: Path, block_run: Path) -> None:
+    task, run = 'HandManipulateBlockRotateXYZ', tmp_path / 'run'
+    config = tiny(task, norm='layer')
+    networks = read_initial_networks(str(block_run)).fitted(config)
+    assert not networks.has_critic
+    started = Trainer(config, tmp_path, Workers(), init_from=networks).learner
+    assert started.critic_first == CRITIC_FIRST
+    assert same(started.actor.state_dict(), part_of(networks.tensors, 'actor'))
+    arguments = ['--task', task, '--steps', '200', *SET, '--set=norm=layer']
+    assert main([*arguments, '--init-from', str(block_run), '--output', str(run)]) == 0
+    on = read_initial_networks(str(run))
+    assert on.fitted(config).has_critic and not on.fitted(tiny(task)).has_critic
+    assert not read_initial_networks(f'{block_run},{run}').has_critic
+
+
 def test_where_it_started_is_kept_through_resume_and_shipped(
     tmp_path: Path, block_run: Path
 ) -> None:

@@ -1,0 +1,68 @@
+"""`critic_bias`: what the critic of a run promises, beside what its actor gets.
+
+    python -m policy_node.training.critic_bias runs/block
+
+A critic that promises more than there is cannot tell the actor what is better. Two things make it
+do so: actors seek the actions that it errs on, and goals chosen in hindsight count every landing
+as meant (docs/training.md).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from msgs_spec.command_line import (
+    EXIT_SUCCESS,
+    CommandParser,
+    UsageError,
+    require_extra,
+    run_command,
+    say,
+    whole_number,
+)
+
+_NAME = 'critic_bias'
+
+
+def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Parses the command line."""
+    parser = CommandParser(prog=_NAME, description=(__doc__ or '').splitlines()[0])
+    parser.add_argument('run', type=Path, help='folder of a run')
+    episodes = whole_number(2, 100_000)
+    parser.add_argument('--episodes', type=episodes, default=128, help='default: 128')
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit status."""
+    options = parse_arguments(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    require_extra('train')
+    from rich.console import Console
+    from rich.table import Table
+
+    from policy_node.training.evaluation.promises import measure
+
+    try:
+        promises = measure(options.run, options.episodes)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    say(f'{options.run}: {options.episodes} fresh episodes, without noise')
+    table = Table()
+    for name in ('tick', 'value promised', 'return got', 'too much', 'correlation'):
+        table.add_column(name, justify='right')
+    for each in promises:
+        numbers = (each.value, each.gain, each.value - each.gain, each.correlation)
+        table.add_row(str(each.tick), *(f'{number:.2f}' for number in numbers))
+    Console().print(table)
+    return EXIT_SUCCESS
+
+
+if __name__ == '__main__':
+    sys.exit(main())

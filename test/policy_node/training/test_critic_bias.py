@@ -1,0 +1,71 @@
+"""What a critic promises beside what its actor gets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from policy_node.training.critic_bias import main
+from policy_node.training.evaluation.promises import discounted, measure
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.learning.trainer import Trainer
+
+TINY = {'num_envs': 2, 'evaluation_episodes': 2, 'simulation_threads': 1, 'torch_threads': 1}
+
+
+def saved_run(folder: Path, value: float, **changes: object) -> Path:
+    """A run of FetchReach whose critic says one value of everything."""
+    trainer = Trainer(recipe_config('FetchReach', 'best', **TINY, **changes), folder, Workers())
+    critic = trainer.learner.critic
+    with torch.no_grad():
+        for name, parameter in critic.named_parameters():
+            if 'output' in name:
+                parameter.fill_(value if name.endswith('bias') else 0.0)
+    trainer.save()
+    return folder
+
+
+def test_returns_go_on_as_the_last_ticks_were() -> None:
+    rewards = np.full((30, 2), -1.0)
+    rewards[20:, 1] = 0.0
+    returns = discounted(rewards, 0.9)
+    np.testing.assert_allclose(returns[:, 0], -10.0)
+    # Half of the last twenty ticks were met.
+    following = -5.0
+    np.testing.assert_allclose(returns[29, 1], 0.9 * following)
+    np.testing.assert_allclose(returns[19, 1], -1.0 + 0.9**11 * following)
+
+
+def test_a_critic_that_promises_too_much_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An actor that has learnt nothing fails all the time: its actions are worth -1/(1 - gamma)."""
+    run = saved_run(tmp_path, value=-3.0)
+    promises = measure(run, episodes=4)
+    assert [promise.tick for promise in promises] == [0, 12, 25]
+    assert all(promise.value == pytest.approx(-3.0) for promise in promises)
+    gains = [promise.gain for promise in promises]
+    assert gains == pytest.approx([-50.0] * 3, abs=2.0)
+    assert np.isnan(promises[0].correlation)
+    assert main([str(run), '--episodes', '4']) == 0
+    assert 'value promised' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [({'condition': 'threshold'}, 'condition threshold'), (None, 'is no file')],
+)
+def test_what_has_no_such_values_is_refused(
+    tmp_path: Path,
+    changes: dict[str, object] | None,
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if changes is not None:
+        saved_run(tmp_path, value=0.0, **changes)
+    assert main([str(tmp_path)]) == 2
+    assert message in capsys.readouterr().err
