@@ -28,6 +28,7 @@ from policy_node.training.learning.critics import Ensemble, count_critics, criti
 from policy_node.training.learning.origins import steps_behind
 from policy_node.training.learning.run_folder import STATE_FILE, companion_file
 from policy_node.training.learning.training_state import part_of, read_state
+from policy_node.training.learning.widening import can_widen, widened
 
 # Updates of the critics alone where one starts from nothing beside an actor that is already good:
 # the gradient of a critic that knows nothing would ruin it.
@@ -76,6 +77,8 @@ class InitialNetworks:
             'goal_features': (self.goal_features, config.goal_features),
             'inputs': (theirs.feature_size, ours.feature_size),
         }
+        if can_widen(theirs.hidden_sizes, ours.hidden_sizes):
+            del pairs['hidden_sizes']
         differing = [f'{name} {old}, now {new}' for name, (old, new) in pairs.items() if old != new]
         if differing:
             origin = f'{self.origin["name"]} ({self.origin["task"]})'
@@ -84,7 +87,8 @@ class InitialNetworks:
     def fitted(self, config: TrainConfig) -> InitialNetworks:
         """These networks for another run, in which other inputs may begin to count.
 
-        A critic whose hidden layers are normalised otherwise is left behind.
+        A critic whose hidden layers are normalised otherwise is left behind. Hidden layers may
+        become wider.
 
         Where the position of an object did not count, the goal's position was always about the
         object's own: networks have learnt nothing from it, and what they do elsewhere is chance (an
@@ -108,8 +112,14 @@ class InitialNetworks:
             tensors = with_input(fitted.tensors, shape.feature_size)
             fitted = replace(fitted, tensors=tensors)
         if config.norm != self.norm:
-            return fitted._without_critic()
-        return fitted.with_critics(config.critics)
+            fitted = fitted._without_critic()
+        else:
+            fitted = fitted.with_critics(config.critics)
+        if config.hidden_sizes == shape.hidden_sizes:
+            return fitted
+        wider = replace(shape, hidden_sizes=config.hidden_sizes)
+        tensors = widened(fitted.tensors, config.hidden_sizes)
+        return replace(fitted, tensors=tensors, shape=wider)
 
     def _without_critic(self) -> InitialNetworks:
         """The actor and its normalisers alone."""

@@ -238,6 +238,22 @@ def test_a_critic_with_another_norm_starts_from_nothing(tmp_path: Path, block_ru
     assert not read_initial_networks(f'{block_run},{run}').has_critic
 
 
+def test_a_run_may_have_wider_networks_than_it_starts_from(tmp_path: Path, block_run: Path) -> None:
+    task, run = 'HandManipulateBlockRotateXYZ', tmp_path / 'run'
+    config = tiny(task, hidden_sizes=(64, 96), critics=2)
+    one = Trainer(tiny(task), tmp_path, Workers(), init_from=read_initial_networks(str(block_run)))
+    networks = read_initial_networks(str(block_run)).fitted(config)
+    wide = Trainer(config, tmp_path, Workers(), init_from=networks)
+    features, action = torch.randn(8, networks.shape.feature_size), torch.rand(8, 20)
+    torch.testing.assert_close(wide.learner.actor(features), one.learner.actor(features))
+    first = wide.learner.critic(features, action)[0]
+    torch.testing.assert_close(first, one.learner.critic(features, action))
+    arguments = ['--task', task, '--steps', '200', *SET, '--set=hidden_sizes=64,96']
+    assert main([*arguments, '--init-from', str(block_run), '--output', str(run)]) == 0
+    with pytest.raises(ValueError, match=r'hidden_sizes \(64, 96\), now \(32, 32\)'):
+        read_initial_networks(str(run)).fitted(tiny(task))
+
+
 def test_where_it_started_is_kept_through_resume_and_shipped(
     tmp_path: Path, block_run: Path
 ) -> None:

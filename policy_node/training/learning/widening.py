@@ -1,0 +1,82 @@
+"""Networks made wider without changing what they say.
+
+Every hidden unit is there several times, and what follows takes from each a part of what it took
+from the one (Net2Net, Chen et al. 2016, arXiv 1511.05641). The parts differ, so that copies learn
+different things. Each unit has as many copies, which leaves a LayerNorm as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+# Smallest share of a unit that one of two copies is given.
+_LEAST_SHARE = 0.3
+_HIDDEN, _OUTPUT = 'hidden.', 'output.weight'
+
+
+def can_widen(before: Sequence[int], after: Sequence[int]) -> bool:
+    """Whether layers of these widths can become those: as many, each a multiple."""
+    if len(before) != len(after):
+        return False
+    return all(new % old == 0 for old, new in zip(before, after, strict=True))
+
+
+def widened(tensors: dict[str, Tensor], after: Sequence[int]) -> dict[str, Tensor]:
+    """Networks, by name, with hidden layers of other widths; other tensors stay.
+
+    Args:
+        tensors: As in a training state: `<network>hidden.<n>.<name>`, `<network>output.<name>`.
+        after: Widths of the hidden layers, see `can_widen`.
+    """
+    changed: dict[str, Tensor] = {}
+    for name in tensors:
+        if name.endswith(_OUTPUT):
+            prefix = name.removesuffix(_OUTPUT)
+            changed |= _widened_network(tensors, prefix, after)
+    return tensors | changed
+
+
+def _widened_network(
+    tensors: dict[str, Tensor], prefix: str, after: Sequence[int]
+) -> dict[str, Tensor]:
+    # The same shares in a network and its slow copy.
+    generator = torch.Generator().manual_seed(0)
+    widths = iter(after)
+    # Which unit each of the layer before is a copy of, and its share; None for the inputs.
+    unit: Tensor | None = None
+    share = torch.ones(1)
+    changed: dict[str, Tensor] = {}
+    for number in _numbers(tensors, prefix):
+        layer = f'{prefix}{_HIDDEN}{number}.'
+        weight = tensors[f'{layer}weight']
+        if weight.ndim == 2:
+            if unit is not None:
+                weight = weight[:, unit] * share
+            units, width = len(weight), next(widths)
+            unit = torch.arange(width) % units
+            share = _shares(units, width // units, generator)
+        for name in (name for name in tensors if name.startswith(layer)):
+            values = weight if name.endswith('.weight') else tensors[name]
+            # Of a normalisation there may be a count beside what it has of each unit.
+            changed[name] = values[unit] if values.ndim else values
+    output = prefix + _OUTPUT
+    changed[output] = tensors[output][:, unit] * share
+    return changed
+
+
+def _numbers(tensors: dict[str, Tensor], prefix: str) -> list[int]:
+    """Numbers of the hidden layers and norms of a network, rising."""
+    start = prefix + _HIDDEN
+    found = {int(n.removeprefix(start).split('.')[0]) for n in tensors if n.startswith(start)}
+    return sorted(found)
+
+
+def _shares(units: int, copies: int, generator: torch.Generator) -> Tensor:
+    """Shares (copies * units,) of each unit that add up to 1 over its copies."""
+    drawn = _LEAST_SHARE + (1.0 - 2.0 * _LEAST_SHARE) * torch.rand(
+        (copies, units), generator=generator
+    )
+    return (drawn / drawn.sum(dim=0)).flatten()
