@@ -13,8 +13,13 @@ from importlib import util
 from pathlib import Path
 
 import mujoco
+import numpy as np
+
+from msgs_spec.arrays import Array
 
 _LOGGER = logging.getLogger(__name__)
+# That of a geom whose MJCF says none (`rgba` in MuJoCo's XML reference).
+_NO_COLOR = np.array([0.5, 0.5, 0.5, 1.0])
 
 
 def asset_path(relative: str) -> Path:
@@ -45,6 +50,15 @@ def load_spec(relative: str) -> mujoco.MjSpec:
 def load_model(relative: str) -> mujoco.MjModel:
     """Compiles an MJCF asset as it is published."""
     return load_spec(relative).compile()
+
+
+def geom_color(model: mujoco.MjModel, geom: int) -> Array:
+    """Returns the colour (4,) that MuJoCo draws: a geom's own, else that of its material."""
+    own = np.array(model.geom_rgba[geom], dtype=np.float64)
+    material = int(model.geom_matid[geom])
+    if material < 0 or not np.array_equal(own, _NO_COLOR):
+        return own
+    return np.array(model.mat_rgba[material], dtype=np.float64)
 
 
 @functools.cache

@@ -13,7 +13,7 @@ from itertools import pairwise
 import mujoco
 import numpy as np
 
-from fetch_hand_sim.simulation.models import load_spec
+from fetch_hand_sim.simulation.models import geom_color, load_spec
 from fetch_hand_sim.simulation.tasks import task_asset
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
@@ -183,9 +183,7 @@ class Scene:
         mujoco.mju_mulPose(
             position, quaternion, pose[:3], pose[3:], model.geom_pos[geom], model.geom_quat[geom]
         )
-        material = int(model.geom_matid[geom])
-        color = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
-        red, green, blue, opacity = map(float, color)
+        red, green, blue, opacity = geom_color(model, geom).tolist()
         shape, size = int(model.geom_type[geom]), model.geom_size[geom].copy()
         return Marker(shape, size, position, (red, green, blue, opacity), quaternion)
 

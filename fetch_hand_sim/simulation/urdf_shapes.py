@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fetch_hand_sim.simulation.models import geom_color
 from msgs_spec.arrays import Array
 from msgs_spec.rotations import quaternion_multiply, quaternion_to_matrix
 
@@ -81,10 +82,8 @@ def _mesh(
 
 
 def _add_color(element: ElementTree.Element, model: mujoco.MjModel, geom: int) -> None:
-    material = int(model.geom_matid[geom])
-    color = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
     named = ElementTree.SubElement(element, 'material', name=f'geom{geom}')
-    ElementTree.SubElement(named, 'color', rgba=numbers(color))
+    ElementTree.SubElement(named, 'color', rgba=numbers(geom_color(model, geom)))
 
 
 def add_origin(element: ElementTree.Element, position: ArrayLike, quaternion: ArrayLike) -> None:

@@ -17,6 +17,7 @@ from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TASKS, task_spec
 
 TASKS_OF_ROBOTS = ['FetchReach', 'HandReach']
+COLORS = {'FetchReach': 5, 'HandReach': 2}
 CONFIGURATIONS = 100
 
 
@@ -103,6 +104,28 @@ def test_meshes_are_the_installed_files(robot):
     for file in files:
         assert file.startswith('file:///') and 'gymnasium_robotics' in file
         assert Path(unquote(urlsplit(file).path)).is_file()
+
+
+def test_links_have_the_colors_that_mujoco_draws(robot):
+    description, scene = robot
+    model = scene.model
+    drawn = mujoco.MjvScene(model, maxgeom=1000)
+    everything, free = mujoco.MjvOption(), mujoco.MjvCamera()
+    mujoco.mjv_updateScene(
+        model, mujoco.MjData(model), everything, None, free, mujoco.mjtCatBit.mjCAT_ALL.value, drawn
+    )
+    shapes = [
+        each for each in drawn.geoms[: drawn.ngeom] if each.objtype == mujoco.mjtObj.mjOBJ_GEOM
+    ]
+    expected = {f'geom{each.objid}': each.rgba.tolist() for each in shapes}
+    root = ElementTree.fromstring(description.to_xml())
+    found = {
+        each.get('name'): [float(value) for value in each.find('color').get('rgba').split()]
+        for each in root.iter('material')
+    }
+    assert found == {name: pytest.approx(expected[name]) for name in found}
+    # The Fetch has them beside its materials, which are all white.
+    assert len({tuple(color) for color in found.values()}) == COLORS[scene.spec.name]
 
 
 def test_a_mesh_is_drawn_where_mujoco_draws_it():
