@@ -24,7 +24,7 @@ SHOWN = (
     TopicSpec(
         'goal_markers',
         'visualization_msgs/msg/MarkerArray',
-        'Goal, achieved goal and object; while somebody subscribes.',
+        'Goal, achieved goal, object, table; while somebody subscribes.',
         frame=WORLD,
     ),
     TopicSpec('camera/image_raw', f'{_IMAGES}Image', 'A picture; while somebody subscribes.'),

@@ -16,6 +16,7 @@ import numpy as np
 from fetch_hand_sim.simulation.models import geom_color, load_spec
 from fetch_hand_sim.simulation.tasks import task_asset
 from msgs_spec.arrays import Array
+from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
 
 Color = tuple[float, float, float, float]
@@ -175,6 +176,19 @@ class Scene:
         body = self.model.body(self.spec.object_name)
         first, count = int(body.geomadr[0]), int(body.geomnum[0])
         return [self._geom_marker(geom, frame.object_pose) for geom in range(first, first + count)]
+
+    def table_markers(self) -> list[Marker]:
+        """What a task's object lies on and no robot moves: the table of a Fetch."""
+        model = self.model
+        markers = []
+        for geom in range(model.ngeom):
+            body = int(model.geom_bodyid[geom])
+            is_robot = model.body(body).name.startswith(JOINT_PREFIX)
+            # The floor is the world's own.
+            if body and not is_robot and int(model.body_weldid[body]) == 0:
+                pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
+                markers.append(self._geom_marker(geom, pose))
+        return markers
 
     def _geom_marker(self, geom: int, pose: Array) -> Marker:
         """A geom of the body that has this pose (7,)."""

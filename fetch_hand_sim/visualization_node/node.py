@@ -169,7 +169,11 @@ class VisualizationNode(Node):
             return
         tick, self._unmarked = self._unmarked, None
         if tick is not None and self._has_listener('goal_markers'):
-            shapes = {'goal': scene.markers(tick.frame), 'object': scene.object_markers(tick.frame)}
+            shapes = {
+                'goal': scene.markers(tick.frame),
+                'object': scene.object_markers(tick.frame),
+                'table': scene.table_markers(),
+            }
             markers = marker_array(shapes, tick.stamp_ns)
             self._outputs['goal_markers'].publish(markers)
         tick = self._undrawn

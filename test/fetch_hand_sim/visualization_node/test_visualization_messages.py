@@ -102,6 +102,18 @@ def test_the_object_is_drawn_where_mujoco_has_it(task):
     assert longest == pytest.approx(2.0 * scene.model.geom(geom.id).size.max())
 
 
+@pytest.mark.parametrize('task', TASKS)
+def test_the_table_of_a_fetch_is_drawn(task):
+    scene = Scene(task)
+    mujoco.mj_kinematics(scene.model, scene.data)
+    markers = scene.table_markers()
+    assert len(markers) == scene.spec.robot.has_gripper_command
+    for marker in markers:
+        np.testing.assert_allclose(marker.position, scene.data.body('table0').xpos)
+        # Its top, metres above the floor.
+        assert marker.position[2] + marker.size[2] == pytest.approx(0.4)
+
+
 def test_an_image_keeps_its_pixels():
     picture = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
     message = deserialize_message(serialize_message(image_message(picture, 'camera', STAMP)), Image)
