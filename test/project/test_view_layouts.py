@@ -42,6 +42,20 @@ def test_rviz_shows_topics_of_the_node():
     classes = {each['Class'].partition('/')[2] for each in displays}
     assert {'RobotModel', 'TF', 'MarkerArray'} <= classes
     assert layout['Visualization Manager']['Global Options']['Fixed Frame'] == 'world'
+    views = layout['Visualization Manager']['Views']
+    assert [view['Name'] for view in views['Saved']] == ['Fetch', 'Hand']
+
+
+def test_rviz_opens_its_window_without_the_picture():
+    """rviz2 14.1.5 enables a picture whose window is open, and reads unset memory without docks."""
+    layout = yaml.safe_load((ROOT / 'config/view.rviz').read_text())
+    window = layout['Window Geometry']
+    assert window['Hide Left Dock'] is window['Hide Right Dock'] is False
+    # A name in UTF-16, its length before it, whether it is shown after it.
+    state, name = bytes.fromhex(window['QMainWindow State']), 'Camera'.encode('utf-16-be')
+    assert state[state.index(name) + len(name)] == 0
+    name = 'Displays'.encode('utf-16-be')
+    assert state[state.index(name) + len(name)] == 1
 
 
 def test_foxglove_shows_topics_that_there_are():
