@@ -401,7 +401,7 @@ def test_a_fast_robot_is_seen_as_it_is_now_and_then_and_a_replay_after_it(
         seconds = time.monotonic() - began
         seen, ticks = (len(connection.received[n]) for n in ('latest_tick', 'joint_states'))
         assert 5 * seconds < seen < 36 * seconds
-        assert ticks > 3 * seen
+        assert ticks > seen, 'a starved machine has few more'
         follower.robot.perform(SetPaused(True))
         follower.until(lambda p: p.facts.is_paused, 'pause')
         connection.spin(1.0)
