@@ -341,6 +341,16 @@ STUDIES: dict[str, Study] = {
                 Arm('few', '13 samples per step, not 51', {'batch_size': 256}),
                 Arm('future', 'future goals alone', {'strategy': 'future'}),
                 Arm('graded', 'graded rewards', {'reward_grades': '.5,1,2'}),
+                Arm(
+                    'displaced',
+                    'half as many future goals, displaced ones instead',
+                    {'goals': 'future=.2,actual=.2,displaced=.4'},
+                ),
+                Arm(
+                    'unbiased',
+                    'displaced goals, no future ones',
+                    {'goals': 'actual=.4,displaced=.4'},
+                ),
             ),
             seeds=2,
         ),
