@@ -51,7 +51,12 @@ def scalar_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
         found.append(_scalar('distance', 'm', 'From the achieved to the desired position.'))
     if task.rotation_threshold is not None:
         found.append(
-            _scalar('rotation', 'rad', 'Angle between the achieved and the desired rotation.')
+            _scalar(
+                'rotation',
+                'rad',
+                'From the achieved to the desired rotation, by the success rule: up to 2 pi by '
+                '`gymnasium`.',
+            )
         )
     return (
         *found,

@@ -88,6 +88,8 @@ class VisualizationNode(Node):
             time.monotonic,
         )
         self._watch = RobotWatch(self, self._on_status, self._on_tick)
+        status_name = self.resolve_topic_name('episode_status')
+        self.get_logger().info(f'waiting for a robot on {status_name}')
 
     def run(self, stop: StopSignals) -> None:
         """Serves until told to stop."""
@@ -146,6 +148,8 @@ class VisualizationNode(Node):
         description.publish(description.msg_type(data=urdf))
         camera = view_transform(self._scene.view, self._prefix + _CAMERA_FRAME)
         self._send_transforms('/tf_static', [*self._transforms.fixed(), camera], 0)
+        shown = ', '.join(sorted(self._outputs))
+        self.get_logger().info(f'{spec.name}: publishes {shown}')
 
     def _on_tick(self, tick: SeenTick) -> None:
         if self._transforms is None or self._scalars is None:

@@ -442,6 +442,8 @@ def test_without_opengl_the_camera_says_so_and_the_rest_goes_on(
     assert node.returncode == 0
     (line,) = [line for line in errors.splitlines() if 'ERROR' in line]
     assert 'rendering needs OpenGL: apt install' in line and 'Traceback' not in output + errors
+    (said,) = [line for line in errors.splitlines() if 'FetchReach: publishes' in line]
+    assert 'goal_markers' in said and distance.name in said
 
 
 def test_scalars_are_those_of_the_tick_with_their_stamp(start_process: Start) -> None:
