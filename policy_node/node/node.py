@@ -164,7 +164,9 @@ class PolicyNode(Node):
         for parameter in parameters:
             if parameter.name != 'policy' or not result.successful:
                 continue
-            status, settings = self._status, self._settings
+            # One that is gone may be followed by a robot of another task.
+            status = self._status if self.count_publishers(self._status_name) else None
+            settings = self._settings
             task = status.task if status else settings['task'] or None
             try:
                 loaded = load_policy(parameter.value, task, trust=settings['trust'])
@@ -176,14 +178,15 @@ class PolicyNode(Node):
             except ValueError as error:
                 return SetParametersResult(successful=False, reason=str(error))
             settings['policy'] = parameter.value
+            self._status = status
             self._is_replaced = self._answered_status is not None
         return result
 
     def _leave(self) -> None:
         """Lets go of the robot that was answered; another policy, or another robot, follows."""
-        assert self._answered_status is not None and self._status is not None
         before, now = self._answered_status, self._status
         if not self._is_replaced:
+            assert before is not None and now is not None
             self.get_logger().info(
                 f'the robot changed from {before.task} at {before.control_hz:g} Hz to {now.task} '
                 f'at {now.control_hz:g} Hz'

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from std_srvs.srv import SetBool
 
 from msgs_spec.codecs import build_status, decode_status
 from msgs_spec.schemas import serialize
-from msgs_spec.tasks import task_spec
+from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
 from support.graph import (
@@ -109,18 +110,43 @@ def test_a_policy_of_another_rate_is_refused_while_another_acts(start_process: S
         robot.subscribe('applied_command')
         commands = robot.received['applied_command']
         robot.spin_until(lambda: len(commands) > 3, 'commands')
-        wanted = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value='FetchReach')
-        answer = robot.call(
-            SetParameters,
-            'policy_node/set_parameters',
-            parameters=[Parameter(name='policy', value=wanted)],
-        )
-        (result,) = answer.results
+        result = _set_policy(robot, 'FetchReach')
         assert not result.successful
         assert 'was trained at 25 Hz; the robot runs at 50 Hz' in result.reason
         count = len(commands)
         robot.spin_until(lambda: len(commands) > count + 3, 'more of them')
     end(policy)
+
+
+def test_an_actor_of_another_task_may_be_set_once_the_robot_is_gone(start_process: Start) -> None:
+    policy = start_process(*POLICY_NODE)
+    end(_answered_robot(start_process, REACH))
+    with client(REACH) as connection:
+        status = topic(REACH, 'episode_status').name
+        connection.spin_until(lambda: not connection.node.count_publishers(status), 'no robot')
+        assert not _set_policy(connection, 'nosuch').successful
+        assert _set_policy(connection, 'HandReach').successful
+    hand = _answered_robot(start_process, task_spec('HandReach'))
+    assert policy.poll() is None
+    assert 'HandReach: commands come from actor HandReach.safetensors' in end(policy)
+    end(hand)
+
+
+def _answered_robot(start_process: Start, task: TaskSpec) -> subprocess.Popen[str]:
+    """Starts a robot and waits until it is commanded."""
+    sim = start_process(*SIM_NODE, *ros_args(task=task.name, wait_for_commands=True))
+    with client(task) as robot:
+        robot.subscribe('applied_command')
+        robot.spin_until(lambda: len(robot.received['applied_command']) > 3, 'commands')
+    return sim
+
+
+def _set_policy(robot: Client, name: str) -> SetParametersResult:
+    wanted = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=name)
+    parameter = Parameter(name='policy', value=wanted)
+    answer = robot.call(SetParameters, 'policy_node/set_parameters', parameters=[parameter])
+    (result,) = answer.results
+    return result
 
 
 def test_robots_in_other_namespaces_are_named(start_process: Start) -> None:
