@@ -351,6 +351,8 @@ STUDIES: dict[str, Study] = {
                     'displaced goals, no future ones',
                     {'goals': 'actual=.4,displaced=.4'},
                 ),
+                Arm('discount', 'discount 0.95, not 0.98', {'gamma': 0.95}),
+                Arm('returns', 'returns of five steps', {'n_step': 5}),
             ),
             seeds=2,
         ),
