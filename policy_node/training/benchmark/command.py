@@ -43,7 +43,7 @@ from policy_node.training.benchmark.research import FINAL_EPISODES, STUDIES, res
 from policy_node.training.benchmark.research_report import require_all_runs
 from policy_node.training.benchmark.studies import best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
-from policy_node.training.learning.config_rules import RECIPES
+from policy_node.training.learning.config_rules import FROM_NOTHING
 from policy_node.training.learning.config_values import parse_assignment
 
 _NAME = 'benchmark'
@@ -75,7 +75,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--episodes', type=count, help='fresh episodes at the end; default: none; 2000; 500')
     add('--ray', action='store_true', help='independent jobs on Ray (extra: cluster)')
     paper = parser.add_argument_group('study paper').add_argument
-    paper('--recipe', choices=RECIPES, help='of all jobs; default: paper')
+    paper('--recipe', choices=FROM_NOTHING, help='of all jobs; default: paper')
     paper('--full', action='store_true', help="the recipe's own budget, not the reduced one")
     best = parser.add_argument_group('study best').add_argument
     best('--actors', type=Path, help='where actors go; default: <output>/actors')

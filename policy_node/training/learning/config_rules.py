@@ -13,7 +13,9 @@ from policy_node.training.learning.graded import parse_grades
 from policy_node.training.learning.hindsight import parse_mixture
 from policy_node.training.learning.multi_step import CORRECTIONS
 
-RECIPES = ('paper', 'best')
+# Recipes of runs that start from nothing.
+FROM_NOTHING = ('paper', 'best')
+RECIPES = (*FROM_NOTHING, 'finetune')
 # Tasks that ignore their gripper action.
 GAMBLE_TASKS = ('FetchReach', 'FetchPush')
 _DEFAULTS = {field.name: field.default for field in dataclasses.fields(ConfigFields)}

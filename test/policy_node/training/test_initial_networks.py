@@ -9,12 +9,17 @@ from pathlib import Path
 import pytest
 import torch
 
+from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
 from policy_node.policies.loading import load_actor
 from policy_node.policies.shipped import shipped_actors
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.initial_networks import CRITIC_FIRST, read_initial_networks
+from policy_node.training.learning.initial_networks import (
+    CRITIC_FIRST,
+    network_shape,
+    read_initial_networks,
+)
 from policy_node.training.learning.origins import steps_behind
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import read_progress
@@ -337,6 +342,20 @@ def test_networks_that_do_not_fit_are_refused_before_anything_is_written(
     assert 'cannot start from FetchReach (FetchReach): ' in error
     assert message in error and error.count('\n') == 1
     assert not (tmp_path / 'run').exists()
+
+
+@pytest.mark.parametrize('task', [name for name in TASKS if name.startswith('HandManipulate')])
+def test_a_recipe_goes_on_from_the_shipped_networks(task: str) -> None:
+    config = recipe_config(task, 'finetune')
+    networks = read_initial_networks(config.init_from)
+    networks.require_fit(config)
+    assert networks.origin['task'] == task and networks.has_critic
+    assert networks.fitted(config).shape == network_shape(config)
+
+
+def test_no_other_task_has_that_recipe() -> None:
+    with pytest.raises(ValueError, match='with an object in the hand, not HandReach'):
+        recipe_config('HandReach', 'finetune')
 
 
 @pytest.mark.parametrize(
