@@ -7,6 +7,7 @@ unreadable file.
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,10 +16,30 @@ from msgs_spec.command_line import CommandParser, FormerOption, require_extra, r
 from msgs_spec.tasks import TASKS
 
 _LOOPBACK = '127.0.0.1'
+_NAMESPACE = re.compile(r'(?:[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*)?', re.ASCII)
+# ROS takes 245, with the names of topics and services behind it.
+_LONGEST_NAMESPACE = 150
 _DESCRIPTION = (
     'Shows a running robot, or episode files, on a page in the browser. Without arguments: the '
     'robot that runs; with --task: starts simulation and actor itself if none does.'
 )
+
+
+def _namespace(text: str) -> str:
+    """Reads a namespace, with or without slashes around it."""
+    inner = text.strip('/')
+    if _is_namespace(inner):
+        return inner
+    meant = re.sub(r'[^\w/]', '_', inner, flags=re.ASCII)
+    hint = f'; did you mean {meant!r}?' if _is_namespace(meant) and meant.strip('_/') else ''
+    raise argparse.ArgumentTypeError(
+        f'{text[:80]!r} given; allowed: letters, digits and _, also several such names with / '
+        f'between them, none with a digit first, up to {_LONGEST_NAMESPACE} characters{hint}'
+    )
+
+
+def _is_namespace(text: str) -> bool:
+    return len(text) <= _LONGEST_NAMESPACE and _NAMESPACE.fullmatch(text) is not None
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -30,7 +51,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         'path', nargs='?', type=Path, help='an episode, or a folder of episodes, to play'
     )
     parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='one of the tasks')
-    parser.add_argument('--robot', default='', help='namespace of the robot')
+    parser.add_argument('--robot', type=_namespace, default='', help='namespace of the robot')
     parser.add_argument('--policy', default='', help='policy to start with --task')
     parser.add_argument('--checkpoint', dest='policy', action=FormerOption, help=argparse.SUPPRESS)
     parser.add_argument('--episode-dir', default='', help='log episodes of --task here')
@@ -49,9 +70,18 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     options.ros_arguments = words[cut:]
     if not 0 <= options.port <= 65535:
         parser.error(f'--port {options.port}; allowed: 0 ... 65535')
-    if options.path is not None and (options.task or options.robot):
-        parser.error('a file and --task or --robot exclude each other')
+    of_a_robot = _given(options, 'task', 'robot', 'policy', 'episode_dir')
+    if options.path is not None and of_a_robot:
+        parser.error(f'a file and {of_a_robot} exclude each other')
+    options.for_a_start = _given(options, 'policy', 'episode_dir')
+    if options.for_a_start and not options.task:
+        parser.error(f'{options.for_a_start}: only together with --task, for the robot it starts')
     return options
+
+
+def _given(options: argparse.Namespace, *names: str) -> str:
+    """Which of these options were given, as they are written."""
+    return ' and '.join(f'--{name.replace("_", "-")}' for name in names if getattr(options, name))
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -34,7 +34,8 @@ def run_files(options: argparse.Namespace) -> int:
         options.host, options.port, [Page(tuple(paths)), Requests(player.perform)]
     )
     try:
-        announce(address, options.browser)
+        if not stop:
+            announce(address, options.browser)
         session = Session(handle, player)
         while not stop:
             session.update()

@@ -22,7 +22,8 @@ from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import announce, open_page
-from msgs_spec.ros import EventLoop, NodeFailure, StopSignals, destroy, run_node
+from msgs_spec.ros import EventLoop, NodeFailure, StopSignals, UsageError, destroy, run_node
+from msgs_spec.tasks import TaskSpec
 
 NODE_NAME = 'view'
 _FRAME_TIME = 1.0 / 60.0
@@ -51,6 +52,8 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
         handle, address = open_page(options.host, options.port, plugins, frame_rate)
         stack.callback(handle.close)
         nodes = stack.enter_context(_nodes(options, node, robot, loop, stop))
+        if stop:
+            return
         _give_way()
         announce(address, options.browser)
         _serve(Session(handle, robot), frame_rate, loop, nodes, stop)
@@ -67,9 +70,8 @@ def _nodes(
     """Finds a robot, or starts one with its actor and ends both afterwards."""
     patience = _DISCOVERY_TIME if options.task else options.wait
     _wait_for_robot(robot, loop, stop, patience)
-    if robot.spec is not None and options.task not in (None, robot.spec.name):
-        where = node.get_namespace()
-        raise NodeFailure(f'a robot in {where} runs already and does {robot.spec.name}')
+    if robot.spec is not None:
+        _check_is_wanted(options, robot.spec, node.get_namespace())
     if robot.spec is not None or stop:
         yield []
     elif options.task is None:
@@ -89,6 +91,17 @@ def _wait_for_robot(robot: LiveRobot, loop: EventLoop, stop: StopSignals, second
     end = time.monotonic() + seconds
     while robot.spec is None and not stop and time.monotonic() < end:
         loop.wait(_FRAME_TIME)
+
+
+def _check_is_wanted(options: argparse.Namespace, spec: TaskSpec, where: str) -> None:
+    """Raises why the robot that runs is not what was asked for."""
+    if options.task not in (None, spec.name):
+        raise NodeFailure(f'a robot in {where} runs already and does {spec.name}')
+    if options.for_a_start:
+        raise UsageError(
+            f'a robot in {where} runs already and does {spec.name}: {options.for_a_start} would '
+            'change nothing; leave that out, or end the robot first'
+        )
 
 
 def _nobody(node: Node, namespace: str) -> str:

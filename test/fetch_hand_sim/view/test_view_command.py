@@ -9,6 +9,7 @@ import pytest
 
 from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.view import main
+from fetch_hand_sim.view.command import parse
 from fetch_hand_sim.view.web import open_browser
 from support.episode_recorder import Recorder
 
@@ -66,10 +67,50 @@ def test_a_mistyped_task_is_one_line(capsys):
     assert code == 2 and line.endswith("; did you mean 'FetchPush'?")
 
 
-def test_a_file_and_a_task_exclude_each_other(capsys, episode):
-    code, lines = error_of(capsys, [episode, '--task', 'FetchPush'])
+@pytest.mark.parametrize(
+    ('given', 'named'),
+    [
+        (['--task', 'FetchPush'], '--task'),
+        (['--robot', 'left'], '--robot'),
+        (['--policy', 'random'], '--policy'),
+        (['--episode-dir', 'there', '--task', 'FetchPush'], '--task and --episode-dir'),
+    ],
+)
+def test_a_file_and_what_is_said_of_robots_exclude_each_other(capsys, episode, given, named):
+    code, lines = error_of(capsys, [episode, *given])
     assert code == 2
-    assert lines[-1] == 'view: a file and --task or --robot exclude each other'
+    assert lines == [f'view: a file and {named} exclude each other']
+
+
+@pytest.mark.parametrize('option', ['--policy', '--episode-dir'])
+def test_what_is_said_of_a_start_needs_a_task(capsys, option):
+    code, (line,) = error_of(capsys, [option, 'x', '--wait', '0'])
+    assert code == 2
+    assert line == f'view: {option}: only together with --task, for the robot it starts'
+
+
+@pytest.mark.parametrize(
+    ('name', 'hint'),
+    [
+        ('left-arm', "'left_arm'"),
+        ('bad name', "'bad_name'"),
+        ('/a/b-1/', "'a/b_1'"),
+        ('a//b', ''),
+        ('1a', ''),
+        ('\u00fc', ''),
+        ('x' * 151, ''),
+    ],
+)
+def test_what_is_no_namespace_is_one_line_with_what_is_meant(capsys, name, hint):
+    code, (line,) = error_of(capsys, ['--robot', name, '--wait', '0'])
+    assert code == 2
+    assert line.startswith(f"view: argument --robot: '{name[:80]}' given; allowed: letters, ")
+    assert line.endswith(f'did you mean {hint}?' if hint else 'up to 150 characters')
+
+
+@pytest.mark.parametrize('name', ['', 'left', '/left/', 'a/b_1', '_x', 'x' * 150])
+def test_a_namespace_is_taken_with_and_without_slashes(name):
+    assert parse(['--robot', name]).robot == name.strip('/')
 
 
 def test_a_port_that_is_in_use(capsys, episode):
