@@ -230,7 +230,9 @@ def set_callback(
 
 
 class StopSignals:
-    """Turns SIGINT and SIGTERM into a flag, so that a tick in progress is finished first.
+    """Turns SIGINT, SIGTERM and SIGHUP into a flag, so that a tick in progress is finished first.
+
+    SIGHUP, which a closed terminal sends, only where it is not ignored, as `nohup` has it.
 
     rclpy's own handlers would invalidate the context in the middle of a tick, and the last messages
     with it. Only the main thread can make one.
@@ -241,8 +243,9 @@ class StopSignals:
 
     def __init__(self) -> None:
         self.received: str | None = None
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._handle)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, self._handle)
 
     def __bool__(self) -> bool:
         """Whether to stop."""

@@ -60,6 +60,9 @@ def pytest_configure(config: pytest.Config) -> None:
     # A shell starts what runs in the background with SIGINT ignored, and children inherit that.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    # So does `nohup` with SIGHUP. It stays ignored here; a handler is nothing that is inherited.
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: None)
     domain, lock = reserve_domain()
     log_directory = tempfile.mkdtemp(prefix='ros_log_')
     start_guard(lock, log_directory)

@@ -8,8 +8,11 @@ from __future__ import annotations
 import sys
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 
+from msgs_spec import parent_process
+
 _DISTRIBUTION = 'fetch_hand_sim'
 _ACTORS = 'fetch_hand_sim.actors'
+_BOUND = parent_process.__name__
 
 
 class UnknownExecutableError(Exception):
@@ -32,15 +35,21 @@ def find_executable(name: str) -> EntryPoint:
     return points[name]
 
 
-def executable(name: str) -> list[str]:
+def executable(name: str, parent: int | None = None) -> list[str]:
     """Returns the command that runs an executable with this interpreter, ready for arguments.
+
+    Args:
+        name: Of the executable.
+        parent: Process id of who starts it, if it is to end with that one.
 
     Raises:
         UnknownExecutableError: If there is none of that name.
     """
     point = find_executable(name)
     function = f'__import__({point.module!r}, fromlist=["_"]).{point.attr}'
-    return [sys.executable, '-c', f'import sys; sys.exit({function}())']
+    # Before anything that takes long to import.
+    first = '' if parent is None else f'import {_BOUND}; {_BOUND}.end_with_parent({parent}); '
+    return [sys.executable, '-c', f'{first}import sys; sys.exit({function}())']
 
 
 def is_actor_shipped(task: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 from collections.abc import Sequence
@@ -18,6 +19,8 @@ def start_node(
 ) -> subprocess.Popen[str]:
     """Starts a node in a process group of its own: Ctrl-C reaches only who started it.
 
+    It ends with this process, also where that is killed.
+
     Args:
         name: Of the executable.
         parameters: `name:=value` each.
@@ -31,7 +34,7 @@ def start_node(
     if namespace:
         words += ['-r', f'__ns:=/{namespace.strip("/")}']
     return subprocess.Popen(
-        [*executable(name), '--ros-args', *words],
+        [*executable(name, parent=os.getpid()), '--ros-args', *words],
         stdout=output,
         stderr=subprocess.STDOUT,
         text=True,

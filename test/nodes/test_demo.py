@@ -15,7 +15,11 @@ from fetch_hand_sim.episode_log import read_summary
 
 @pytest.mark.parametrize(
     ('number', 'code'),
-    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.release)],
+    [
+        (signal.SIGINT, 130),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.release),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.release),
+    ],
 )
 def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, tmp_path):
     command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting']

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import multiprocessing
 import os
@@ -17,12 +16,12 @@ from types import FrameType
 from typing import Any, Protocol, Self
 
 from msgs_spec.command_line import EXIT_FAILURE, EXIT_SUCCESS, CommandError, complain
+from msgs_spec.parent_process import end_with_parent
 from policy_node.training.benchmark.final import measure_final
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.learning.run import RunTakenError, train_run
 
 LOG_FILE = 'log.txt'
-_SET_PARENT_DEATH_SIGNAL = 1
 # Seconds between two lines about each running job.
 _STATUS_SECONDS = 600.0
 
@@ -201,8 +200,9 @@ def _work(job: Job, command: str) -> None:
     # Out of the terminal's group, so that Ctrl-C does not come twice; in the session of the caller,
     # because Linux shares processors out by session: in one of its own `nice` would not hold.
     os.setpgid(0, 0)
-    if sys.platform == 'linux':
-        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
+    parent = multiprocessing.parent_process()
+    if parent is not None and parent.pid is not None:
+        end_with_parent(parent.pid)
     job.folder.mkdir(parents=True, exist_ok=True)
     with (job.folder / LOG_FILE).open('a') as log:
         os.dup2(log.fileno(), sys.stdout.fileno())

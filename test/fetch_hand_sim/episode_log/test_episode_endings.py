@@ -200,19 +200,30 @@ def test_a_directory_that_is_removed_while_it_is_written(start_process, tmp_path
     assert len(errors) == 1 and 'No such file or directory' in errors[0]
 
 
-def test_a_terminated_robot_completes_its_episode(start_process, tmp_path):
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
+def test_a_terminated_robot_completes_its_episode(start_process, tmp_path, number):
     # Slow, so that no episode ends by itself just then.
     robot = start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path, real_time_factor=0.2))
     with client(REACH) as listener:
         listener.subscribe('reward')
         listener.spin_until(lambda: len(listener.received['reward']) > 5, 'ticks')
-        robot.terminate()
+        robot.send_signal(number)
         code, output = finish(robot)
     assert code == 0, output
     *whole, last = map(read_episode, find_episodes(tmp_path))
     assert all(episode.is_complete for episode in whole)
-    assert last.result['reason'] == 'SIGTERM'
+    assert last.result['reason'] == number.name
     assert find_leftovers(tmp_path) == []
+
+
+def test_a_robot_under_nohup_survives_its_terminal(start_process):
+    robot = start_process('nohup', *SIM_NODE, stdin=subprocess.DEVNULL)
+    with client(REACH) as listener:
+        listener.subscribe('joint_states')
+        ticks_after(listener, 1)
+        robot.send_signal(signal.SIGHUP)
+        ticks_after(listener)
+    stop(robot)
 
 
 def test_a_directory_that_is_a_file_is_one_line(start_process, tmp_path):

@@ -1,0 +1,94 @@
+"""Robots that `view` starts: whether it should, beside which others, and how they end with it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from msgs_spec.tasks import task_spec
+from support.graph import SIM_NODE, client, finish, ros_args
+
+Start = Callable[..., subprocess.Popen[str]]
+REACH = task_spec('FetchReach')
+VIEW = (sys.executable, '-m', 'fetch_hand_sim.view', '--no-browser')
+PATIENCE = 30.0
+
+
+def stat_of(process: int) -> list[str]:
+    """State, parent and what follows of a process; empty if it is gone."""
+    try:
+        return Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()
+    except OSError:
+        return []
+
+
+def is_running(process: int) -> bool:
+    return stat_of(process)[:1] not in ([], ['Z'])
+
+
+def children_of(parent: int) -> list[int]:
+    processes = [int(path.name) for path in Path('/proc').glob('[0-9]*')]
+    return [process for process in processes if stat_of(process)[1:2] == [str(parent)]]
+
+
+def wait_until(condition: Callable[[], bool], what: str) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, f'no {what}'
+        time.sleep(0.05)
+
+
+def start_view(start_process: Start, *arguments: str) -> tuple[subprocess.Popen[str], list[str]]:
+    """A page, and what it said until it was there."""
+    view = start_process(*VIEW, *arguments)
+    said = []
+    while not said or 'The page is at' not in said[-1]:
+        said.append(view.stdout.readline())
+        assert said[-1], finish(view)
+    return view, said
+
+
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGHUP])
+@pytest.mark.parametrize('is_loaded', [False, True])
+def test_the_nodes_end_with_who_started_them(
+    start_process: Start, number: signal.Signals, is_loaded: bool
+) -> None:
+    view, _ = start_view(start_process, '--task', 'FetchReach')
+    nodes = children_of(view.pid)
+    assert len(nodes) == 2
+    if is_loaded:
+        with client(REACH) as connection:
+            connection.subscribe('reward')
+            connection.spin_until(lambda: connection.received['reward'], 'step')
+    view.send_signal(number)
+    code, output = finish(view)
+    assert code == (-signal.SIGKILL if number == signal.SIGKILL else 0), output
+    wait_until(lambda: not any(map(is_running, nodes)), 'end of the nodes')
+
+
+def test_ctrl_c_while_a_robot_is_looked_for_announces_no_page(start_process: Start) -> None:
+    view = start_process(*VIEW, '--wait', '60')
+    with client(REACH) as connection:
+        connection.spin_until(lambda: 'view' in connection.node.get_node_names(), 'viewer')
+    view.send_signal(signal.SIGINT)
+    assert finish(view) == (0, '')
+
+
+def test_what_a_running_robot_would_not_do_is_refused(start_process: Start, tmp_path: Path) -> None:
+    start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    given = ['--task', 'FetchReach', '--policy', 'nosuch', '--episode-dir', str(tmp_path / 'there')]
+    with client(REACH) as connection:
+        connection.subscribe('episode_status')
+        connection.spin_until(lambda: connection.received['episode_status'], 'robot')
+    code, output = finish(start_process(*VIEW, *given))
+    assert (code, output) == (
+        2,
+        'view: a robot in / runs already and does FetchReach: --policy and --episode-dir would '
+        'change nothing; leave that out, or end the robot first\n',
+    )
