@@ -1,7 +1,7 @@
 """`render_episode FILE --out film.mp4`: a film or picture of a logged episode, or of many at once.
 
-Needs no display. Exit code 0: written; 1: something failed; 2: bad usage, or an episode that cannot
-be read.
+Needs no display. What cannot be read in a folder is skipped, named on stderr. Exit code 0: written;
+1: something failed; 2: bad usage, or nothing that can be read.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from msgs_spec.command_line import (
     CommandError,
     CommandParser,
     UsageError,
+    complain,
     progress,
     run_command,
     say,
@@ -87,7 +88,9 @@ def _render(options: argparse.Namespace) -> None:
     from fetch_hand_sim.films.recording import Recording, load_recordings
 
     columns, rows = options.grid or (1, 1)
-    recordings: list[Recording] = load_recordings(options.path, columns * rows)
+    recordings: list[Recording] = load_recordings(
+        options.path, columns * rows, on_skip=lambda error: complain(_NAME, f'skipped {error}')
+    )
     width, height = options.size
     studio = Studio(width, height, options.camera)
     try:

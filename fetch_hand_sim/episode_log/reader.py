@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -14,6 +15,7 @@ import zstandard
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metadata, Schema
 
+from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.episode_record import HasOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeReadError, one_line
@@ -152,7 +154,8 @@ def episode_records(
     """
     for name in (EPISODE, EPISODE_RESULT):
         if name not in records:
-            raise EpisodeReadError(f'{file}: no episode, there is no metadata record {name!r}')
+            reason = _unfinished(file) or f'no episode, there is no metadata record {name!r}'
+            raise EpisodeReadError(f'{file}: {reason}')
     return records[EPISODE], records[EPISODE_RESULT]
 
 
@@ -194,6 +197,16 @@ def one_line_errors(file: Path) -> Iterator[None]:
     except OSError as error:
         raise EpisodeReadError(f'{file}: {error.strerror or error}') from error
     except DAMAGED as error:
-        raise EpisodeReadError(
-            f'{file}: truncated, damaged or no MCAP file ({one_line(error)})'
-        ) from error
+        reason = _unfinished(file) or f'truncated, damaged or no MCAP file ({one_line(error)})'
+        raise EpisodeReadError(f'{file}: {reason}') from error
+
+
+def _unfinished(file: Path) -> str:
+    """What to say of a file in the hidden directory of an episode; empty for others."""
+    if durable.active_name(file.parent) is None:
+        return ''
+    with suppress(OSError):
+        if durable.is_locked(file):
+            return 'still being written'
+    directory = shlex.quote(str(file.parent.parent))
+    return f'truncated by a kill or a full disk; `recover_episodes {directory}` makes it whole'

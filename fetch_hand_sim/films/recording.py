@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,17 +91,44 @@ def _vectors(messages: MessageFile, task: TaskSpec, name: str, ticks: int) -> Ar
         raise EpisodeReadError(f'{messages.path}: no readable {name}: {error}') from error
 
 
-def load_recordings(path: Path, count: int) -> list[Recording]:
+def load_recordings(
+    path: Path, count: int, on_skip: Callable[[EpisodeReadError], None] | None = None
+) -> list[Recording]:
     """Reads the first episodes of a path.
 
     Args:
         path: An episode, or a folder of episodes.
         count: How many at most.
+        on_skip: Called for what cannot be read, which is left out then; None raises instead.
 
     Raises:
-        EpisodeReadError: If there is none, or one cannot be read.
+        EpisodeReadError: If there is none, or with `on_skip` None one cannot be read, else none.
     """
-    return [load_recording(each) for each in find_playable(path)[:count]]
+    recordings: list[Recording] = []
+    skipped: list[EpisodeReadError] = []
+    for each in find_playable(path):
+        if len(recordings) == count:
+            break
+        try:
+            recordings.append(load_recording(each))
+        except EpisodeReadError as error:
+            if on_skip is None:
+                raise
+            skipped.append(error)
+    if not recordings:
+        raise none_readable(skipped)
+    if on_skip is not None:
+        for reason in skipped:
+            on_skip(reason)
+    return recordings
+
+
+def none_readable(errors: Sequence[EpisodeReadError]) -> EpisodeReadError:
+    """Returns what to raise where each of some episodes, one at least, cannot be read."""
+    first, *others = errors
+    if not others:
+        return first
+    return EpisodeReadError(f'none of {len(errors)} episodes can be read; the first: {first}')
 
 
 def find_playable(path: Path) -> list[Path]:

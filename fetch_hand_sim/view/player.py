@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fetch_hand_sim.episode_log import EpisodeReadError
-from fetch_hand_sim.films.recording import load_recording
+from fetch_hand_sim.films.recording import load_recording, none_readable
 from fetch_hand_sim.simulation.scene import tracked_position
 from fetch_hand_sim.view.curves import Curves
 from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Picture, Timeline
@@ -36,7 +36,7 @@ class Player:
         clock: A steady clock, seconds.
 
     Raises:
-        EpisodeReadError: If the first one cannot be read.
+        EpisodeReadError: If none can be read.
     """
 
     def __init__(self, paths: Sequence[Path], clock: Callable[[], float] = time.monotonic) -> None:
@@ -49,7 +49,7 @@ class Player:
         self._then = clock()
         self._notice = ''
         self._shown: tuple[object, ...] = ()
-        self._open(0)
+        self._open_first()
 
     @property
     def index(self) -> int:
@@ -93,6 +93,21 @@ class Player:
     def _show(self, index: int) -> None:
         last = len(self._recording.frames) - 1
         self._position = float(self._recording.times[min(max(index, 0), last)])
+
+    def _open_first(self) -> None:
+        """Opens the first episode that can be read."""
+        skipped: list[EpisodeReadError] = []
+        for number in range(len(self._paths)):
+            try:
+                self._open(number)
+            except EpisodeReadError as error:
+                skipped.append(error)
+                continue
+            if skipped:
+                more = f' (and {len(skipped) - 1} more)' if len(skipped) > 1 else ''
+                self._notice = f'skipped {skipped[0]}{more}'
+            return
+        raise none_readable(skipped)
 
     def _change(self, by: int) -> None:
         """Opens the next episode that can be read."""

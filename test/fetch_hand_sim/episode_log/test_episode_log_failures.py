@@ -29,7 +29,9 @@ from fetch_hand_sim.episode_log import (
     LogSettings,
     durable,
     find_leftovers,
+    load_episodes,
     read_episode,
+    read_summary,
     recover_episode,
 )
 from msgs_spec.schemas import deserialize
@@ -128,8 +130,11 @@ def test_a_killed_recorder_leaves_an_episode_marked_as_unfinished(killed):
     assert 60 <= leftover.age_s < 120
     assert 'FetchReach_000002_seed2' in str(leftover)
     assert not (directory / leftover.name).exists()
-    with pytest.raises(EpisodeReadError, match='truncated'):
-        read_episode(leftover.path)
+    for read in (read_episode, read_summary, load_episodes):
+        with pytest.raises(EpisodeReadError, match='truncated by a kill') as caught:
+            read(leftover.path)
+        assert f'`recover_episodes {directory}`' in str(caught.value)
+        assert_one_line(caught.value)
 
 
 def test_a_kill_loses_at_most_half_a_simulated_second(killed):
@@ -212,6 +217,8 @@ def test_recovery_refuses_what_it_cannot_recover(finished, recorder, ticks, tmp_
     recorder.write(writer, ticks)
     with pytest.raises(EpisodeLogError, match='is being written'):
         recover_episode(tmp_path / '.running.active')
+    with pytest.raises(EpisodeReadError, match='still being written'):
+        read_episode(tmp_path / '.running.active')
     damaged = tmp_path / '.damaged.active' / 'damaged_0.mcap'
     damaged.parent.mkdir()
     damaged.write_bytes(b'x' + next(finished.glob('*.mcap')).read_bytes()[1:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 
@@ -146,6 +147,39 @@ def test_command_writes_a_film_and_a_picture(folder, tmp_path, capsys):
         assert path.name in capsys.readouterr().out
         with Image.open(path) as image:
             assert image.size == ((130, 98) if more[0] == '--grid' else (64, 48))
+
+
+@pytest.fixture
+def partly_damaged(folder, tmp_path):
+    """A folder whose first episode is cut off."""
+    directory = tmp_path / 'partly_damaged'
+    shutil.copytree(folder, directory)
+    file = directory / 'FetchReach_000000_seed0' / 'FetchReach_000000_seed0_0.mcap'
+    file.write_bytes(file.read_bytes()[:2000])
+    return directory
+
+
+@pytest.mark.usefixtures('opengl')
+def test_what_cannot_be_read_is_left_out_and_said(partly_damaged, tmp_path, capsys):
+    path = tmp_path / 'grid.png'
+    arguments = ['--grid', '2x1', '--out', str(path), '--size', '64x48']
+    assert render_episode([str(partly_damaged), *arguments]) == 0
+    error = capsys.readouterr().err
+    assert error.startswith('render_episode: skipped ') and error.count('\n') == 1
+    assert 'FetchReach_000000_seed0_0.mcap: truncated' in error
+    with Image.open(path) as image:
+        right = np.asarray(image)[:, 68:]
+    assert right.std() > 10, 'the third episode in place of the first'
+
+
+def test_if_nothing_can_be_read_there_is_one_line(partly_damaged, tmp_path, capsys):
+    for file in partly_damaged.glob('*/*.mcap'):
+        file.write_bytes(b'')
+    arguments = ['--grid', '2x2', '--out', str(tmp_path / 'grid.png')]
+    assert render_episode([str(partly_damaged), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith('render_episode: none of 3 episodes can be read; the first: ')
+    assert error.count('\n') == 1
 
 
 @pytest.mark.parametrize('number', [51, 1000, -52])

@@ -124,6 +124,23 @@ def test_what_cannot_be_read_is_skipped_and_said(folder, tmp_path, clock):
     assert 'damaged.mcap' in picture.facts.notice
 
 
+def test_the_first_that_can_be_read_is_opened(folder, tmp_path, clock):
+    good = find_playable(folder)
+    damaged = []
+    for name in ('a.mcap', 'b.mcap'):
+        damaged.append(tmp_path / name)
+        data = next(good[0].glob('*.mcap')).read_bytes()
+        damaged[-1].write_bytes(data[: len(data) // 2])
+    picture = Player([damaged[0], *good], clock).picture()
+    assert picture.timeline.number == 1
+    assert 'skipped' in picture.facts.notice and 'a.mcap' in picture.facts.notice
+    picture = Player([*damaged, *good], clock).picture()
+    assert picture.timeline.number == 2
+    assert 'a.mcap' in picture.facts.notice and picture.facts.notice.endswith(' (and 1 more)')
+    with pytest.raises(EpisodeReadError, match=r'none of 2 episodes can be read; .*a\.mcap'):
+        Player(damaged, clock)
+
+
 def test_an_episode_is_chosen_by_its_number(player):
     player.perform(OpenEpisode(2))
     assert player.picture().timeline.number == 2
