@@ -22,7 +22,15 @@ from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import announce, open_page
-from msgs_spec.ros import EventLoop, NodeFailure, StopSignals, UsageError, destroy, run_node
+from msgs_spec.ros import (
+    EventLoop,
+    NodeFailure,
+    StopSignals,
+    UsageError,
+    count_publishers,
+    destroy,
+    run_node,
+)
 from msgs_spec.tasks import TaskSpec
 
 NODE_NAME = 'view'
@@ -33,6 +41,7 @@ _DISCOVERY_TIME = 2.0
 # The page never takes a processor that the robot wants.
 _NICENESS = 10
 _LAST_LINES = 5
+_CLOCK = '/clock'
 
 
 def run_live(options: argparse.Namespace) -> int:
@@ -78,7 +87,7 @@ def _nodes(
         raise NodeFailure(_nobody(node, options.robot))
     else:
         with tempfile.NamedTemporaryFile('w+', prefix='view_', suffix='.log') as log:
-            started = _start(options, log)
+            started = _start(options, node, log)
             try:
                 yield started
                 _check_alive(started, log, stop)
@@ -120,7 +129,7 @@ def _nobody(node: Node, namespace: str) -> str:
     return f'no robot in namespace {where}; {hint}'
 
 
-def _start(options: argparse.Namespace, log: IO[str]) -> list[subprocess.Popen[str]]:
+def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> list[subprocess.Popen[str]]:
     policy = options.policy or options.task
     if not options.policy and not is_actor_shipped(options.task):
         print(f'No actor is shipped for {options.task} yet: commands are random.', flush=True)
@@ -128,6 +137,10 @@ def _start(options: argparse.Namespace, log: IO[str]) -> list[subprocess.Popen[s
     settings = [f'task:={options.task}', 'wait_for_commands:=true']
     if options.episode_dir:
         settings.append(f'episode_dir:={Path(options.episode_dir)}')
+    # While a robot was looked for, everybody else was found too.
+    if count_publishers(node, _CLOCK):
+        print('/clock comes from another robot: this one does not publish it.', flush=True)
+        settings.append('publish_clock:=false')
     return [
         start_node('policy_node', [f'policy:={policy}'], log, options.robot),
         start_node('sim_node', settings, log, options.robot),

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 
 from msgs_spec.tasks import task_spec
 from support.graph import SIM_NODE, client, finish, ros_args
@@ -92,3 +93,23 @@ def test_what_a_running_robot_would_not_do_is_refused(start_process: Start, tmp_
         'view: a robot in / runs already and does FetchReach: --policy and --episode-dir would '
         'change nothing; leave that out, or end the robot first\n',
     )
+
+
+def test_of_two_robots_one_publishes_the_clock(start_process: Start) -> None:
+    for robot, task in (('left', 'FetchReach'), ('right', 'HandReach')):
+        _, said = start_view(start_process, '--robot', robot, '--task', task)
+        assert any('/clock comes from another' in line for line in said) == (robot == 'right')
+        with client(REACH) as connection:
+            connection.subscribe('/diagnostics')
+            name = f'/{robot}/sim_node'
+
+            def is_well(name=name, connection=connection):
+                reports = connection.reports(name)
+                return len(reports) > 2 and connection.values(name)['clock publishers'] != '-'
+
+            connection.spin_until(is_well, f'reports of {name}')
+            publishers = connection.node.get_publishers_info_by_topic('/clock')
+            assert [each.node_namespace for each in publishers] == ['/left']
+            for node in ('/left/sim_node', '/right/sim_node'):
+                levels = {report.level for report in connection.reports(node)}
+                assert DiagnosticStatus.ERROR not in levels
