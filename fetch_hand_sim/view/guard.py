@@ -20,8 +20,9 @@ from websockets.http11 import Request, Response
 
 _LOOPBACK = frozenset({'localhost', '127.0.0.1', '::1'})
 _SOCKETS = frozenset({'/ui', '/state'})
-# Carries the token after the first request.
-_COOKIE = 'fetch_hand_sim_view'
+# Carries the token after the first request. Browsers give all ports of a host the same cookies, so
+# that the port is in the name.
+_COOKIE = 'fetch_hand_sim_view_{port}'
 _FORBIDDEN_PATHS = frozenset({'/drop'})
 # Let other sites read the answers, or load them.
 _OPENING_HEADERS = ('Access-Control-Allow-Origin', 'Cross-Origin-Resource-Policy')
@@ -62,10 +63,12 @@ class Guard:
 
     Args:
         token: What visitors must show; None for nothing.
+        port: That is listened on; two pages of one host know their visitors apart by it.
     """
 
-    def __init__(self, token: str | None = None) -> None:
+    def __init__(self, token: str | None = None, port: int = 0) -> None:
         self.token = token
+        self._cookie = _COOKIE.format(port=port)
 
     def refusal(self, target: str, headers: Headers) -> Refusal | None:
         """Returns why a request is refused, or None.
@@ -93,7 +96,7 @@ class Guard:
         """Returns the cookie for whoever came with the token in the address, or None."""
         if self.token is None or not self._matches(parse_qs(urlsplit(target).query).get('token')):
             return None
-        return f'{_COOKIE}={self.token}; Path=/; HttpOnly; SameSite=Strict'
+        return f'{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict'
 
     def _has_token(self, target: str, headers: Headers) -> bool:
         given = parse_qs(urlsplit(target).query).get('token', [])
@@ -102,8 +105,8 @@ class Guard:
                 cookies = SimpleCookie(line)
             except CookieError:
                 continue
-            if _COOKIE in cookies:
-                given.append(cookies[_COOKIE].value)
+            if self._cookie in cookies:
+                given.append(cookies[self._cookie].value)
         return self._matches(given)
 
     def _matches(self, given: Sequence[str] | None) -> bool:

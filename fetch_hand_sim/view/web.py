@@ -12,6 +12,7 @@ import threading
 import time
 import webbrowser
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from mujoco.studio import (
@@ -32,6 +33,9 @@ from fetch_hand_sim.view.guard import Guard, guarded_serve, is_loopback, new_tok
 from msgs_spec.command_line import CommandError
 
 _LOOPBACK = '127.0.0.1'
+_EVERYWHERE = ('::', '0.0.0.0')
+# Of networks that exist in documents alone; nothing is sent there.
+_SOMEBODY = ((socket.AF_INET, '203.0.113.1'), (socket.AF_INET6, '2001:db8::1'))
 _START_TIMEOUT = 10.0
 # Of prctl(2), and nanoseconds that a timer may be late: little beside a picture's 16 ms.
 _SET_TIMER_SLACK, _SLACK_NS = 29, 5_000_000
@@ -59,7 +63,7 @@ class Address:
     @property
     def url(self) -> str:
         """What to open in a browser."""
-        host = socket.getfqdn() if self.host in ('::', '0.0.0.0') else self.host
+        host = outside_host() if self.host in _EVERYWHERE else self.host
         host = f'[{host}]' if ':' in host else host
         query = f'?token={self.token}' if self.token else ''
         return f'http://{host}:{self.port}/{query}'
@@ -113,6 +117,36 @@ def _read_touch() -> Touch:
     )
 
 
+def outside_host() -> str:
+    """Returns by what others reach this machine: its name, else its address, where it has one."""
+    name = socket.getfqdn()
+    for each in (name, socket.gethostname()):
+        if _leads_outside(each):
+            return each
+    return _outside_address() or name
+
+
+def _leads_outside(name: str) -> bool:
+    """Whether a name is that of an address which is not this machine's own."""
+    try:
+        found = socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError):
+        return False
+    return any(not is_loopback(str(address[0])) for *_, address in found)
+
+
+def _outside_address() -> str | None:
+    """The address from which this machine would send, if it could."""
+    for family, other in _SOMEBODY:
+        # Of a datagram socket this chooses the route and sends nothing.
+        with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as route:
+            route.connect((other, 9))
+            own = str(route.getsockname()[0])
+            if not is_loopback(own):
+                return own
+    return None
+
+
 def open_page(
     host: str,
     port: int,
@@ -131,8 +165,8 @@ def open_page(
         CannotServe: If the port is taken or the host is not ours.
     """
     needs_token = not is_loopback(host)
-    guard = Guard(new_token() if needs_token else None)
     listening = _bind(host, port)
+    guard = Guard(new_token() if needs_token else None, listening.getsockname()[1])
     address = Address(host, listening.getsockname()[1], guard.token)
     # The two places where the viewer meets the network; it offers no option for either.
     web_server.bind_public_socket = lambda *_: listening
@@ -187,7 +221,7 @@ def _bind(host: str, port: int) -> socket.socket:
 
 def _check_guarded(address: Address) -> None:
     """Asks as a foreign site would; a server that answers must not run."""
-    host = _LOOPBACK if address.host in ('::', '0.0.0.0') else address.host
+    host = _LOOPBACK if address.host in _EVERYWHERE else address.host
     deadline = time.monotonic() + _START_TIMEOUT
     while True:
         connection = http.client.HTTPConnection(host, address.port, timeout=_START_TIMEOUT)
@@ -213,9 +247,11 @@ def announce(address: Address, wants_browser: bool) -> None:
     """Prints the address and opens it where a browser could show itself."""
     if address.warning:
         print(f'Warning: {address.warning}', flush=True)
-    print(f'The page is at {address.url} (Ctrl-C ends)', flush=True)
+    # Once: a name server may be slow to answer.
+    url = address.url
+    print(f'The page is at {url} (Ctrl-C ends)', flush=True)
     if wants_browser and has_display():
-        open_browser(address.url)
+        open_browser(url)
 
 
 def has_display() -> bool:

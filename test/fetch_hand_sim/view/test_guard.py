@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import http.client
 import logging
+import socket
+from http.cookies import SimpleCookie
 
 import pytest
 from websockets.datastructures import Headers
@@ -13,7 +15,7 @@ from websockets.sync.client import connect
 from fetch_hand_sim.view.guard import Guard, is_loopback
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests
-from fetch_hand_sim.view.web import CannotServe, open_page
+from fetch_hand_sim.view.web import Address, CannotServe, open_page
 
 TOKEN = 'a-token'
 
@@ -39,7 +41,7 @@ def test_a_name_that_points_here_is_not(host):
 )
 @pytest.mark.parametrize('token', [None, TOKEN])
 def test_a_web_socket_of_another_site_is_refused(path, origin, token):
-    headers = {'Host': 'localhost:8080', 'Cookie': f'fetch_hand_sim_view={TOKEN}'}
+    headers = {'Host': 'localhost:8080', 'Cookie': f'fetch_hand_sim_view_0={TOKEN}'}
     if origin is not None:
         headers['Origin'] = origin
     assert refusal(Guard(token), path, **headers).status == 403
@@ -57,7 +59,13 @@ def test_no_files_from_visitors():
 
 @pytest.mark.parametrize(
     ('target', 'cookie'),
-    [('/', ''), ('/?token=wrong', ''), ('/', 'fetch_hand_sim_view=wrong'), ('/', 'other=a-token')],
+    [
+        ('/', ''),
+        ('/?token=wrong', ''),
+        ('/', 'fetch_hand_sim_view_0=wrong'),
+        ('/', 'fetch_hand_sim_view_1=a-token'),
+        ('/', 'other=a-token'),
+    ],
 )
 def test_without_the_token_nobody_is_served(target, cookie):
     assert refusal(Guard(TOKEN), target, Host='robot.example', Cookie=cookie).status == 403
@@ -70,6 +78,65 @@ def test_the_token_admits_and_leaves_the_address():
     cookie = guard.admission(f'/?token={TOKEN}')
     assert 'HttpOnly' in cookie and 'SameSite=Strict' in cookie
     assert refusal(guard, '/', Host='robot.example', Cookie=cookie.partition(';')[0]) is None
+
+
+def test_two_pages_of_one_host_know_their_visitors_apart():
+    """Browsers give all ports of a host the same cookies."""
+    guards = [Guard('one', 8080), Guard('two', 8081)]
+    admissions = [guard.admission(f'/?token={guard.token}') for guard in guards]
+    jar = SimpleCookie()
+    for each in admissions:
+        jar.load(each)
+    cookie = '; '.join(f'{name}={morsel.value}' for name, morsel in jar.items())
+    for guard in guards:
+        assert refusal(guard, '/', Host='robot.example', Cookie=cookie) is None
+
+
+class Network:
+    """What the machine knows of itself: addresses by name, and the one it would send from."""
+
+    def __init__(self, monkeypatch, name, addresses, route):
+        monkeypatch.setattr(socket, 'getfqdn', lambda: 'localhost')
+        monkeypatch.setattr(socket, 'gethostname', lambda: name)
+        self.addresses = {'localhost': '127.0.0.1'} | addresses
+        monkeypatch.setattr(socket, 'getaddrinfo', self.find)
+        monkeypatch.setattr(socket, 'socket', lambda *_: self)
+        self.route = route
+
+    def find(self, name, *_, **__):
+        if name not in self.addresses:
+            raise socket.gaierror
+        return [(None, None, None, '', (self.addresses[name], 0))]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def connect(self, _):
+        if self.route is None:
+            raise OSError('Network is unreachable')
+
+    def getsockname(self):
+        return (self.route, 40000)
+
+
+@pytest.mark.parametrize(
+    ('name', 'addresses', 'route', 'host'),
+    [
+        ('robot', {'robot': '192.168.0.7'}, None, 'robot'),
+        # As Debian has it.
+        ('robot', {'robot': '127.0.1.1'}, '192.168.0.7', '192.168.0.7'),
+        ('robot', {}, '2001:db8::7', '[2001:db8::7]'),
+        ('localhost', {}, None, 'localhost'),
+        ('localhost', {}, '127.0.0.1', 'localhost'),
+    ],
+)
+def test_the_address_is_one_by_which_others_come(monkeypatch, name, addresses, route, host):
+    Network(monkeypatch, name, addresses, route)
+    assert Address('0.0.0.0', 8080, TOKEN).url == f'http://{host}:8080/?token={TOKEN}'
+    assert Address('10.0.0.1', 8080, TOKEN).url == f'http://10.0.0.1:8080/?token={TOKEN}'
 
 
 def test_loopback_is_told_from_the_rest():
@@ -106,8 +173,8 @@ def test_server_gives_the_page_and_opens_it_to_no_other_site(address):
 
 def test_server_refuses_web_sockets_of_other_sites(address):
     url = f'ws://127.0.0.1:{address.port}/state?sid=x'
-    with connect(url, origin=f'http://127.0.0.1:{address.port}') as socket:
-        assert socket.recv(timeout=10)
+    with connect(url, origin=f'http://127.0.0.1:{address.port}') as visitor:
+        assert visitor.recv(timeout=10)
     for origin in ('http://evil.example', None):
         with pytest.raises(InvalidStatus):
             connect(url, origin=origin)
