@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import xml.etree.ElementTree as ElementTree
 
@@ -9,6 +10,7 @@ import pytest
 import rclpy
 import yaml
 
+from fetch_hand_sim.view.command import parse
 from msgs_spec.parameters import POLICY_NODE, SIM_NODE, validate
 from msgs_spec.ros import declare_parameters
 from support import ROOT
@@ -108,14 +110,46 @@ def test_launch_file_starts_what_setup_py_installs():
     assert all(arg.get('description') for arg in LAUNCH.findall('arg'))
 
 
+VIEW_LAUNCH = ElementTree.parse(ROOT / 'launch' / 'view.launch.xml').getroot()
+
+
+def resolved_by_view(text: str, values: dict[str, str]) -> str:
+    return re.sub(r'\$\(var (\w+)\)', lambda match: values[match[1]], text)
+
+
+def values_of_view(**arguments: str) -> dict[str, str]:
+    """The arguments of view.launch.xml."""
+    return {arg.get('name'): arg.get('default') for arg in VIEW_LAUNCH.findall('arg')} | arguments
+
+
 def given_by_view(**arguments: str) -> dict[str, str]:
     """The arguments that view.launch.xml gives to demo.launch.xml."""
-    root = ElementTree.parse(ROOT / 'launch' / 'view.launch.xml').getroot()
-    values = {arg.get('name'): arg.get('default') for arg in root.findall('arg')} | arguments
+    values = values_of_view(**arguments)
     return {
-        arg.get('name'): re.sub(r'\$\(var (\w+)\)', lambda m: values[m[1]], arg.get('value'))
-        for arg in root.find('include').findall('arg')
+        arg.get('name'): resolved_by_view(arg.get('value'), values)
+        for arg in VIEW_LAUNCH.find('include').findall('arg')
     }
+
+
+def page_of_view(**arguments: str) -> argparse.Namespace:
+    """The options with which view.launch.xml starts the page."""
+    values = values_of_view(**arguments)
+    (node,) = [
+        node
+        for node in VIEW_LAUNCH.findall('node')
+        if resolved_by_view(node.get('if', 'true'), values) == 'true'
+        and resolved_by_view(node.get('unless', 'false'), values) == 'false'
+    ]
+    assert (node.get('exec'), node.get('namespace')) == ('view', '$(var namespace)')
+    return parse(resolved_by_view(node.get('args'), values).split())
+
+
+def test_a_launched_page_is_of_this_machine_and_may_act_unless_told_otherwise():
+    page = page_of_view()
+    assert (page.host, page.port, page.read_only, page.wait) == ('127.0.0.1', 0, False, 60.0)
+    page = page_of_view(host='0.0.0.0', port='8090', read_only='true')
+    assert (page.host, page.port, page.read_only) == ('0.0.0.0', 8090, True)
+    assert all(arg.get('description') for arg in VIEW_LAUNCH.findall('arg'))
 
 
 def test_what_is_only_looked_at_runs_on_and_is_not_logged():
