@@ -12,7 +12,7 @@ from msgs_spec import parent_process
 
 _DISTRIBUTION = 'fetch_hand_sim'
 _ACTORS = 'fetch_hand_sim.actors'
-_BOUND = parent_process.__name__
+_PARENT = parent_process.__name__
 
 
 class UnknownExecutableError(Exception):
@@ -48,7 +48,7 @@ def executable(name: str, parent: int | None = None) -> list[str]:
     point = find_executable(name)
     function = f'__import__({point.module!r}, fromlist=["_"]).{point.attr}'
     # Before anything that takes long to import.
-    first = '' if parent is None else f'import {_BOUND}; {_BOUND}.end_with_parent({parent}); '
+    first = '' if parent is None else f'import {_PARENT}; {_PARENT}.end_with_parent({parent}); '
     return [sys.executable, '-c', f'{first}import sys; sys.exit({function}())']
 
 

@@ -209,4 +209,4 @@ def _unfinished(file: Path) -> str:
         if durable.is_locked(file):
             return 'still being written'
     directory = shlex.quote(str(file.parent.parent))
-    return f'truncated by a kill or a full disk; `recover_episodes {directory}` makes it whole'
+    return f'truncated by a kill or a full disk; `recover_episodes {directory}` ends it'

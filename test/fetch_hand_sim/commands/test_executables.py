@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
+import sys
 
 import pytest
 
@@ -21,6 +24,13 @@ def test_an_executable_runs_with_its_arguments_and_exit_code(tmp_path):
     assert result.stdout.startswith('0 episodes')
     missing = subprocess.run([*command[:-1], tmp_path / 'none'], capture_output=True, text=True)
     assert missing.returncode == 2 and 'none' in missing.stderr
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='Linux tells of a parent that has ended')
+def test_an_executable_whose_parent_is_gone_does_not_start(tmp_path):
+    for parent, code in ((os.getpid(), 0), (os.getppid(), -signal.SIGTERM)):
+        command = [*executable('list_episodes', parent), tmp_path]
+        assert subprocess.run(command, capture_output=True).returncode == code
 
 
 def test_an_unknown_executable_is_named_with_those_there_are():
