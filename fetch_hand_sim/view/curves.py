@@ -10,6 +10,9 @@ from fetch_hand_sim.view.picture import Graphs, Series
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import TaskSpec
 
+# How far each finger of the Fetch slides, metres (`fetch/robot.xml`).
+_FINGER_RANGE = 0.05
+
 
 class Curves:
     """The latest ticks as curves.
@@ -27,6 +30,9 @@ class Curves:
         # Columns: time, distance, rotation, reward, commands, positions.
         self._rows = np.full((length, 4 + 2 * commands), np.nan)
         self._count = 0
+        self._fingers = [
+            index for index, name in enumerate(spec.robot.joints) if 'gripper_finger' in name
+        ]
         self._commanded = [
             spec.robot.joints.index(part.name) if part.name in spec.robot.joints else None
             for part in spec.robot.command
@@ -60,9 +66,13 @@ class Curves:
         )
 
     def _positions(self, frame: Frame) -> Array:
-        """What the commands move; a gripper's axes are no joints and stay out."""
+        """What the commands move; the axes of a gripper's path are no joints and stay out."""
         joints = frame.joint_position
-        return np.array([np.nan if i is None else joints[i] for i in self._commanded])
+        positions = np.array([np.nan if i is None else joints[i] for i in self._commanded])
+        if self._spec.robot.has_gripper_command:
+            # From -1 to 1, as the last command closes and opens.
+            positions[-1] = 2.0 * np.mean(joints[self._fingers]) / _FINGER_RANGE - 1.0
+        return positions
 
     def _series(self, columns: int | slice) -> Series:
         size = len(self._rows)

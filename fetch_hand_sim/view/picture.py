@@ -30,12 +30,15 @@ class Facts:
         episode_return: Sum of its rewards.
         commander: Who commands.
         is_paused: Whether time stands still.
-        speed: Simulated seconds per second, asked for.
+        speed: Simulated seconds per second, asked for; 0 for as fast as possible.
+        has_speed: Whether that can be chosen; in lockstep commands say how fast time goes.
         rate: Ticks per second, measured; 0 if unknown.
         missed_ticks: Since the robot started.
         push_limit: Largest force of a push, N; 0 where the robot takes none.
         may_command: Whether this page may act at all.
         actors: Actors to choose from; empty where there is no policy.
+        actor: The one of these that acts, the file of another one, or '' if unknown.
+        is_replay: Whether what is live is the replay of an episode.
         is_commanding: Whether the page sends commands.
         notice: What the last action led to.
     """
@@ -50,13 +53,21 @@ class Facts:
     commander: str = ''
     is_paused: bool = False
     speed: float = 1.0
+    has_speed: bool = True
     rate: float = 0.0
     missed_ticks: int = 0
     push_limit: float = 0.0
     may_command: bool = True
     actors: tuple[str, ...] = ()
+    actor: str = ''
+    is_replay: bool = False
     is_commanding: bool = False
     notice: str = ''
+
+    @property
+    def takes_actions(self) -> bool:
+        """Whether there is a robot that does what this page asks for."""
+        return self.source == 'live' and self.may_command and not self.is_replay
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +92,8 @@ class Graphs:
         rotation: To the goal, rad.
         reward: Of each tick.
         commands: One column per command: (ticks,) times and (ticks, commands) values.
-        positions: The joints that the commands drive, likewise; NaN for a gripper's path.
+        positions: The joints that the commands drive, likewise; how far a gripper is open, from -1
+            to 1; NaN for its path.
     """
 
     distance: Series | None = None

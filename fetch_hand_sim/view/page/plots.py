@@ -2,33 +2,79 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 
+from fetch_hand_sim.view.page.teleoperation import is_move
 from fetch_hand_sim.view.picture import Graphs, Series
+from msgs_spec.robots import CommandPart
 from msgs_spec.tasks import TaskSpec
 
-_HEIGHT = 130.0
+_HEIGHT = 140.0
 _SECONDS = 8.0
+# Above and below what is drawn, of its height: what lies on an edge is not seen.
+_ROOM = 0.15
 
 
 def draw_plots(spec: TaskSpec, graphs: Graphs, width: float) -> None:
     """Draws distances with their thresholds, the reward, and commands against joints."""
     if graphs.distance is not None:
         curves = {'distance (m)': graphs.distance}
-        _plot('Distance', curves, width, threshold=spec.distance_threshold)
+        _plot('##Distance', curves, width, threshold=spec.distance_threshold)
     if graphs.rotation is not None:
         curves = {'rotation (rad)': graphs.rotation}
-        _plot('Rotation', curves, width, threshold=spec.rotation_threshold)
+        _plot('##Rotation', curves, width, threshold=spec.rotation_threshold)
     if graphs.reward is not None:
-        _plot('Reward', {'reward': graphs.reward}, width)
+        _plot('##Reward', {'reward': graphs.reward}, width)
     if graphs.commands is not None and imgui.CollapsingHeader('Commands and joints'):
         for index, part in enumerate(spec.robot.command):
-            curves = {'command': _column(graphs.commands, index)}
-            if graphs.positions is not None and not spec.robot.has_gripper_command:
-                curves['joint'] = _column(graphs.positions, index)
-            _plot(f'{part.name.removeprefix("robot0:")} ({part.unit})', curves, width)
+            _plot(
+                f'{part.name.removeprefix("robot0:")} ({part.unit})',
+                command_curves(part, graphs, index),
+                width,
+            )
+
+
+def command_curves(part: CommandPart, graphs: Graphs, index: int) -> dict[str, Series]:
+    """A command and what can be compared with it, by their names on the page.
+
+    Args:
+        part: The command.
+        graphs: With commands.
+        index: Which one it is.
+    """
+    assert graphs.commands is not None
+    command = _column(graphs.commands, index)
+    if is_move(part):
+        return {'command, from where it is': command}
+    curves = {'command': command}
+    if graphs.positions is not None:
+        is_joint = part.unit == 'rad'
+        name = 'joint' if is_joint else 'fingers (1: 0.1 m apart)'
+        curves[name] = _column(graphs.positions, index)
+    return curves
+
+
+def value_limits(
+    curves: Iterable[Series], threshold: float | None, begin: float, end: float
+) -> tuple[float, float]:
+    """Lower and upper end of an axis on which curves and threshold are seen, none of it at an end.
+
+    Args:
+        curves: What is drawn, one value per time.
+        threshold: What must be seen too; None for nothing.
+        begin: Time from which it is drawn, seconds.
+        end: Time up to which.
+    """
+    parts = [each.values[(each.times >= begin) & (each.times <= end)] for each in curves]
+    values = np.concatenate([*parts, [] if threshold is None else [threshold]])
+    values = values[np.isfinite(values)]
+    lower, upper = (values.min(), values.max()) if len(values) else (0.0, 1.0)
+    room = _ROOM * ((upper - lower) or 1.0)
+    return float(lower - room), float(upper + room)
 
 
 def _column(series: Series, index: int) -> Series:
@@ -42,11 +88,15 @@ def _plot(
     options = int(flags.NoMouseText) | int(flags.NoMenus) | int(flags.NoBoxSelect)
     if not implot.BeginPlot(title, imgui.Vec2(width - 20.0, _HEIGHT), options):
         return
-    axis = implot.AxisFlags
-    implot.SetupAxes('', '', int(axis.NoTickLabels), int(axis.AutoFit))
+    implot.SetupAxes('', '', int(implot.AxisFlags.NoTickLabels))
+    legend = implot.LegendFlags
+    # Else it covers what it explains.
+    implot.SetupLegend(int(implot.Location.North), int(legend.Outside) | int(legend.Horizontal))
     newest = max((s.times[-1] for s in curves.values() if len(s.times)), default=0.0)
     always = int(implot.Cond.Always)
     implot.SetupAxisLimits(implot.Axis.X1, newest - _SECONDS, newest, always)
+    limits = value_limits(curves.values(), threshold, newest - _SECONDS, newest)
+    implot.SetupAxisLimits(implot.Axis.Y1, *limits, always)
     if threshold is not None:
         ends = np.array([newest - _SECONDS, newest])
         implot.PlotLine('success below', ends, np.full(2, threshold))

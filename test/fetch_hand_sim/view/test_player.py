@@ -10,6 +10,12 @@ import pytest
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.films.recording import find_playable, load_recording
+from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from fetch_hand_sim.simulation.scene import Frame
+from fetch_hand_sim.view.curves import Curves
+from fetch_hand_sim.view.page.plots import command_curves, value_limits
+from fetch_hand_sim.view.picture import Series
 from fetch_hand_sim.view.player import Player
 from fetch_hand_sim.view.requests import (
     ChangeEpisode,
@@ -182,3 +188,39 @@ def test_an_unreadable_file_is_one_line(tmp_path, content):
 def test_an_empty_folder_is_one_line(tmp_path):
     with pytest.raises(EpisodeReadError, match='no episodes'):
         find_playable(tmp_path)
+
+
+def test_fingers_are_comparable_with_the_command_of_the_gripper():
+    simulation = Simulation('FetchPickAndPlace', num_threads=1)
+    spec, model = simulation.spec, simulation.model
+    curves = Curves(spec, GoalMetric(spec))
+    ranges = [model.joint(name).range for name in spec.robot.joints if 'gripper_finger' in name]
+    np.testing.assert_array_equal(ranges, [[0.0, 0.05]] * 2)
+    simulation.reset(seed=0)
+    for tick in range(20):
+        # Opens, then closes.
+        command = np.array([0.0, 0.0, 0.1, 1.0 if tick < 10 else -1.0])
+        simulation.step_commands(command[None])
+        joints = simulation.readings()['joint_states'][0][: len(spec.robot.joints)]
+        goal = np.zeros(3)
+        curves.add(tick * 0.04, Frame(joints, goal, goal, None, False), 0.0, command)
+    graphs = curves.graphs()
+    names = [list(command_curves(part, graphs, i)) for i, part in enumerate(spec.robot.command)]
+    assert names == [['command, from where it is']] * 3 + [['command', 'fingers (1: 0.1 m apart)']]
+    opening = command_curves(spec.robot.command[3], graphs, 3)['fingers (1: 0.1 m apart)'].values
+    assert opening[9] == pytest.approx(1.0, abs=0.1) and opening[-1] == pytest.approx(-1.0, abs=0.1)
+
+
+@pytest.mark.parametrize('threshold', [0.01, 0.1])
+@pytest.mark.parametrize('values', [[0.3, 0.2], [0.3, 0.001], [0.005, 0.004], [0.1, 0.1], []])
+def test_the_threshold_is_seen_whatever_the_curve_does(values, threshold):
+    series = Series(np.arange(len(values)), np.array(values))
+    lower, upper = value_limits([series], threshold, 0.0, 2.0)
+    for each in [threshold, *values]:
+        assert 0.1 < (each - lower) / (upper - lower) < 0.9
+
+
+def test_an_axis_is_for_what_is_seen_of_a_curve():
+    series = Series(np.array([0.0, 1.0, 2.0, 3.0]), np.array([99.0, 1.0, np.nan, 2.0]))
+    lower, upper = value_limits([series], None, 0.5, 3.0)
+    assert 0.5 < lower < 1.0 and 2.0 < upper < 2.5
