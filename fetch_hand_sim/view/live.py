@@ -6,6 +6,8 @@ import dataclasses
 from collections import deque
 from typing import Any
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
@@ -13,6 +15,7 @@ from fetch_hand_sim.simulation.scene import tracked_position
 from fetch_hand_sim.view.curves import Curves
 from fetch_hand_sim.view.frame_rate import FOLLOWING, OVERLOOKING
 from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Graphs, Picture
+from fetch_hand_sim.view.replay_watch import ReplayWatch
 from fetch_hand_sim.view.requests import LatestRequest, Request, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RobotRequests
 from fetch_hand_sim.view.robot_watch import ANY_TASK, WATCHING, RobotWatch, SeenTick
@@ -24,6 +27,8 @@ from msgs_spec.topics import DIAGNOSTICS, topic
 
 # Of the ticks per second that a robot has in real time: one with more is faster.
 _HURRY = 1.5
+# Seconds between two looks at who is there and what nodes are set to.
+_LOOK_PERIOD = 0.5
 
 
 class LiveRobot:
@@ -40,6 +45,10 @@ class LiveRobot:
         self._sim_name = f'{node.get_namespace().rstrip("/")}/sim_node'
         self._facts = Facts(may_command=may_command)
         self._commander = ''
+        self._phase = ''
+        self._asked_rate: str | None = None
+        # Settings of nodes to be read: they may have changed.
+        self._unread: set[str] = set()
         self._trail: deque[Array] = deque(maxlen=TRAIL_TICKS)
         self._curves: Curves | None = None
         self._rule = ''
@@ -51,6 +60,10 @@ class LiveRobot:
         self._watch.subscribe(DIAGNOSTICS, WATCHING, self._on_diagnostics)
         introduction = topic(ANY_TASK, 'policy_status')
         self._watch.subscribe(introduction, introduction.qos, self._on_commander)
+        self._replays = ReplayWatch(node)
+        # Of wall time: simulated time stands still with a robot that is paused.
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(_LOOK_PERIOD, self._look, clock=clock)
 
     @property
     def spec(self) -> TaskSpec | None:
@@ -79,7 +92,7 @@ class LiveRobot:
             self._update_facts(notice='this page may only watch (--read-only)')
             return
         self._requests.perform(request)
-        if isinstance(request, SetGoal):
+        if isinstance(request, SetGoal) and not self._facts.is_replay:
             self._show_goal(request.values)
 
     def _on_status(self, status: EpisodeStatus) -> None:
@@ -91,6 +104,7 @@ class LiveRobot:
             self._rule = rule
             self._curves = Curves(spec, GoalMetric(spec, success_rule=rule))
         self._requests.take_task(spec)
+        self._phase = status.phase
         # Of a fast robot the reset itself may not have been among the ticks that came.
         episode = status.episode, status.seed
         if status.phase == 'reset' or episode != self._episode or status.tick < self._facts.tick:
@@ -104,6 +118,10 @@ class LiveRobot:
         spec = self.spec
         if spec is None or self._curves is None:
             return
+        self._replays.count_tick()
+        if tick.status is None and tick.reward is not None:
+            # `episode_status` speaks up only where an episode begins or ends.
+            self._phase = 'running'
         goal = self._requests.shown_goal(tick.frame.desired_goal)
         frame = dataclasses.replace(tick.frame, desired_goal=goal)
         self._trail.append(tracked_position(frame))
@@ -133,21 +151,63 @@ class LiveRobot:
 
     def _on_commander(self, message: Any) -> None:
         self._commander = decode_status(message).get('commander', '')
+        self._unread.add('actor')
         self._is_new = True
+
+    def _look(self) -> None:
+        """Looks at who replays, and reads what nodes may have been set to."""
+        is_other = self._replays.look()
+        replay, facts = self._replays.replay, self._facts
+        if is_other:
+            self._requests.take_replay(replay)
+            self._facts = dataclasses.replace(
+                facts, is_replay=replay is not None, is_paused=False, commander='', rate=0.0
+            )
+        if replay is not None:
+            self._follow_replay(replay.name)
+        for name, read in (
+            ('speed', self._requests.read_speed),
+            ('actor', self._requests.read_actor),
+        ):
+            if name in self._unread:
+                read()
+
+    def _follow_replay(self, name: str) -> None:
+        """Says of a replay what a robot says of itself in its diagnostics."""
+        self._asked_rate = None
+        self._unread.add('speed')
+        self._requests.push_limit = 0.0
+        self._update_facts(
+            is_paused=self._replays.stands_still(self._facts.is_paused),
+            rate=self._replays.rate,
+            missed_ticks=0,
+            commander=f'a replay ({name})',
+            push_limit=0.0,
+            has_speed=True,
+        )
+        self._yield_to_others()
 
     def _on_diagnostics(self, message: Any) -> None:
         for status in message.status:
-            if status.name == self._sim_name:
-                values = {pair.key: pair.value for pair in status.values}
-                self._requests.push_limit = _number(values.get('perturb limit (N)'))
-                self._update_facts(
-                    is_paused=values.get('paused') == 'True',
-                    rate=_number(values.get('rate (Hz)')),
-                    missed_ticks=int(_number(values.get('missed ticks'))),
-                    commander=values.get('commanders', '-'),
-                    push_limit=self._requests.push_limit,
-                )
-                self._yield_to_others()
+            if status.name == self._sim_name and not self._facts.is_replay:
+                self._take_report({pair.key: pair.value for pair in status.values})
+
+    def _take_report(self, values: dict[str, str]) -> None:
+        asked = values.get('rate asked (Hz)')
+        if asked != self._asked_rate:
+            # Rounded, and of a robot that is paused or in lockstep not there: the robot knows.
+            self._asked_rate = asked
+            self._unread.add('speed')
+        self._requests.push_limit = _number(values.get('perturb limit (N)'))
+        self._update_facts(
+            is_paused=values.get('paused') == 'True',
+            rate=_number(values.get('rate (Hz)')),
+            missed_ticks=int(_number(values.get('missed ticks'))),
+            commander=values.get('commanders', '-'),
+            push_limit=self._requests.push_limit,
+            has_speed=values.get('mode') != 'lockstep',
+        )
+        self._yield_to_others()
 
     def _yield_to_others(self) -> None:
         """Stops to command where somebody else does: two would fight over the robot."""
@@ -158,6 +218,7 @@ class LiveRobot:
 
     def _update_facts(self, **changes: Any) -> None:
         self._facts = dataclasses.replace(self._facts, **changes)
+        self._unread -= changes.keys()
         self._is_new = True
 
     def _current_facts(self) -> Facts:
@@ -168,7 +229,7 @@ class LiveRobot:
             commander = f'{commander}: {self._commander}'
         return dataclasses.replace(
             facts,
-            phase=status.phase,
+            phase=self._phase,
             episode=status.episode,
             seed=status.seed,
             tick=min(facts.tick, spec.episode_ticks),

@@ -10,14 +10,15 @@ from rclpy.node import Node
 from msgs_spec.ros import ros_service_class
 
 _SET_PARAMETERS = 'rcl_interfaces/srv/SetParameters'
+_GET_PARAMETERS = 'rcl_interfaces/srv/GetParameters'
 
 
 class RemoteNode:
-    """A node in the namespace of ours, by name.
+    """Another node, by name.
 
     Args:
         node: Of this process.
-        name: Of the other one.
+        name: Of the other one, in the namespace of ours or fully qualified.
         notice: Gets a line about what a call led to.
     """
 
@@ -31,9 +32,43 @@ class RemoteNode:
         """Whether it answers services."""
         return bool(self._client('set_parameters', _SET_PARAMETERS).service_is_ready())
 
-    def call(self, service: str, type_name: str, **fields: Any) -> None:
-        """Calls a service of the kind that says whether it worked and why or why not."""
-        self._call(service, type_name, fields, lambda response: self._notice(response.message))
+    def call(
+        self,
+        service: str,
+        type_name: str,
+        then: Callable[[], None] | None = None,
+        **fields: Any,
+    ) -> None:
+        """Calls a service of the kind that says whether it worked, and goes on where it did.
+
+        Args:
+            service: Its name, below the node's or fully qualified.
+            type_name: Its type.
+            then: Called after an answer that says so.
+            fields: Of the request.
+        """
+
+        def answered(response: Any) -> None:
+            self._notice(response.message)
+            if response.success and then is not None:
+                then()
+
+        self._call(service, type_name, fields, answered)
+
+    def get_parameter(self, name: str, then: Callable[[Any], None]) -> None:
+        """Hands a parameter on when it comes; does nothing where the node has none, or is none."""
+        from rclpy.parameter import parameter_value_to_python
+
+        def answered(future: Any) -> None:
+            values = [parameter_value_to_python(each) for each in future.result().values]
+            for value in values:
+                if value is not None:
+                    then(value)
+
+        client = self._client('get_parameters', _GET_PARAMETERS)
+        if client.service_is_ready():
+            request = ros_service_class(_GET_PARAMETERS).Request(names=[name])
+            client.call_async(request).add_done_callback(answered)
 
     def set_parameter(
         self, name: str, value: str | int | float, then: Callable[[], None] | None = None
@@ -69,7 +104,6 @@ class RemoteNode:
 
     def _client(self, service: str, type_name: str) -> Any:
         if service not in self._clients:
-            self._clients[service] = self._node.create_client(
-                ros_service_class(type_name), f'{self._name}/{service}'
-            )
+            name = service if service.startswith('/') else f'{self._name}/{service}'
+            self._clients[service] = self._node.create_client(ros_service_class(type_name), name)
         return self._clients[service]

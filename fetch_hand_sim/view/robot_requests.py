@@ -12,6 +12,7 @@ from rclpy.node import Node
 
 from fetch_hand_sim.episodes.perturbations import bounded_wrench
 from fetch_hand_sim.view.remote_node import RemoteNode
+from fetch_hand_sim.view.replay_watch import Replay
 from fetch_hand_sim.view.requests import (
     ChooseActor,
     LatestRequest,
@@ -31,11 +32,14 @@ from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_message
 from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.schemas import serialize
+from msgs_spec.services import PAUSE
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
 
 # Seconds a goal is shown before the robot confirms it.
 _GOAL_PATIENCE = 0.5
+# What a replay can do, and what is the page's own affair.
+_OF_A_REPLAY = (SetPaused, SetSpeed, SetCommanding)
 
 
 class RobotRequests:
@@ -54,6 +58,7 @@ class RobotRequests:
         self._tell = tell
         self._sim = RemoteNode(node, 'sim_node', self._notice)
         self._policy = RemoteNode(node, 'policy_node', self._notice)
+        self._replay: tuple[Replay, RemoteNode] | None = None
         self._spec: TaskSpec | None = None
         self.push_limit = 0.0
         self._is_commanding = False
@@ -84,16 +89,37 @@ class RobotRequests:
             self._kept_goal = None
         self._spec = spec
 
+    def take_replay(self, replay: Replay | None) -> None:
+        """Takes who replays where a robot would be, or None: it is asked instead of the robot."""
+        self._replay = None
+        if replay is not None:
+            self._replay = replay, RemoteNode(self._node, replay.name, self._notice)
+
     def begin_episode(self) -> None:
         """Sends an episode that has begun the goal that people keep."""
-        if self._kept_goal is not None:
+        if self._kept_goal is not None and self._replay is None:
             self._send_goal(self._kept_goal)
+
+    def read_speed(self) -> None:
+        """Asks how fast time shall go; the answer is told when it comes."""
+        self._time.get_parameter(self._speed_name, lambda value: self._tell(speed=value))
+
+    def read_actor(self) -> None:
+        """Asks who acts; the answer is told when it comes."""
+        if self._spec is not None:
+            # Without a name it is the one that comes with the task.
+            shipped = self._spec.name
+            self._policy.get_parameter('policy', lambda name: self._tell(actor=name or shipped))
 
     def perform(self, request: Request | LatestRequest) -> None:
         """Does what the page asks for; what only files understand is nothing to a robot."""
         action = self._actions.get(type(request))
-        if action is not None and self._spec is not None:
-            action(request)
+        if action is None or self._spec is None:
+            return
+        if self._replay is not None and not isinstance(request, _OF_A_REPLAY):
+            self._notice('a replay stops, goes on and changes its speed, no more')
+            return
+        action(request)
 
     def shown_goal(self, goal: Array) -> Array:
         """The goal (goal size,) the page asked for a moment ago, or the robot's."""
@@ -104,9 +130,19 @@ class RobotRequests:
             self._asked_goal = None
         return goal
 
+    @property
+    def _time(self) -> RemoteNode:
+        """The node that makes time go on."""
+        return self._sim if self._replay is None else self._replay[1]
+
+    @property
+    def _speed_name(self) -> str:
+        return 'real_time_factor' if self._replay is None else 'rate'
+
     def _pause(self, request: SetPaused) -> None:
-        self._sim.call('pause', 'std_srvs/srv/SetBool', data=request.is_paused)
-        self._tell(is_paused=request.is_paused)
+        service = 'pause' if self._replay is None else self._replay[0].pause
+        paused = partial(self._tell, is_paused=request.is_paused)
+        self._time.call(service, PAUSE.type_name, paused, data=request.is_paused)
 
     def _step(self, request: StepOnce) -> None:
         del request
@@ -121,11 +157,13 @@ class RobotRequests:
             self._sim.set_parameter('seed', request.seed, reset)
 
     def _set_speed(self, request: SetSpeed) -> None:
-        self._sim.set_parameter('real_time_factor', float(request.factor))
-        self._tell(speed=request.factor)
+        factor = float(request.factor)
+        taken = partial(self._tell, speed=factor, notice=f'{self._speed_name}: {factor:g}')
+        self._time.set_parameter(self._speed_name, factor, taken)
 
     def _choose_actor(self, request: ChooseActor) -> None:
-        self._policy.set_parameter('policy', request.name)
+        taken = partial(self._tell, actor=request.name, notice=f'policy: {request.name}')
+        self._policy.set_parameter('policy', request.name, taken)
 
     def _set_goal(self, request: SetGoal) -> None:
         self._kept_goal = request.values if request.is_kept else None

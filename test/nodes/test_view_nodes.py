@@ -19,9 +19,11 @@ import PIL.Image
 import pytest
 import rclpy
 
+from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.view.live import LiveRobot
+from fetch_hand_sim.view.picture import Facts
 from fetch_hand_sim.view.requests import (
     ChooseActor,
     Push,
@@ -30,14 +32,16 @@ from fetch_hand_sim.view.requests import (
     SetCommanding,
     SetGoal,
     SetPaused,
+    SetSpeed,
     StepOnce,
 )
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.ros import EventLoop, rclpy_profile, ros_message_class
 from msgs_spec.tasks import task_spec
-from msgs_spec.topics import LATCHED, topic
+from msgs_spec.topics import LATCHED, topic, topics
 from msgs_spec.view_topics import scalar_topics
-from support.graph import POLICY_NODE, SIM_NODE, client, end, ros_args
+from support.episode_recorder import Recorder
+from support.graph import POLICY_NODE, SIM_NODE, Client, client, end, ros_args
 
 Start = Callable[..., subprocess.Popen[str]]
 REACH = task_spec('FetchReach')
@@ -46,6 +50,7 @@ VISUALIZATION = (sys.executable, '-m', 'fetch_hand_sim.visualization_node')
 
 
 VIEW_REPLAY = (sys.executable, '-m', 'fetch_hand_sim.replay_node')
+ACTOR = Path(__file__).parents[2] / 'policy_node' / 'actors' / 'FetchReach.safetensors'
 
 
 class Follower:
@@ -112,8 +117,10 @@ def test_another_actor_takes_over(start_process: Start) -> None:
         )
         follower.robot.perform(ChooseActor('nosuch'))
         follower.until(lambda p: 'refuses policy' in p.facts.notice, 'refusal')
+        assert follower.picture.facts.actor == 'FetchReach', 'it acts still'
         follower.robot.perform(ChooseActor('random'))
         follower.until(lambda p: 'random' in p.facts.commander, 'random commander')
+        assert follower.picture.facts.actor == 'random'
         stamp = follower.picture.stamp_ns
         commands = []
 
@@ -124,6 +131,135 @@ def test_another_actor_takes_over(start_process: Start) -> None:
             return len(commands) > 1 and np.ptp(np.stack(commands), axis=0).min() > 0.5
 
         follower.until(has_changed, 'random commands')
+
+
+@pytest.mark.parametrize('policy', ['random', ACTOR])
+def test_the_page_knows_who_acts_from_the_first(start_process: Start, policy: object) -> None:
+    start_process(*POLICY_NODE, *ros_args(policy=policy))
+    start_process(*SIM_NODE, *ros_args(task='FetchReach', wait_for_commands=True))
+    with client(REACH) as connection:
+        follower = Follower(connection)
+        follower.until(lambda p: p.facts.actors and p.facts.actor == str(policy), f'{policy}')
+
+
+def test_the_speed_is_the_one_of_the_robot_whoever_sets_it(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(task='FetchReach', real_time_factor=2.0))
+    with client(REACH) as connection:
+        follower = Follower(connection)
+        follower.until(lambda p: p.facts.speed == 2.0, 'speed that it was started with')
+        set_parameter(connection, '/sim_node', 'real_time_factor', 0.123)
+        follower.until(lambda p: p.facts.speed == 0.123, 'speed that another program has set')
+        follower.robot.perform(SetSpeed(5000.0))
+        follower.until(lambda p: 'refuses real_time_factor' in p.facts.notice, 'refusal')
+        assert follower.picture.facts.speed == 0.123
+        follower.robot.perform(SetSpeed(0.5))
+        follower.until(lambda p: p.facts.speed == 0.5, 'speed of the page')
+        set_parameter(connection, '/sim_node', 'real_time_factor', 0.0)
+        follower.until(lambda p: p.facts.speed == 0.0, 'no speed at all')
+        assert follower.picture.facts.has_speed
+
+
+def test_a_robot_in_lockstep_has_no_speed_to_choose(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(task='FetchReach', mode='lockstep'))
+    start_process(*POLICY_NODE)
+    with client(REACH) as connection:
+        follower = Follower(connection)
+        follower.until(lambda p: p.facts.rate and not p.facts.has_speed, 'lockstep')
+
+
+def test_a_replay_is_told_from_a_robot_and_paused(start_process: Start, tmp_path: Path) -> None:
+    path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
+    start_process(*VIEW_REPLAY, *ros_args(path=path, loop=True, rate=0.8))
+    with client(REACH) as connection:
+        follower = Follower(connection)
+        follower.until(lambda p: p.facts.rate > 10.0 and p.facts.phase == 'running', 'replay')
+        facts = follower.picture.facts
+        assert facts.commander == 'a replay (/replay_node)'
+        assert facts.rate < 30.0 and not facts.takes_actions
+        follower.until(lambda p: p.facts.speed == 0.8, 'its rate')
+        follower.robot.perform(SetSpeed(0.001))
+        follower.until(lambda p: 'refuses rate' in p.facts.notice, 'refusal')
+        assert follower.picture.facts.speed == 0.8
+        follower.robot.perform(SetSpeed(2.0))
+        follower.until(lambda p: p.facts.speed == 2.0, 'other speed')
+        goal = follower.picture.frame.desired_goal
+        follower.robot.perform(SetGoal(goal + 0.1))
+        follower.until(lambda p: 'a replay stops' in p.facts.notice, 'a word about goals')
+        np.testing.assert_array_equal(follower.picture.frame.desired_goal, goal)
+        follower.robot.perform(SetPaused(True))
+        picture = follower.robot.picture() or follower.picture
+        assert not picture.facts.is_paused, 'before it answers'
+        follower.until(lambda p: p.facts.is_paused, 'pause')
+        assert follower.picture.facts.notice == 'paused'
+        connection.spin(0.3)
+        follower.until(lambda p: True, 'picture')
+        stamp = follower.picture.stamp_ns
+        connection.spin(2.5)
+        follower.until(lambda p: True, 'picture')
+        assert follower.picture.stamp_ns == stamp and follower.picture.facts.is_paused
+        # Another program lets it go on.
+        pause(connection, '/replay_node', False)
+        follower.until(lambda p: not p.facts.is_paused and p.stamp_ns != stamp, 'it goes on')
+
+
+def test_a_replay_of_any_name_in_any_namespace_is_paused(
+    start_process: Start, tmp_path: Path
+) -> None:
+    path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
+    names = {each.name for each in topics(REACH) if each.direction == 'published'} - {'/clock'}
+    names_in_left = [word for name in names for word in ('-r', f'/{name}:=/left/{name}')]
+    renamed = ['-r', '__node:=player', '-r', '__ns:=/left', '-r', '~/pause:=/left/halt']
+    start_process(*VIEW_REPLAY, *ros_args(path=path, loop=True), *names_in_left, *renamed)
+    rclpy.init()
+    node = rclpy.create_node('viewer', namespace='left')
+    viewer, loop = LiveRobot(node, may_command=True), EventLoop(node)
+    try:
+
+        def wait_for(condition: Callable[[Facts], object]) -> None:
+            end = time.monotonic() + 30.0
+            while (picture := viewer.picture()) is None or not condition(picture.facts):
+                assert time.monotonic() < end
+                loop.wait(0.05)
+
+        wait_for(lambda facts: facts.commander == 'a replay (/left/player)' and facts.rate > 1.0)
+        viewer.perform(SetPaused(True))
+        wait_for(lambda facts: facts.is_paused)
+        viewer.perform(SetPaused(False))
+        wait_for(lambda facts: not facts.is_paused and facts.notice == 'running')
+    finally:
+        loop.close()
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def test_a_robot_that_does_not_answer_is_not_paused(start_process: Start) -> None:
+    robot = start_process(*SIM_NODE, *ros_args(task='FetchReach'))
+    with client(REACH) as connection:
+        follower = Follower(connection)
+        follower.until(lambda p: p.frame is not None and p.facts.rate > 0.0, 'picture')
+        robot.send_signal(signal.SIGSTOP)
+        connection.spin(0.3)
+        follower.robot.perform(SetPaused(True))
+        connection.spin(1.0)
+        follower.until(lambda p: True, 'picture')
+        assert not follower.picture.facts.is_paused
+        robot.send_signal(signal.SIGCONT)
+        follower.until(lambda p: p.facts.is_paused, 'pause')
+
+
+def set_parameter(connection: Client, node: str, name: str, value: float) -> None:
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+
+    parameter = Parameter(name, value=value).to_parameter_msg()
+    answer = connection.call(SetParameters, f'{node}/set_parameters', parameters=[parameter])
+    assert answer.results[0].successful
+
+
+def pause(connection: Client, node: str, is_paused: bool) -> None:
+    from std_srvs.srv import SetBool
+
+    assert connection.call(SetBool, f'{node}/pause', data=is_paused).success
 
 
 def test_the_page_commands_until_somebody_else_does(start_process: Start) -> None:

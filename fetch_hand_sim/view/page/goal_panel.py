@@ -1,4 +1,4 @@
-"""Sliders for a goal."""
+"""Setting a goal by numbers."""
 
 from __future__ import annotations
 
@@ -15,32 +15,60 @@ from msgs_spec.tasks import GoalKind, TaskSpec
 _FETCH_RANGES = ((1.05, 1.6), (0.4, 1.1), (0.42, 0.9))
 _SLIDE_RANGES = ((1.1, 2.0), (0.4, 1.1), (0.4, 0.45))
 _HAND_RANGES = ((0.94, 1.06), (0.78, 0.96), (0.15, 0.32))
+# Where fingertips get to.
+_FINGERTIP_RANGES = ((0.87, 1.12), (0.76, 0.96), (0.06, 0.27))
+# In the order of `FINGERTIPS`.
+_FINGERS = ('first finger', 'middle finger', 'ring finger', 'little finger', 'thumb')
 
 
 def position_ranges(spec: TaskSpec) -> tuple[tuple[float, float], ...]:
     """Lower and upper ends of the sliders for x, y and z, metres."""
+    if spec.goal is GoalKind.FINGERTIPS:
+        return _FINGERTIP_RANGES
     if not spec.robot.has_gripper_command:
         return _HAND_RANGES
     return _SLIDE_RANGES if spec.name == 'FetchSlide' else _FETCH_RANGES
 
 
-def draw_goal_sliders(spec: TaskSpec, goal: Array, is_kept: bool, send: Send) -> None:
-    """Draws sliders for position and rotation, as far as the task has them."""
-    if spec.goal is GoalKind.FINGERTIPS:
-        imgui.Text('Drag the five balls.')
-    changed = goal.copy()
-    if spec.goal is GoalKind.POINT or (spec.position_counts and spec.goal is GoalKind.POSE):
-        for axis, (name, (lower, upper)) in enumerate(
-            zip('xyz', position_ranges(spec), strict=True)
-        ):
+class GoalPanel:
+    """The part of the robot's panel with the goal, as far as the task has position and rotation.
+
+    Args:
+        send: Gets the goals.
+
+    Attributes:
+        keeps_goal: Whether goals that people set are for later episodes as well.
+    """
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self._finger = 0
+        self.keeps_goal = True
+
+    def draw(self, spec: TaskSpec, goal: Array) -> None:
+        """Draws it for a goal (goal size,), and sends another where something was moved."""
+        self.keeps_goal = imgui.Checkbox('Keep my goal in new episodes', self.keeps_goal)[1]
+        changed = goal.copy()
+        if spec.goal is GoalKind.FINGERTIPS:
             imgui.SetNextItemWidth(ITEM_WIDTH)
-            changed[axis] = imgui.SliderFloat(f'{name} (m)', float(goal[axis]), lower, upper)[1]
-    if spec.goal is GoalKind.POSE:
-        changed[3:] = _draw_angles(spec, goal[3:])
-    if np.abs(changed - goal).max() > 1e-6:
-        send(SetGoal(changed, is_kept))
-    if imgui.Button('Let the task choose again'):
-        send(ReleaseGoal())
+            self._finger = imgui.Combo('finger', self._finger, list(_FINGERS))[1]
+            _draw_position(spec, changed[3 * self._finger : 3 * self._finger + 3])
+        elif spec.position_counts or spec.goal is GoalKind.POINT:
+            _draw_position(spec, changed[:3])
+        if spec.goal is GoalKind.POSE:
+            changed[3:] = _draw_angles(spec, goal[3:])
+        if np.abs(changed - goal).max() > 1e-6:
+            self._send(SetGoal(changed, self.keeps_goal))
+        if imgui.Button('Let the task choose again'):
+            self._send(ReleaseGoal())
+
+
+def _draw_position(spec: TaskSpec, position: Array) -> None:
+    """Sliders for a position (3,), metres, which they change."""
+    for axis, (lower, upper) in enumerate(position_ranges(spec)):
+        imgui.SetNextItemWidth(ITEM_WIDTH)
+        name, value = f'{"xyz"[axis]} (m)', float(position[axis])
+        position[axis] = imgui.SliderFloat(name, value, lower, upper)[1]
 
 
 def _draw_angles(spec: TaskSpec, quaternion: Array) -> Array:

@@ -112,7 +112,7 @@ class Page(plugin.ViewerPlugin):
         size = imgui.GetIO().DisplaySize
         if scene is None or picture is None or picture.frame is None or size.y <= 0:
             return
-        if body_drag is None or not picture.facts.may_command or picture.facts.source != 'live':
+        if body_drag is None or not picture.facts.takes_actions:
             return
         mouse = imgui.GetIO().MousePos
         place = MousePlace(mouse.x / size.x, mouse.y / size.y, size.x / size.y)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
+
 import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
 from fetch_hand_sim.view.page.command_panel import CommandPanel
-from fetch_hand_sim.view.page.goal_panel import draw_goal_sliders
+from fetch_hand_sim.view.page.goal_panel import GoalPanel
 from fetch_hand_sim.view.page.introduction import drag_hint, introduction
 from fetch_hand_sim.view.page.push_panel import PushPanel
 from fetch_hand_sim.view.page.time_controls import draw_pause, draw_speed, draw_step
@@ -17,6 +19,7 @@ from msgs_spec.tasks import TaskSpec
 
 _GREEN = imgui.Vec4(0.1, 0.55, 0.2, 1.0)
 _RED = imgui.Vec4(0.75, 0.2, 0.15, 1.0)
+_WAITING = 'The robot waits for somebody who commands it.'
 
 
 class RobotPanel:
@@ -29,19 +32,20 @@ class RobotPanel:
     def __init__(self, send: Send) -> None:
         self._send = send
         self._seed = 0
-        self._actor = 0
-        self._task = ''
+        self._goal_panel = GoalPanel(send)
         self._command_panel = CommandPanel(send)
         self._push_panel = PushPanel(send)
-        self.keeps_goal = True
+
+    @property
+    def keeps_goal(self) -> bool:
+        """Whether goals that people set are for later episodes as well."""
+        return self._goal_panel.keeps_goal
 
     def draw(self, spec: TaskSpec, picture: Picture) -> None:
         """Draws its content."""
         facts = picture.facts
-        if self._task != spec.name:
-            self._task, self._actor = spec.name, 0
         say(introduction(spec))
-        if facts.source == 'live' and facts.may_command:
+        if facts.takes_actions:
             say(f'{drag_hint(spec)}: the robot follows.')
             if facts.push_limit:
                 say('Drag robot or object with Ctrl to pull at it.')
@@ -59,18 +63,22 @@ class RobotPanel:
             imgui.TextDisabled('This page may only watch.')
             return
         imgui.Separator()
-        self._draw_time(facts)
+        draw_pause(facts.is_paused, 'Run', self._send)
+        if facts.is_replay:
+            draw_speed(facts.speed, self._send)
+            return
+        self._draw_episode(facts)
+        if facts.has_speed:
+            draw_speed(facts.speed, self._send)
         if facts.actors:
-            self._draw_actors(facts)
+            draw_actors(facts, self._send)
         if picture.frame is not None and imgui.CollapsingHeader('Goal'):
-            self.keeps_goal = imgui.Checkbox('Keep my goal in new episodes', self.keeps_goal)[1]
-            draw_goal_sliders(spec, picture.frame.desired_goal, self.keeps_goal, self._send)
+            self._goal_panel.draw(spec, picture.frame.desired_goal)
         self._command_panel.draw(spec, picture)
         if facts.push_limit and imgui.CollapsingHeader('Push it'):
             self._push_panel.draw(spec, facts.push_limit)
 
-    def _draw_time(self, facts: Facts) -> None:
-        draw_pause(facts.is_paused, 'Run', self._send)
+    def _draw_episode(self, facts: Facts) -> None:
         imgui.SameLine()
         imgui.BeginDisabled(not facts.is_paused)
         draw_step('Step', 1, self._send)
@@ -83,19 +91,25 @@ class RobotPanel:
         imgui.SameLine()
         if imgui.Button('With this seed'):
             self._send(Reset(self._seed))
-        draw_speed(facts.speed, self._send)
 
-    def _draw_actors(self, facts: Facts) -> None:
-        imgui.SetNextItemWidth(ITEM_WIDTH)
-        changed, self._actor = imgui.Combo('actor', self._actor, list(facts.actors))
-        if changed:
-            self._send(ChooseActor(facts.actors[self._actor]))
+
+def draw_actors(facts: Facts, send: Send) -> None:
+    """A choice of actors that begins with who acts, so that whatever is chosen is a change."""
+    names, index = list(facts.actors), 0
+    if facts.actor in names:
+        index = names.index(facts.actor)
+    else:
+        names.insert(0, PurePath(facts.actor).name or '-')
+    imgui.SetNextItemWidth(ITEM_WIDTH)
+    changed, index = imgui.Combo('actor', index, names)
+    if changed and names[index] in facts.actors:
+        send(ChooseActor(names[index]))
 
 
 def _draw_state(spec: TaskSpec, picture: Picture) -> None:
     facts = picture.facts
     if picture.frame is None:
-        say('The robot waits for somebody who commands it.')
+        say('Nothing is seen yet.' if facts.is_replay else _WAITING)
     elif picture.frame.is_success:
         imgui.TextColored(_GREEN, 'Goal reached')
     else:
@@ -113,4 +127,4 @@ def _draw_state(spec: TaskSpec, picture: Picture) -> None:
     say(f'commands: {facts.commander or "-"}')
     if facts.source == 'live':
         state = 'paused' if facts.is_paused else f'{facts.rate:.2f} ticks/s'
-        imgui.Text(f'{state}, {facts.missed_ticks} missed')
+        imgui.Text(state if facts.is_replay else f'{state}, {facts.missed_ticks} missed')

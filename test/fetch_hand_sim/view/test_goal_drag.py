@@ -6,8 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from fetch_hand_sim.episodes.goals import FARTHEST_GOAL
+from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.scene import Scene, View, ghost_pose
+from fetch_hand_sim.view.page import goal_panel
 from fetch_hand_sim.view.page.goal_drag import find_handle, handles, moved_goal
+from fetch_hand_sim.view.page.goal_panel import GoalPanel, position_ranges
 from fetch_hand_sim.view.page.ray import MousePlace, mouse_ray
 from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TASKS
@@ -114,3 +118,48 @@ def test_a_pose_moves_only_where_its_position_counts():
     moved = moved_goal(full, goal, handle, ray_at(goal[:3] + 0.02), False, delta)
     np.testing.assert_array_equal(moved[3:], goal[3:])
     assert np.abs(moved[:3] - goal[:3]).max() > 1e-3
+
+
+class Hands:
+    """An ImGui in which somebody chooses a finger and moves one slider by 1 cm."""
+
+    def __init__(self, finger, axis):
+        self.finger, self.axis = finger, axis
+        self.sliders = {}
+
+    def __getattr__(self, name):
+        return lambda *arguments: None
+
+    def Checkbox(self, label, value):
+        return False, value
+
+    def Combo(self, label, index, names):
+        return index != self.finger, self.finger
+
+    def SliderFloat(self, label, value, lower, upper):
+        self.sliders[label] = value, lower, upper
+        return label[0] == self.axis, value + 0.01 * (label[0] == self.axis)
+
+
+@pytest.mark.parametrize('finger', range(5))
+@pytest.mark.parametrize('axis', 'xyz')
+def test_each_fingertip_has_sliders_for_its_goal(monkeypatch, finger, axis):
+    spec, sent = TASKS['HandReach'], []
+    goal = np.linspace(0.1, 1.5, spec.goal.size)
+    monkeypatch.setattr(goal_panel, 'imgui', hands := Hands(finger, axis))
+    GoalPanel(sent.append).draw(spec, goal)
+    assert list(hands.sliders) == ['x (m)', 'y (m)', 'z (m)']
+    assert [value for value, _, _ in hands.sliders.values()] == list(goal.reshape(5, 3)[finger])
+    (request,) = sent
+    moved = np.zeros(spec.goal.size)
+    moved[3 * finger + 'xyz'.index(axis)] = 0.01
+    np.testing.assert_allclose(request.values - goal, moved, atol=1e-12)
+    assert request.is_kept
+
+
+def test_sliders_for_fingertips_reach_the_goals_of_the_task():
+    simulation = Simulation('HandReach', num_threads=1)
+    goals = [simulation.reset(seed=seed)['desired_goal'].reshape(5, 3) for seed in range(100)]
+    for axis, (lower, upper) in enumerate(position_ranges(TASKS['HandReach'])):
+        values = np.array(goals)[..., axis]
+        assert -FARTHEST_GOAL <= lower < values.min() and values.max() < upper <= FARTHEST_GOAL

@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 import rclpy
 
-from fetch_hand_sim.view.requests import OpenEpisode, Push, SetCommand, SetCommanding
+from fetch_hand_sim.view.page import robot_panel, time_controls
+from fetch_hand_sim.view.picture import Facts
+from fetch_hand_sim.view.requests import (
+    ChooseActor,
+    OpenEpisode,
+    Push,
+    SetCommand,
+    SetCommanding,
+    SetPaused,
+    SetSpeed,
+)
 from fetch_hand_sim.view.robot_requests import RobotRequests
 from msgs_spec.codecs import decode
 from msgs_spec.ros import rclpy_profile, ros_message_class
@@ -90,3 +100,51 @@ def test_sliders_command_only_while_they_are_switched_on(desk):
 def test_what_only_files_understand_is_nothing_to_a_robot(desk):
     desk.requests.perform(OpenEpisode(1))
     assert desk.told == {}
+
+
+@pytest.mark.parametrize('desk', ['perturb'], indirect=True)
+def test_who_does_not_answer_is_not_paused(desk):
+    desk.requests.perform(SetPaused(True))
+    assert desk.told == {'notice': 'sim_node does not answer'}
+    desk.requests.perform(SetSpeed(2.0))
+    assert 'speed' not in desk.told
+
+
+class Choice:
+    """An ImGui in which somebody chooses an entry of a list, by its name."""
+
+    def __init__(self, name=None):
+        self.name, self.shown, self.names = name, '', []
+
+    def __getattr__(self, name):
+        return lambda *arguments: None
+
+    def Combo(self, label, index, names):
+        self.shown, self.names = names[index], names
+        wanted = index if self.name is None else names.index(self.name)
+        # It reports only changes.
+        return wanted != index, wanted
+
+
+ACTORS = ('FetchPush', 'random', 'resting')
+
+
+@pytest.mark.parametrize('actor', [*ACTORS, '/home/me/best.safetensors', ''])
+@pytest.mark.parametrize('wanted', ACTORS)
+def test_every_choice_of_an_actor_is_a_change(monkeypatch, actor, wanted):
+    sent = []
+    monkeypatch.setattr(robot_panel, 'imgui', choice := Choice(wanted))
+    robot_panel.draw_actors(Facts(actors=ACTORS, actor=actor), sent.append)
+    assert choice.shown == {'/home/me/best.safetensors': 'best.safetensors', '': '-'}.get(
+        actor, actor
+    )
+    assert sent == ([] if actor == wanted else [ChooseActor(wanted)])
+
+
+@pytest.mark.parametrize(
+    ('speed', 'shown'), [(1.0, 'x 1'), (0.123, 'x 0.123'), (3.0, 'x 3'), (0.0, 'fastest')]
+)
+def test_any_speed_is_shown(monkeypatch, speed, shown):
+    monkeypatch.setattr(time_controls, 'imgui', choice := Choice())
+    time_controls.draw_speed(speed, lambda request: pytest.fail(f'{request} is no choice'))
+    assert choice.shown == shown and 'x 5' in choice.names
