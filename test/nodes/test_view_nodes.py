@@ -115,12 +115,13 @@ def test_another_actor_takes_over(start_process: Start) -> None:
         follower.until(
             lambda p: 'FetchReach' in p.facts.commander and p.facts.actors, 'actor that commands'
         )
+        follower.until(lambda p: p.facts.actor == 'FetchReach', 'its name')
         follower.robot.perform(ChooseActor('nosuch'))
         follower.until(lambda p: 'refuses policy' in p.facts.notice, 'refusal')
         assert follower.picture.facts.actor == 'FetchReach', 'it acts still'
         follower.robot.perform(ChooseActor('random'))
         follower.until(lambda p: 'random' in p.facts.commander, 'random commander')
-        assert follower.picture.facts.actor == 'random'
+        follower.until(lambda p: p.facts.actor == 'random', 'its name')
         stamp = follower.picture.stamp_ns
         commands = []
 
