@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import subprocess
@@ -10,9 +9,12 @@ import sys
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -39,9 +41,21 @@ from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.ros import EventLoop, rclpy_profile, ros_message_class
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import LATCHED, topic, topics
-from msgs_spec.view_topics import scalar_topics
+from msgs_spec.view_topics import scalar_topics, view_topic
 from support.episode_recorder import Recorder
-from support.graph import POLICY_NODE, SIM_NODE, Client, client, end, ros_args
+from support.graph import (
+    POLICY_NODE,
+    SIM_NODE,
+    Client,
+    client,
+    end,
+    episodes_in,
+    finish,
+    payload,
+    ros_args,
+)
+from support.pace import TOPIC, assert_keeps_pace
+from support.visitors import DeafVisitor, Visitor
 
 Start = Callable[..., subprocess.Popen[str]]
 REACH = task_spec('FetchReach')
@@ -321,21 +335,122 @@ def test_the_robot_shares_no_memory_with_who_listens(start_process: Start) -> No
         assert '/dev/shm/fastrtps' in Path('/proc/self/maps').read_text()
 
 
+def open_view(start_process: Start) -> tuple[subprocess.Popen[str], str]:
+    """Starts a viewer; returns its process and where its page is."""
+    view = start_process(*VIEW, '--wait', '30')
+    found = re.search(r'http://(127.0.0.1:\d+)/', view.stdout.readline())
+    assert found, view.communicate()
+    return view, found[1]
+
+
+def wait_for_pictures(connection: Client, visitor: Visitor) -> None:
+    """Waits until a visitor has seen more than it had."""
+    wanted = visitor.pictures + 5
+    connection.spin_until(lambda: visitor.pictures > wanted, 'pictures')
+
+
 @pytest.mark.alone
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP])
-def test_a_viewer_that_dies_or_hangs_is_not_noticed(start_process: Start, number: int) -> None:
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize('harm', ['visitor leaves', 'visitor is deaf', 'SIGSTOP', 'SIGKILL'])
+def test_a_page_or_a_viewer_that_ends_or_hangs_is_not_noticed(
+    start_process: Start, harm: str
+) -> None:
     start_process(*SIM_NODE, *ros_args(task='FetchReach'))
     with client(REACH) as connection:
-        connection.subscribe('achieved_goal')
-        connection.spin_until(lambda: connection.received['achieved_goal'], 'tick')
-        view = start_process(*VIEW)
-        assert re.search(r'http://127.0.0.1:\d+/', view.stdout.readline())
-        assert set(niceness_of_threads(view.pid)) == {10}
-        connection.spin(0.5)
-        os.kill(view.pid, number)
-        count, began = len(connection.received['achieved_goal']), connection.received_at
-        connection.spin(2.0)
-        assert len(connection.received['achieved_goal']) - count >= 40, began.keys()
+        connection.subscribe(TOPIC)
+        connection.spin_until(lambda: connection.received[TOPIC], 'tick')
+
+        @contextmanager
+        def harmed():
+            view, address = open_view(start_process)
+            assert set(niceness_of_threads(view.pid)) == {10}
+            visitor = Visitor(address, 'visitor')
+            wait_for_pictures(connection, visitor)
+            if harm == 'visitor is deaf':
+                with DeafVisitor(address):
+                    yield
+                    # Nor do those who watch beside it.
+                    wait_for_pictures(connection, visitor)
+                end(view)
+            elif harm == 'visitor leaves':
+                visitor.close()
+                yield
+                end(view)
+            else:
+                view.send_signal(signal.Signals[harm])
+                yield
+                view.kill()
+                view.wait()
+
+        assert_keeps_pace(connection, harmed)
+
+
+def watch_everything(connection: Client) -> dict[str, set[int]]:
+    """Subscribes to what `visualization_node` publishes of a tick; returns the stamps by topic."""
+    seen: dict[str, set[int]] = {name: set() for name in ('goal_markers', 'scalars/distance')}
+    try:
+        prepare_opengl()
+        seen['camera/image_raw'] = set()
+    except RuntimeError:
+        pass
+
+    def subscribe(name: str) -> None:
+        source = view_topic(REACH, name)
+
+        def keep(message: Any) -> None:
+            (first, *_) = getattr(message, 'markers', [message])
+            seen[name].add(message_stamp(first))
+
+        kind = ros_message_class(source.type_name)
+        connection.node.create_subscription(kind, name, keep, rclpy_profile(source.qos))
+
+    for name in seen:
+        subscribe(name)
+    return seen
+
+
+@pytest.mark.alone
+def test_episodes_are_logged_to_the_same_bytes_whoever_watches(
+    start_process: Start, tmp_path: Path
+) -> None:
+    """A page with its visitor, markers, scalars and pictures leave no trace in them."""
+
+    def start_robot(name: str) -> subprocess.Popen[str]:
+        settings = {'seed': 7, 'episodes': 8, 'episode_dir': tmp_path / name}
+        lockstep = ros_args(mode='lockstep', wait_for_commands=True, **settings)
+        return start_process(*SIM_NODE, *lockstep)
+
+    robot, policy = start_robot('alone'), start_process(*POLICY_NODE)
+    code, output = finish(robot, 60.0)
+    assert code == 0, output
+    end(policy)
+    robot = start_robot('watched')
+    node = start_process(*VISUALIZATION, *ros_args(camera_width=64, camera_height=48))
+    view, address = open_view(start_process)
+    visitor = Visitor(address, 'visitor')
+    with client(REACH) as connection:
+        seen = watch_everything(connection)
+        wait_for_pictures(connection, visitor)
+        # There is no tick before the first command, but by then all of them are there.
+        connection.spin_until(
+            lambda: (
+                all(connection.node.count_publishers(name) for name in seen)
+                and connection.node.count_subscribers('latest_tick')
+            ),
+            'page and node',
+        )
+        policy = start_process(*POLICY_NODE)
+        connection.spin_until(lambda: robot.poll() is not None, 'end of the robot', 60.0)
+        assert min(map(len, seen.values())) > 1 and len(seen['scalars/distance']) > 8, seen
+    for process in (policy, view, node, robot):
+        end(process)
+    first, second = (episodes_in(tmp_path / name) for name in ('alone', 'watched'))
+    assert len(first) == len(second) == 8
+    for alone, watched in zip(first, second, strict=True):
+        assert payload(alone) == payload(watched)
+        # The one value that tells two runs apart.
+        assert alone.metadata.pop('started') != watched.metadata.pop('started')
+        assert replace(alone, path=watched.path) == watched
 
 
 def test_standard_tools_get_what_they_need(start_process: Start) -> None:
