@@ -1,10 +1,11 @@
 """What viewers cost a robot: the rate of `joint_states` without any, with one, with its visitors.
 
-`make bench-view` runs it. Visitors are web sockets that take every picture and draw none; with
-`--browser` a headless Chromium draws as well, on the same processors. In lockstep a policy that
-rests answers every tick, so ticks per second say what is left of the machine; since that changes by
-itself from one minute to the next, the viewer is stopped (`SIGSTOP`) every other two seconds.
-`taskset -c 0,1 ...` leaves two processors.
+`make bench-view` runs it. Visitors are web sockets that take every picture and draw none, and one
+that asks for everything and then reads and confirms nothing; with `--browser` a headless Chromium
+draws as well, on the same processors. In lockstep a policy that rests answers every tick, so ticks
+per second say what is left of the machine; since that changes by itself from one minute to the
+next, the viewer is stopped (`SIGSTOP`) every other two seconds. `taskset -c 0,1 ...` leaves two
+processors.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from threading import Thread
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'bench'), str(ROOT / 'test')]
@@ -26,12 +26,11 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'bench'), str(ROOT / 'test')]
 import numpy as np  # noqa: E402
 import rclpy  # noqa: E402
 from bench_rate import Watcher, report  # noqa: E402
-from websockets.exceptions import ConnectionClosed  # noqa: E402
-from websockets.sync.client import ClientConnection, connect  # noqa: E402
 
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
 from msgs_spec.transport import keep_discovery_local  # noqa: E402
+from support.visitors import DeafVisitor, Visitor  # noqa: E402
 
 VISITORS = 3
 # Seconds of a turn with the viewer or without, and before it until either is under way.
@@ -66,24 +65,6 @@ def open_view(stack: ExitStack) -> tuple[subprocess.Popen[str], str]:
     raise SystemExit('bench_view: the viewer did not start')
 
 
-def visit(stack: ExitStack, address: str, number: int) -> None:
-    """Takes every picture of a page, and confirms it as a page would."""
-    socket: ClientConnection = connect(
-        f'ws://{address}/state?sid=bench{number}', origin=f'http://{address}', max_size=None
-    )
-
-    def take() -> None:
-        try:
-            for message in socket:
-                if isinstance(message, bytes):
-                    socket.send('state_ack')
-        except ConnectionClosed:
-            pass
-
-    Thread(target=take, daemon=True).start()
-    stack.callback(socket.close)
-
-
 def measure(watcher: Watcher, label: str, seconds: float) -> None:
     """Watches a robot in real time for a while and prints what was seen."""
     watcher.watch(2.0)
@@ -108,7 +89,7 @@ def take_turns(watcher: Watcher, seconds: float) -> None:
     with ExitStack() as stack:
         view, address = open_view(stack)
         for number in range(VISITORS):
-            visit(stack, address, number)
+            stack.callback(Visitor(address, f'bench{number}').close)
         watcher.watch(2.0)
         turns = np.zeros((max(2, round(seconds / _TURN)), 2))
         for index, turn in enumerate(turns):
@@ -136,7 +117,7 @@ def compare(watcher: Watcher, seconds: float, with_browser: bool) -> None:
         view, address = open_view(stack)
         measure(watcher, 'a viewer that nobody visits', seconds)
         for number in range(VISITORS):
-            visit(stack, address, number)
+            stack.callback(Visitor(address, f'bench{number}').close)
         measure(watcher, f'{VISITORS} visitors that do not draw', seconds)
         if with_browser:
             from support.browser import Browser
@@ -145,6 +126,8 @@ def compare(watcher: Watcher, seconds: float, with_browser: bool) -> None:
             stack.callback(browser.close)
             browser.open(f'http://{address}/')
             measure(watcher, 'and a Chromium that draws', seconds)
+        stack.enter_context(DeafVisitor(address))
+        measure(watcher, 'and one that reads and confirms nothing', seconds)
         view.send_signal(signal.SIGSTOP)
         measure(watcher, 'a viewer that is stopped', seconds)
         view.send_signal(signal.SIGCONT)

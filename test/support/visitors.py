@@ -29,7 +29,7 @@ class Visitor:
     def __init__(self, address: str, name: str) -> None:
         self.pictures = 0
         self._connections = ExitStack()
-        socket: ClientConnection = self._connections.enter_context(
+        page = self._connections.enter_context(
             connect(
                 f'ws://{address}/state?sid={name}',
                 origin=f'http://{address}',
@@ -37,18 +37,18 @@ class Visitor:
                 open_timeout=_TIMEOUT,
             )
         )
-        Thread(target=self._take, args=(socket,), daemon=True).start()
+        Thread(target=self._take, args=(page,), daemon=True).start()
 
     def close(self) -> None:
         """Leaves."""
         self._connections.close()
 
-    def _take(self, socket: ClientConnection) -> None:
+    def _take(self, page: ClientConnection) -> None:
         try:
-            for message in socket:
+            for message in page:
                 if isinstance(message, bytes):
                     self.pictures += 1
-                    socket.send('state_ack')
+                    page.send('state_ack')
         except ConnectionClosed:
             pass
 
