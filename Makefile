@@ -39,7 +39,8 @@ help:
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
 	@echo 'make torture    100,000 hostile messages per test, an hour of memory at 20x, 50 killed'
 	@echo '                robots, 10,000 damaged and 2,000 crafted episode files'
-	@echo 'make test-release  the long tests, among them the tutorials; documentation; wheel and'
+	@echo 'make test-release  the long tests, among them the tutorials and, where there is one, an'
+	@echo '                installed Chromium with the page; documentation; wheel and'
 	@echo '                sdist, built, installed elsewhere and used; the tests of Gymnasium-Robotics'
 	@echo 'make bench-episodes  what logging costs and how fast logs load'
 	@echo 'make env        only create $(VENV)'
@@ -81,7 +82,7 @@ lint: env
 	$(BIN)/python -m mypy
 
 test-browser: env
-	VIEW_BROWSER=1 $(BIN)/python -m pytest test/fetch_hand_sim/view/test_page_in_browser.py
+	$(BIN)/python -m pytest -m release test/fetch_hand_sim/view/test_page_in_browser.py
 
 format: env
 	$(BIN)/python -m ruff format $(PYTHON_FILES)

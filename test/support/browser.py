@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
 import urllib.request
+from contextlib import ExitStack
 from io import BytesIO
 from threading import Thread
 from typing import Any
@@ -34,8 +37,23 @@ def find_browser() -> str | None:
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
+# Seconds after which a browser that says nothing counts as broken, on a machine without a GPU that
+# does other things too.
+_PATIENCE = 180.0
 _CONTROL = 2
 _KEY_CODES = {'Control': 17, 'ArrowLeft': 37, 'ArrowUp': 38, 'ArrowRight': 39, 'ArrowDown': 40}
+
+
+def _page_of(port: str) -> str:
+    """Waits for the first page of a browser that starts; returns where to drive it."""
+    end = time.monotonic() + _PATIENCE
+    while time.monotonic() < end:
+        with urllib.request.urlopen(f'http://{port}/json') as answer:
+            pages = [page for page in json.load(answer) if page['type'] == 'page']
+        if pages:
+            return str(pages[0]['webSocketDebuggerUrl'])
+        time.sleep(0.1)
+    raise AssertionError('the browser has no page')
 
 
 class Browser:
@@ -49,6 +67,8 @@ class Browser:
             [program, *OPTIONS, f'--user-data-dir={self._profile}', 'about:blank'],
             stderr=subprocess.PIPE,
             text=True,
+            # So that a signal reaches all of its processes.
+            start_new_session=True,
         )
         assert self._process.stderr is not None
         port = ''
@@ -58,10 +78,18 @@ class Browser:
                 break
         # A full pipe would stop the browser.
         Thread(target=self._process.stderr.read, daemon=True).start()
-        with urllib.request.urlopen(f'http://{port}/json') as answer:
-            pages = [page for page in json.load(answer) if page['type'] == 'page']
+        self._connections = ExitStack()
         # Drawing without a GPU keeps the page from answering for a while.
-        self._socket = connect(pages[0]['webSocketDebuggerUrl'], max_size=None, ping_interval=None)
+        self._socket = self._connections.enter_context(
+            connect(
+                _page_of(port),
+                max_size=None,
+                ping_interval=None,
+                open_timeout=_PATIENCE,
+                # Of a browser that was killed nothing more is to come.
+                close_timeout=0.1,
+            )
+        )
         self._number = 0
         self._modifiers = 0
         self.events: list[dict[str, Any]] = []
@@ -79,7 +107,7 @@ class Browser:
         self._number += 1
         self._socket.send(json.dumps({'id': self._number, 'method': method, 'params': parameters}))
         while True:
-            message = json.loads(self._socket.recv(timeout=180))
+            message = json.loads(self._socket.recv(timeout=_PATIENCE))
             if message.get('id') == self._number:
                 assert 'error' not in message, message
                 result: dict[str, Any] = message['result']
@@ -87,7 +115,11 @@ class Browser:
             self.events.append(message)
 
     def open(self, url: str) -> None:
+        """Opens an address and waits until its page is there, if not drawn."""
+        start = len(self.events)
         self.call('Page.navigate', url=url)
+        while not any(each.get('method') == 'Page.loadEventFired' for each in self.events[start:]):
+            self.events.append(json.loads(self._socket.recv(timeout=_PATIENCE)))
 
     def wait(self, seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -102,6 +134,13 @@ class Browser:
             'Runtime.evaluate', expression=script, returnByValue=True, awaitPromise=True
         )
         return result['result'].get('value')
+
+    def wait_for_frames(self, count: int) -> None:
+        """Waits until the page was drawn some times, however long that takes."""
+        self.run(
+            f'new Promise(done => {{ let left = {count}; const next = () => '
+            'left-- > 0 ? requestAnimationFrame(next) : done(); next(); })'
+        )
 
     def screenshot(self) -> NDArray[np.uint8]:
         """What the page shows, (height, width, 3)."""
@@ -173,7 +212,14 @@ class Browser:
         )
         self.wait(0.25)
 
+    def hang(self) -> None:
+        """Stops all of its processes; only `close` is left to do."""
+        os.killpg(self._process.pid, signal.SIGSTOP)
+
     def close(self) -> None:
-        self._process.kill()
-        self._process.wait()
+        if self._process.poll() is None:
+            # Those that are stopped too.
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        self._connections.close()
         shutil.rmtree(self._profile, ignore_errors=True)
