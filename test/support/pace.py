@@ -14,8 +14,8 @@ TOPIC = 'achieved_goal'
 CONTROL_HZ = 25.0
 # Ticks per second that nobody may cost a robot.
 _LOSS = 0.4
-# Seconds of a turn, and how many pairs of turns there are before the robot is found too slow.
-_TURN = 3.0
+# Seconds before a turn and of a turn; after so many pairs of turns the robot is found too slow.
+_SETTLING, _TURN = 0.5, 3.0
 _PAIRS = 6
 
 
@@ -37,14 +37,17 @@ def assert_keeps_pace(
         alone += progress(connection)
         with beside():
             disturbed += progress(connection)
-        rates = [CONTROL_HZ * simulated / real for simulated, real in (alone, disturbed)]
-        if rates[1] > rates[0] - _LOSS:
+        before, now = (CONTROL_HZ * simulated / real for simulated, real in (alone, disturbed))
+        # Faster than it should be is only how a busy machine delivers.
+        if now > min(before, CONTROL_HZ) - _LOSS:
             return
-    raise AssertionError(f'{rates[1]:.2f} Hz, {rates[0]:.2f} Hz when left alone')
+    raise AssertionError(f'{now:.2f} Hz, {before:.2f} Hz when left alone')
 
 
 def progress(connection: Client) -> np.ndarray:
     """Simulated and real seconds of a turn, from the arrival of one tick to that of another."""
+    # Ticks that came while nobody listened would count with the time at which they are read.
+    connection.spin(_SETTLING)
     began = _next_tick(connection)
     connection.spin(_TURN)
     return _next_tick(connection) - began
