@@ -204,6 +204,8 @@ def robot(start_process):
 
 
 def latest(connection: Client, name: str) -> np.ndarray:
+    # Nothing is served while a browser is waited for, so it may be the first to be.
+    connection.spin_until(lambda: connection.received[name], name, PATIENCE)
     return decode(topic(connection.spec, name), connection.received[name][-1])
 
 
