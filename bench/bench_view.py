@@ -17,7 +17,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -119,18 +119,18 @@ def compare(watcher: Watcher, seconds: float, with_browser: bool) -> None:
         for number in range(VISITORS):
             stack.callback(Visitor(address, f'bench{number}').close)
         measure(watcher, f'{VISITORS} visitors that do not draw', seconds)
-        if with_browser:
-            from support.browser import Browser
-
-            browser = Browser()
-            stack.callback(browser.close)
-            browser.open(f'http://{address}/')
-            measure(watcher, 'and a Chromium that draws', seconds)
-        stack.enter_context(DeafVisitor(address))
-        measure(watcher, 'and one that reads and confirms nothing', seconds)
+        with DeafVisitor(address):
+            measure(watcher, 'and one that reads and confirms nothing', seconds)
         view.send_signal(signal.SIGSTOP)
         measure(watcher, 'a viewer that is stopped', seconds)
         view.send_signal(signal.SIGCONT)
+        if with_browser:
+            from support.browser import Browser
+
+            # Last: it takes the processors that the other rows are to have.
+            with closing(Browser()) as browser:
+                browser.open(f'http://{address}/')
+                measure(watcher, f'{VISITORS} visitors and a Chromium that draws', seconds)
     measure(watcher, 'no viewer any more', seconds)
 
 

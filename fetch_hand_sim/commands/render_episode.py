@@ -85,12 +85,15 @@ def _run(options: argparse.Namespace) -> int:
 def _render(options: argparse.Namespace) -> None:
     from fetch_hand_sim.films.film import STILL, write_film, write_picture
     from fetch_hand_sim.films.pictures import Picture, Studio, grid, tile
-    from fetch_hand_sim.films.recording import Recording, load_recordings
+    from fetch_hand_sim.films.recording import Recording, find_playable, load_recordings
 
     columns, rows = options.grid or (1, 1)
     recordings: list[Recording] = load_recordings(
         options.path, columns * rows, on_skip=lambda error: complain(_NAME, f'skipped {error}')
     )
+    found = len(find_playable(options.path))
+    if found > 1 and options.grid is None:
+        say(f'{recordings[0].title} alone, of {found} episodes; --grid CxR takes several')
     width, height = options.size
     studio = Studio(width, height, options.camera)
     try:

@@ -84,7 +84,7 @@ def _nodes(
     if robot.spec is not None or stop:
         yield []
     elif options.task is None:
-        raise NodeFailure(_nobody(node, options.robot))
+        raise NodeFailure(_nobody(node))
     else:
         with tempfile.NamedTemporaryFile('w+', prefix='view_', suffix='.log') as log:
             started = _start(options, node, log)
@@ -113,20 +113,19 @@ def _check_is_wanted(options: argparse.Namespace, spec: TaskSpec, where: str) ->
         )
 
 
-def _nobody(node: Node, namespace: str) -> str:
+def _nobody(node: Node) -> str:
     """What to say where no robot answers."""
     suffix = '/episode_status'
     topics = (name for name, _ in node.get_topic_names_and_types() if name.endswith(suffix))
     found = sorted(
         name.removesuffix(suffix) or '/' for name in topics if node.count_publishers(name)
     )
-    where = f'/{namespace.strip("/")}'
     hint = (
         f'robots found: {", ".join(found)} (--robot chooses)'
         if found
         else ('start sim_node, or both with: view --task FetchReach')
     )
-    return f'no robot in namespace {where}; {hint}'
+    return f'no robot in namespace {node.get_namespace()}; {hint}'
 
 
 def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> list[subprocess.Popen[str]]:
@@ -141,9 +140,11 @@ def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> list[subpro
     if count_publishers(node, _CLOCK):
         print('/clock comes from another robot: this one does not publish it.', flush=True)
         settings.append('publish_clock:=false')
+    # Of `--robot` or of `--ros-args`.
+    namespace = node.get_namespace()
     return [
-        start_node('policy_node', [f'policy:={policy}'], log, options.robot),
-        start_node('sim_node', settings, log, options.robot),
+        start_node('policy_node', [f'policy:={policy}'], log, namespace),
+        start_node('sim_node', settings, log, namespace),
     ]
 
 

@@ -35,6 +35,8 @@ class Visitor:
                 origin=f'http://{address}',
                 max_size=None,
                 open_timeout=_TIMEOUT,
+                # Waits for a viewer that is stopped, as a page does.
+                ping_interval=None,
             )
         )
         Thread(target=self._take, args=(page,), daemon=True).start()

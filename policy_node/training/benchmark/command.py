@@ -41,6 +41,7 @@ from policy_node.training.benchmark.jobs import ARMS, Job
 from policy_node.training.benchmark.reporting import report, require_readable, ship_all
 from policy_node.training.benchmark.research import FINAL_EPISODES, STUDIES, research_jobs
 from policy_node.training.benchmark.research_report import require_all_runs
+from policy_node.training.benchmark.shared_runs import take_from_other_studies
 from policy_node.training.benchmark.studies import best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
 from policy_node.training.learning.config_rules import FROM_NOTHING
@@ -188,6 +189,9 @@ def _run(options: argparse.Namespace, command: str) -> int:
         jobs = jobs_from_arguments(options)
         if options.study in STUDIES:
             require_all_runs(jobs, _report_folder(options))
+            if options.output is None:
+                # Who names a folder wants runs of their own.
+                take_from_other_studies(jobs, _output(options).parent)
         finished = [job for job in jobs if job.is_finished]
     except (ValueError, TypeError) as error:
         raise UsageError(str(error)) from None

@@ -144,7 +144,10 @@ def test_command_writes_a_film_and_a_picture(folder, tmp_path, capsys):
     for out, more in (('grid.png', ['--grid', '2x2']), ('one.jpg', ['--camera', 'lidar'])):
         path = tmp_path / out
         assert render_episode([str(folder), '--out', str(path), '--size', '64x48', *more]) == 0
-        assert path.name in capsys.readouterr().out
+        said = capsys.readouterr().out.splitlines()
+        assert said[-1].startswith(str(path))
+        alone = ['FetchReach_000000_seed0 alone, of 3 episodes; --grid CxR takes several']
+        assert said[:-1] == ([] if more[0] == '--grid' else alone)
         with Image.open(path) as image:
             assert image.size == ((130, 98) if more[0] == '--grid' else (64, 48))
 

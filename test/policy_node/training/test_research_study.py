@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -11,10 +12,12 @@ import torch
 
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.final import FINAL_FILE
+from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import are_apart, area_under, sum_up
 from policy_node.training.benchmark.research import STEP_COUNTS, STUDIES, Study
 from policy_node.training.benchmark.research_report import BEGIN, END, format_table, read_rows
 from policy_node.training.benchmark.results import Curve
+from policy_node.training.benchmark.shared_runs import take_from_other_studies
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.training_state import Counters, TrainingState, write_state
@@ -148,6 +151,36 @@ def test_a_run_that_was_measured_on_other_episodes_is_measured_again(tmp_path: P
     for episodes in (4, 50):
         (job.folder / FINAL_FILE).write_text(json.dumps({'success': 0.5, 'episodes': episodes}))
         assert job.is_finished is (episodes == 50)
+
+
+def test_a_run_that_another_study_has_is_taken_from_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def jobs_of(study: str, arm: str) -> list[Job]:
+        arguments = ['--study', study, '--tasks', 'FetchPush', '--arms', arm, '--seeds', '0', '1']
+        return jobs_from_arguments(parse_arguments(arguments))
+
+    done, half = jobs_of('targets', 'polyak4')
+    for job in (done, half):
+        job.folder.mkdir(parents=True)
+        counters = Counters(env_steps=job.config.total_steps if job is done else 100)
+        config = dataclasses.asdict(job.config)
+        write_state(job.folder / STATE_FILE, TrainingState({}, counters, {'config': config}))
+        (job.folder / FINAL_FILE).write_text(json.dumps({'success': 0.5, 'episodes': 500}))
+    same, other = jobs_of('returns', 'one'), jobs_of('returns', 'none3')
+    take_from_other_studies([*same, *other], Path('runs/research'))
+    assert [job.is_finished for job in (*same, *other)] == [True, False, False, False]
+    assert capsys.readouterr().out.count('\n') == 1
+    assert [path.name for path in Path('runs/research/returns/FetchPush/one').iterdir()] == [
+        'seed0'
+    ]
+    # What has begun goes on.
+    before = (half.folder / STATE_FILE).read_bytes()
+    (same[0].folder / FINAL_FILE).unlink()
+    take_from_other_studies([half, *same], Path('runs/research'))
+    assert (half.folder / STATE_FILE).read_bytes() == before and not same[0].is_finished
 
 
 def test_runs_of_others_are_not_overwritten(

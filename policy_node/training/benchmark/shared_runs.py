@@ -1,0 +1,48 @@
+"""Runs that another study has already: equal settings give equal runs, so none is made twice."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from policy_node.training.benchmark.jobs import Job
+from policy_node.training.learning.run_folder import STATE_FILE
+
+
+def take_from_other_studies(jobs: Sequence[Job], studies: Path) -> None:
+    """Copies finished runs of other studies into the folders of jobs that are configured alike.
+
+    A copy keeps the command, the revision and the processor time of the run it is of.
+
+    Args:
+        jobs: Jobs of a study; those that have begun are left alone.
+        studies: Folder of all studies, each with `<task>/<arm>/seed<k>`.
+    """
+    for job in jobs:
+        if job.folder.exists() or (found := _equal_run(job, studies)) is None:
+            continue
+        # Whole or not there, and a copy of several that another process makes at the same time.
+        copy = job.folder.with_name(f'.{job.folder.name}.{os.getpid()}')
+        shutil.copytree(found, copy)
+        try:
+            copy.rename(job.folder)
+        except OSError:
+            shutil.rmtree(copy)
+        else:
+            print(f'{job.name} is the run in {found}', flush=True)
+
+
+def _equal_run(job: Job, studies: Path) -> Path | None:
+    """A finished run of any study with the settings of a job."""
+    pattern = f'*/{job.config.task}/*/seed{job.config.seed}/{STATE_FILE}'
+    for state in sorted(studies.glob(pattern)):
+        there = Job(job.arm, job.config, state.parent, final_episodes=job.final_episodes)
+        try:
+            there.check_configuration()
+        except (ValueError, TypeError, OSError):
+            continue
+        if there.is_finished:
+            return state.parent
+    return None
