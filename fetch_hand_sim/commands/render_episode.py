@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _render(options: argparse.Namespace) -> None:
     from fetch_hand_sim.films.film import STILL, write_film, write_picture
-    from fetch_hand_sim.films.pictures import Picture, Studio, grid, tile
+    from fetch_hand_sim.films.pictures import Picture, Studio, framed, grid, tile
     from fetch_hand_sim.films.recording import Recording, find_playable, load_recordings
 
     columns, rows = options.grid or (1, 1)
@@ -98,7 +98,8 @@ def _render(options: argparse.Namespace) -> None:
     studio = Studio(width, height, options.camera)
     try:
         if options.out.suffix.lower() in STILL:
-            stills = [studio.picture(recording, options.frame) for recording in recordings]
+            draw = framed if options.grid else Studio.picture
+            stills = [draw(studio, recording, options.frame) for recording in recordings]
             write_picture(options.out, tile(stills, columns))
             return
         hz = float(recordings[0].arrays.metadata['control_hz'])

@@ -102,8 +102,14 @@ def grid(studio: Studio, recordings: Sequence[Recording], columns: int) -> Itera
 
 
 def _framed(studio: Studio, recording: Recording) -> Iterator[Picture]:
-    for picture, frame in zip(studio.pictures(recording), recording.frames, strict=True):
-        yield with_frame(picture) if frame.is_success else picture
+    for index in range(len(recording.frames)):
+        yield framed(studio, recording, index)
+
+
+def framed(studio: Studio, recording: Recording, index: int) -> Picture:
+    """Returns the picture of one frame as `grid` shows it."""
+    picture = studio.picture(recording, index)
+    return with_frame(picture) if recording.frames[index].is_success else picture
 
 
 def with_frame(picture: Picture) -> Picture:

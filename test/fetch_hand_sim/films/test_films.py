@@ -119,6 +119,20 @@ def test_tiles_lie_in_rows():
     assert sheet[0, 9, 0] == 40 and sheet[7, 0, 0] == 80 and (sheet[7:, 9:] == 255).all()
 
 
+@pytest.mark.usefixtures('opengl')
+def test_in_a_grid_pictures_say_who_is_at_the_goal(folder, tmp_path):
+    recordings = load_recordings(folder, 3)
+    reached = [[frame.is_success for frame in each.frames] for each in recordings]
+    index = next(index for index, each in enumerate(zip(*reached, strict=True)) if any(each))
+    path = tmp_path / 'grid.png'
+    arguments = ['--grid', '3x1', '--out', str(path), '--size', '64x48', '--frame', str(index)]
+    assert render_episode([str(folder), *arguments]) == 0
+    with Image.open(path) as image:
+        edge = np.asarray(image)[24, ::66].astype(int)
+    is_green = edge[:, 1] > edge[:, 0] + 40
+    assert is_green.tolist() == [each[index] for each in reached]
+
+
 def test_a_frame_changes_only_the_edge():
     picture = np.zeros((20, 30, 3), dtype=np.uint8)
     framed = with_frame(picture)
