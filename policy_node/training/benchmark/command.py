@@ -2,7 +2,7 @@
 
 `--study paper`: the paper's comparison, DDPG with and without HER on sparse and dense rewards.
 Trains task x arm x seed, each in <output>/<task>/<arm>/seed<k>, then draws success against steps
-and prints a table beside the published numbers.
+and prints a table beside the published numbers; or, with `--page`, reports as the studies below.
 
 `--study best`: the best recipe of every task, as many at once as there are cores; some start from
 the networks of another. At the end it also evaluates each best actor on fresh episodes and puts it
@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,10 +40,16 @@ from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.jobs import ARMS, Job
 from policy_node.training.benchmark.reporting import report, require_readable, ship_all
-from policy_node.training.benchmark.research import FINAL_EPISODES, STUDIES, research_jobs
+from policy_node.training.benchmark.research import (
+    FINAL_EPISODES,
+    REPEATABLE,
+    STUDIES,
+    Study,
+    research_jobs,
+)
 from policy_node.training.benchmark.research_report import require_all_runs
 from policy_node.training.benchmark.shared_runs import take_from_other_studies
-from policy_node.training.benchmark.studies import best_jobs, paper_jobs, reduced_budget
+from policy_node.training.benchmark.studies import PAPER, best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
 from policy_node.training.learning.config_rules import FROM_NOTHING
 from policy_node.training.learning.config_values import parse_assignment
@@ -78,12 +85,13 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     paper = parser.add_argument_group('study paper').add_argument
     paper('--recipe', choices=FROM_NOTHING, help='of all jobs; default: paper')
     paper('--full', action='store_true', help="the recipe's own budget, not the reduced one")
+    paper('--page', action='store_true', help='renew docs/research/paper')
     best = parser.add_argument_group('study best').add_argument
     best('--actors', type=Path, help='where actors go; default: <output>/actors')
     return parser.parse_args(arguments)
 
 
-_OF_STUDY = {'paper': ('recipe', 'full'), 'best': ('actors',)}
+_OF_STUDY = {'paper': ('recipe', 'full', 'page'), 'best': ('actors',)}
 
 
 def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
@@ -96,9 +104,12 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
         for name in names:
             if study != options.study and getattr(options, name) not in (None, False):
                 raise ValueError(f'--{name} belongs to --study {study}')
-    for name, study in (('arms', 'best'), ('episodes', 'paper')):
-        if getattr(options, name) is not None and study == options.study:
-            raise ValueError(f'--{name} does not belong to --study {study}')
+    if options.arms is not None and options.study == 'best':
+        raise ValueError('--arms does not belong to --study best')
+    if options.episodes is not None and options.study == 'paper' and not options.page:
+        raise ValueError('--episodes does not belong to --study paper without --page')
+    if options.page and (options.full or options.recipe):
+        raise ValueError('--page shows the reduced budget: leave out --full and --recipe')
     overrides = _overrides(options)
     list_jobs = {'paper': _paper, 'best': _best}.get(options.study, _research)
     jobs = list_jobs(options, overrides)
@@ -142,8 +153,10 @@ def _paper(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
     jobs = []
     for task in dict.fromkeys(options.tasks or ['FetchReach']):
         reduced = {} if options.full or recipe != 'paper' else reduced_budget(task)
-        jobs += paper_jobs([task], arms, seeds, recipe, {**reduced, **overrides}, output)
-    return jobs
+        shared = REPEATABLE if options.page else {}
+        jobs += paper_jobs([task], arms, seeds, recipe, {**shared, **reduced, **overrides}, output)
+    episodes = (options.episodes or FINAL_EPISODES) if options.page else 0
+    return [replace(job, final_episodes=episodes) for job in jobs]
 
 
 def _best(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
@@ -164,15 +177,20 @@ def _research(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Jo
     return research_jobs(study, tasks, arms, seeds, overrides, _output(options), episodes)
 
 
+def _study(options: argparse.Namespace) -> Study | None:
+    """The study whose page is renewed; None renews none."""
+    return PAPER if options.page else STUDIES.get(options.study)
+
+
 def _output(options: argparse.Namespace) -> Path:
     folders = {'paper': Path('benchmark'), 'best': Path('best')}
-    folder = folders.get(options.study, Path('research') / options.study)
+    folder = Path('research') / options.study if _study(options) else folders[options.study]
     return Path(options.output or Path('runs') / folder)
 
 
 def _report_folder(options: argparse.Namespace) -> Path:
     pages = Path('docs') / 'research' / options.study
-    return Path(options.report or (pages if options.study in STUDIES else _output(options)))
+    return Path(options.report or (pages if _study(options) else _output(options)))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -187,7 +205,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
         require_extra('cluster')
     try:
         jobs = jobs_from_arguments(options)
-        if options.study in STUDIES:
+        if _study(options) is not None:
             require_all_runs(jobs, _report_folder(options))
             if options.output is None:
                 # Who names a folder wants runs of their own.
@@ -213,9 +231,8 @@ def _make_folder(folder: Path, content: str) -> None:
 
 
 def _run_where_asked(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> bool:
-    is_research = options.study in STUDIES
     # Pages of a study after every run: a machine that is lost then loses one run at most.
-    renew = partial(_report_finished, options, jobs, command) if is_research else None
+    renew = partial(_report_finished, options, jobs, command) if _study(options) else None
     if options.ray:
         return run_jobs(jobs, Ray(command), renew)
     cores = len(os.sched_getaffinity(0))
@@ -229,7 +246,7 @@ def _run_where_asked(options: argparse.Namespace, jobs: Sequence[Job], command: 
 def _report_finished(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> list[Job]:
     """Reports on the jobs that are finished, and returns them."""
     finished = [job for job in jobs if job.is_finished]
-    report(finished, STUDIES.get(options.study), _report_folder(options), command)
+    report(finished, _study(options), _report_folder(options), command)
     return finished
 
 

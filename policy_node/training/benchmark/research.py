@@ -19,7 +19,7 @@ from policy_node.training.learning.recipes import recipe_config
 # Fresh episodes behind the final success of a run.
 FINAL_EPISODES = 500
 # What makes runs repeatable on any processor, and one core enough for a run.
-_SHARED: dict[str, Any] = {
+REPEATABLE: dict[str, Any] = {
     'simulation_threads': 1,
     'torch_threads': 1,
     'precision': 'float32',
@@ -405,7 +405,7 @@ def research_jobs(
     for task in tasks:
         if task not in study.settings:
             raise ValueError(f'--tasks {task}; allowed in {study.name}: {", ".join(study.tasks)}')
-        shared = {**_SHARED, **study.settings[task], **overrides}
+        shared = {**REPEATABLE, **study.settings[task], **overrides}
         for seed in seeds:
             for arm in arms:
                 values = _at_rate({**shared, **arm.changes, 'seed': seed})

@@ -8,6 +8,7 @@ from typing import Any
 
 from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, Job
+from policy_node.training.benchmark.research import Study
 from policy_node.training.learning.recipes import recipe_config
 
 # The long ones first. What XYZ has learnt of turning a block serves every other task of the block;
@@ -83,6 +84,16 @@ def reduced_budget(task: str) -> dict[str, Any]:
         # As many as there are simulations, so that none of them is cut short.
         'evaluation_episodes': 76,
     }
+
+
+PAPER = Study(
+    'paper',
+    None,
+    'What do hindsight and dense rewards do to DDPG, on every task of the paper?',
+    {task: reduced_budget(task) for task in TASKS},
+    tuple(ARMS.values()),
+)
+"""The paper's own comparison as a study with a page."""
 
 
 def paper_jobs(

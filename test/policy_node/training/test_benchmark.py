@@ -23,8 +23,9 @@ from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark import published
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.jobs import ARMS
+from policy_node.training.benchmark.research import REPEATABLE
 from policy_node.training.benchmark.results import Curve, aggregate, read_curve, summarize
-from policy_node.training.benchmark.studies import paper_jobs
+from policy_node.training.benchmark.studies import paper_jobs, reduced_budget
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.run_folder import LOCK_FILE
 from policy_node.training.learning.run_log import COLUMNS
@@ -94,6 +95,18 @@ def test_all_jobs_but_for_arm_and_seed_have_one_configuration(tmp_path: Path) ->
 
     assert all(shared(job.config) == shared(jobs[0].config) for job in jobs)
     assert jobs[0].config.evaluation_episodes <= jobs[0].config.num_envs, 'else cut short'
+
+
+def test_the_page_of_the_paper_shows_its_reduced_budget_on_every_task() -> None:
+    options = parse_arguments(['--page', '--tasks', *TASKS, '--seeds', '0'])
+    jobs = jobs_from_arguments(options)
+    assert len(jobs) == 4 * len(TASKS)
+    for job in jobs:
+        assert job.folder.parts[:3] == ('runs', 'research', 'paper')
+        assert job.config.recipe == 'paper' and job.final_episodes == 500
+        assert all(getattr(job.config, name) == value for name, value in REPEATABLE.items())
+        budget = reduced_budget(job.config.task)
+        assert all(getattr(job.config, name) == value for name, value in budget.items())
 
 
 def test_a_curve_holds_the_evaluations_of_a_log(tmp_path: Path) -> None:
@@ -259,7 +272,9 @@ def test_another_budget_in_the_same_folder_is_refused(
         (['--steps', '0'], 'total_steps 0; allowed: 1 ... '),
         (['--study', 'best', '--arms', 'her_sparse'], '--arms does not belong to --study best'),
         (['--study', 'best', '--full'], '--full belongs to --study paper'),
-        (['--episodes', '10'], '--episodes does not belong to --study paper'),
+        (['--episodes', '10'], '--episodes does not belong to --study paper without --page'),
+        (['--page', '--full'], '--page shows the reduced budget: leave out --full and --recipe'),
+        (['--study', 'goals', '--page'], '--page belongs to --study paper'),
         (['--set', 'init_from=FetchReach'], '--set init_from is not possible'),
         (['--set', 'time_limit=2'], '--set time_limit is not possible: a job ends when its steps'),
         (['--set', 'success_target=.9'], '--set success_target is not possible: a job ends when'),
