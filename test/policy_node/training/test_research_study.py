@@ -18,6 +18,7 @@ from policy_node.training.benchmark.research import STEP_COUNTS, STUDIES, Study
 from policy_node.training.benchmark.research_report import BEGIN, END, format_table, read_rows
 from policy_node.training.benchmark.results import Curve
 from policy_node.training.benchmark.shared_runs import take_from_other_studies
+from policy_node.training.benchmark.studies import PAPER
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.training_state import Counters, TrainingState, write_state
@@ -59,7 +60,7 @@ def test_every_study_has_its_page_and_every_request_its_line() -> None:
     assert {study.request for study in STUDIES.values()} == {None, *range(1, 10)}
 
 
-@pytest.mark.parametrize('study', STUDIES.values(), ids=list(STUDIES))
+@pytest.mark.parametrize('study', [*STUDIES.values(), PAPER], ids=lambda study: study.name)
 def test_a_page_says_what_its_data_say(study: Study) -> None:
     folder = ROOT / 'docs' / 'research' / study.name
     runs, arms = read_rows(folder / 'runs.csv'), read_rows(folder / 'arms.csv')
