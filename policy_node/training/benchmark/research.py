@@ -304,6 +304,11 @@ STUDIES: dict[str, Study] = {
                     'goals in hindsight, weighed per decision',
                     {'strategy': 'future', 'importance': 'decision'},
                 ),
+                Arm(
+                    'moved',
+                    'as if acted for, 4 of 5 from episodes that moved something',
+                    {'strategy': 'future', 'moved_share': 0.8},
+                ),
             ),
         ),
         Study(

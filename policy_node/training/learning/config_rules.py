@@ -27,7 +27,7 @@ _ON_POLICY = {
     **{
         name: _DEFAULTS[name]
         for name in (
-            'noise_spread final_exploration random_steps moved_share ticks_after_drop '
+            'noise_spread final_exploration random_steps ticks_after_drop '
             'first_distance first_rotation narrow_above goal_choice condition n_step discount '
             'advantage noise_seconds parameter_noise longest_hold subgoal_every subgoal_prior '
             'critics norm target policy_delay target_noise temporal_smoothness'

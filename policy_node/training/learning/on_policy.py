@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msgs_spec.tasks import TaskSpec
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.episode_weights import episode_weights
 from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.replay import draw_by
 from policy_node.training.learning.rollouts import (
     Critique,
     RolloutMaker,
@@ -45,12 +48,24 @@ class OnPolicyExperience(Experience):
         self._newest = workers.share(config.num_envs)
         self._rollouts: Rollouts | None = None
         self._made_after = -1
+        self._weigh = episode_weights(config.episode_weights, spec, config.control_hz)
+        self._weight_up_to = np.zeros(0)
 
     def batch(self, env_steps: int) -> Transitions:
         """Draws from the rollouts of the newest cycle; the first call after it makes them."""
         if self._rollouts is None or env_steps != self._made_after:
             self._rollouts, self._made_after = self._roll_out(env_steps), env_steps
-        return self._rollouts.draw(self.batch_size, self.config.gamma, self.generator)
+            self._weight_up_to = np.cumsum(self._weigh(self._rollouts.episodes))
+        return self._rollouts.draw(self._draw_rows(), self.config.gamma, self.generator)
+
+    def _draw_rows(self) -> NDArray[np.int64]:
+        """Draws the rollout of each transition of a batch."""
+        generator, count, share = self.generator, self.batch_size, self.config.moved_share
+        row = generator.integers(len(self._weight_up_to), size=count)
+        if share > 0.0 and self._weight_up_to[-1] > 0.0:
+            chosen = np.flatnonzero(generator.random(count) < share)
+            row[chosen] = draw_by(self._weight_up_to, len(chosen), generator)
+        return row
 
     def _roll_out(self, env_steps: int) -> Rollouts:
         episodes = self.replay.newest(self._newest)

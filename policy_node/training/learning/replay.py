@@ -157,14 +157,14 @@ class EpisodeReplay:
         if self._count_ticks is None:
             row = generator.integers(self._size, size=count)
         else:
-            row = _draw_by(self._ticks_up_to, count, generator)
+            row = draw_by(self._ticks_up_to, count, generator)
         chosen = np.flatnonzero(generator.random(count) < weighted_share)
         if len(chosen) and self._weight_up_to[-1] > 0.0:
-            row[chosen] = _draw_by(self._weight_up_to, len(chosen), generator)
+            row[chosen] = draw_by(self._weight_up_to, len(chosen), generator)
         return row
 
 
-def _draw_by(sums: Array64, count: int, generator: np.random.Generator) -> NDArray[np.int64]:
+def draw_by(sums: Array64, count: int, generator: np.random.Generator) -> NDArray[np.int64]:
     """Draws rows in proportion to what each adds to `sums`."""
     # A draw may round up to the last sum: the last row that adds something is meant.
     last = np.searchsorted(sums, sums[-1])

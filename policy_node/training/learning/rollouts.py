@@ -75,10 +75,11 @@ class Rollouts:
     value_target: Array
     weight: Array
 
-    def draw(self, count: int, gamma: float, generator: np.random.Generator) -> RolloutTransitions:
-        """Draws transitions with replacement."""
-        episodes = self.episodes
-        row = generator.integers(len(episodes), size=count)
+    def draw(
+        self, row: NDArray[np.int64], gamma: float, generator: np.random.Generator
+    ) -> RolloutTransitions:
+        """Draws a transition from each of these episodes, (batch,)."""
+        episodes, count = self.episodes, len(row)
         tick = generator.integers(episodes.ticks, size=count)
         return RolloutTransitions(
             observation=episodes.observation[row, tick],

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from msgs_spec.tasks import task_spec
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning import ppo
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.learners import make_learner
 from policy_node.training.learning.ppo import PPO, log_probability
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import Episodes
@@ -22,6 +24,7 @@ from policy_node.training.learning.rollouts import (
     decision_weights,
     goals_in_hindsight,
 )
+from policy_node.training.learning.sampling import TransitionSampler
 from policy_node.training.learning.trainer import Trainer
 from policy_node.training.learning.transitions import Transitions
 from support.refusals import assert_refused
@@ -117,7 +120,8 @@ def learn(cycles: int, **changes: object) -> tuple[PPO, RolloutMaker]:
         goals = [goals_in_hindsight(episodes, {'random': 1.0}, generator) for _ in range(copies)]
         rollouts = maker.make(episodes, goals)
         for _ in range(20):
-            learner.update(rollouts.draw(256, config.gamma, generator))
+            row = generator.integers(len(rollouts.episodes), size=256)
+            learner.update(rollouts.draw(row, config.gamma, generator))
         learner.average()
     return learner, maker
 
@@ -151,9 +155,34 @@ def test_rollouts_hold_every_episode_once_for_each_goal() -> None:
         np.zeros((4, 1), np.float32), rollouts.episodes.desired_goal, rollouts.episodes.action[:, 0]
     )
     np.testing.assert_allclose(rollouts.log_probability[:, 0], logs, rtol=1e-5)
-    batch = rollouts.draw(50, 0.5, np.random.default_rng(0))
+    row = np.arange(50) % 4
+    batch = rollouts.draw(row, 0.5, np.random.default_rng(0))
+    np.testing.assert_array_equal(batch.goal, rollouts.episodes.desired_goal[row])
     place = np.where(batch.goal[:, 0] == 0.5, batch.action[:, 0] < 0, 2 + (batch.goal[:, 0] < 0))
     np.testing.assert_array_equal(batch.reward, rollouts.reward[place.astype(int), 0])
+
+
+@pytest.mark.parametrize('share', [0.0, 0.75, 1.0])
+def test_a_share_of_a_batch_is_from_episodes_that_moved_the_object(share: float) -> None:
+    config = recipe_config('FetchPush', 'best', **ON_POLICY, moved_share=share, batch_size=4000)
+    spec, generator = task_spec('FetchPush'), np.random.default_rng(0)
+    sampler = TransitionSampler(
+        lambda achieved, desired: -1.0 * (np.linalg.norm(achieved - desired, axis=-1) > 0.05), 0.98
+    )
+    cpu = torch.device('cpu')
+    _, experience = make_learner(config, spec, cpu, Workers(), sampler, generator)
+    count, ticks = config.num_envs, spec.episode_ticks
+    observation = np.zeros((count, ticks + 1, spec.observation_size), np.float32)
+    observation[:, :, 0] = np.arange(count)[:, None]
+    achieved = np.zeros((count, ticks + 1, 3), np.float32)
+    moved = np.array([2, 5])
+    achieved[moved, 20:] = 0.1
+    goal, action = np.ones((count, 3), np.float32), np.zeros((count, ticks, 4), np.float32)
+    experience.replay.add(Episodes(observation, achieved, goal, action))
+    drawn = experience.batch(0).observation[:, 0]
+    found = np.isin(drawn, moved).mean()
+    assert found == pytest.approx(share + (1 - share) * 2 / count, abs=0.03)
+    assert set(drawn) >= set(moved)
 
 
 def test_updates_move_probabilities_less_far_with_the_clip_than_without(
@@ -176,7 +205,8 @@ def log_ratio_after_updates() -> tuple[np.ndarray, np.ndarray]:
     rollouts = maker.make(episodes, [])
     generator = np.random.default_rng(0)
     for _ in range(300):
-        learner.update(rollouts.draw(256, 0.5, generator))
+        row = generator.integers(len(rollouts.episodes), size=256)
+        learner.update(rollouts.draw(row, 0.5, generator))
     logs = learner.log_probabilities(episodes.observation[:, 0], goal, action[:, 0])
     return logs - rollouts.log_probability[:, 0], rollouts.advantage[:, 0] > 0
 
