@@ -91,8 +91,7 @@ def _render(options: argparse.Namespace) -> None:
     recordings: list[Recording] = load_recordings(
         options.path, columns * rows, on_skip=lambda error: complain(_NAME, f'skipped {error}')
     )
-    found = len(find_playable(options.path))
-    if found > 1 and options.grid is None:
+    if options.grid is None and (found := len(find_playable(options.path))) > 1:
         say(f'{recordings[0].title} alone, of {found} episodes; --grid CxR takes several')
     width, height = options.size
     studio = Studio(width, height, options.camera)

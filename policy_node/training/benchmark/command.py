@@ -21,7 +21,6 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,13 +39,7 @@ from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.jobs import ARMS, Job
 from policy_node.training.benchmark.reporting import report, require_readable, ship_all
-from policy_node.training.benchmark.research import (
-    FINAL_EPISODES,
-    REPEATABLE,
-    STUDIES,
-    Study,
-    research_jobs,
-)
+from policy_node.training.benchmark.research import FINAL_EPISODES, STUDIES, Study, research_jobs
 from policy_node.training.benchmark.research_report import require_all_runs
 from policy_node.training.benchmark.shared_runs import take_from_other_studies
 from policy_node.training.benchmark.studies import PAPER, best_jobs, paper_jobs, reduced_budget
@@ -111,8 +104,11 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
     if options.page and (options.full or options.recipe):
         raise ValueError('--page shows the reduced budget: leave out --full and --recipe')
     overrides = _overrides(options)
-    list_jobs = {'paper': _paper, 'best': _best}.get(options.study, _research)
-    jobs = list_jobs(options, overrides)
+    of_a_page = _study(options)
+    if of_a_page is not None:
+        jobs = _research(of_a_page, options, overrides)
+    else:
+        jobs = {'paper': _paper, 'best': _best}[options.study](options, overrides)
     for job in jobs:
         job.check_configuration()
     return jobs
@@ -127,11 +123,10 @@ def _overrides(options: argparse.Namespace) -> dict[str, Any]:
     overrides = {name: value for name, value in chosen.items() if value is not None}
     overrides.update(parse_assignment(text) for text in options.set)
     decided: tuple[str, ...] = ('task', 'recipe', 'seed', 'init_from')
-    if options.study == 'paper':
+    if (study := _study(options)) is not None:
+        decided = (*decided, *(name for arm in study.arms for name in arm.changes))
+    elif options.study == 'paper':
         decided = (*decided, 'reward_type')
-    elif options.study in STUDIES:
-        arms = STUDIES[options.study].arms
-        decided = (*decided, *(name for arm in arms for name in arm.changes))
     for name in decided:
         if name in overrides:
             raise ValueError(f'--set {name} is not possible: jobs differ in it')
@@ -153,10 +148,8 @@ def _paper(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
     jobs = []
     for task in dict.fromkeys(options.tasks or ['FetchReach']):
         reduced = {} if options.full or recipe != 'paper' else reduced_budget(task)
-        shared = REPEATABLE if options.page else {}
-        jobs += paper_jobs([task], arms, seeds, recipe, {**shared, **reduced, **overrides}, output)
-    episodes = (options.episodes or FINAL_EPISODES) if options.page else 0
-    return [replace(job, final_episodes=episodes) for job in jobs]
+        jobs += paper_jobs([task], arms, seeds, recipe, {**reduced, **overrides}, output)
+    return jobs
 
 
 def _best(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
@@ -167,8 +160,7 @@ def _best(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
     return best_jobs(tasks, seeds, {**threads, **overrides}, _output(options))
 
 
-def _research(options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
-    study = STUDIES[options.study]
+def _research(study: Study, options: argparse.Namespace, overrides: dict[str, Any]) -> list[Job]:
     seeds = list(dict.fromkeys(options.seeds or range(study.seeds)))
     tasks = list(dict.fromkeys(options.tasks or study.tasks[:1]))
     names = dict.fromkeys(options.arms or [arm.name for arm in study.arms])

@@ -1,8 +1,8 @@
 """The studies: what each compares, as data. Nine answer the paper's requests for research.
 
 All arms of a study share task, budget and settings and differ in `changes` alone. Settings are the
-`best` recipe but for what is named here. Every run is one of `train_her`: on one thread it gives
-the same bits from the same seed.
+`best` recipe, or the study's own, but for what is named here. Every run is one of `train_her`: on
+one thread it gives the same bits from the same seed.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ class Study:
         settings: Fields of `TrainConfig` for all arms, by task; the first task is the default.
         arms: What is compared; the first is the baseline.
         seeds: How many by default.
+        recipe: That all arms start from.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Study:
     settings: Mapping[str, Mapping[str, Any]]
     arms: tuple[Arm, ...]
     seeds: int = 5
+    recipe: str = 'best'
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -414,7 +416,7 @@ def research_jobs(
         for seed in seeds:
             for arm in arms:
                 values = _at_rate({**shared, **arm.changes, 'seed': seed})
-                config = recipe_config(task, 'best', **values)
+                config = recipe_config(task, study.recipe, **values)
                 folder = output / task / arm.name / f'seed{seed}'
                 jobs.append(Job(arm, config, folder, final_episodes=episodes))
     return jobs

@@ -92,6 +92,7 @@ PAPER = Study(
     'What do hindsight and dense rewards do to DDPG, on every task of the paper?',
     {task: reduced_budget(task) for task in TASKS},
     tuple(ARMS.values()),
+    recipe='paper',
 )
 """The paper's own comparison as a study with a page."""
 
