@@ -232,7 +232,7 @@ STUDIES: dict[str, Study] = {
             'Does hindsight take a gamble for a sure thing, and what cures it?',
             {
                 'FetchReach': {**_REACH, 'gamble': True},
-                'FetchPush': {**_PUSH, 'gamble': True},
+                'FetchPush': {**_PICK, 'gamble': True},
             },
             (
                 Arm('future', 'future goals', {'strategy': 'future'}),

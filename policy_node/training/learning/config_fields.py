@@ -73,7 +73,7 @@ class ConfigFields:
     """Share of a batch drawn by `episode_weights`; 0 draws uniformly."""
     episode_weights: str = 'moved'
     """Weights of episodes: `moved` (1 where the achieved goal moved, else 0) or `energy` (given to
-    the object)."""
+    the object). Where a `gamble` landed counts for neither."""
     ticks_after_drop: int = -1
     """Ticks after an object fell off the palm that are still learnt from; -1 is all."""
     drop_is_lost: bool = False

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
+from policy_node.training.learning.gamble import without_landings
 from policy_node.training.learning.replay import Episodes, has_moved
 
 _GRAVITY = 9.81
@@ -19,11 +20,23 @@ Weights = Callable[[Episodes], NDArray[np.float64]]
 LastTicks = Callable[[Episodes], NDArray[np.int64]]
 
 
-def episode_weights(kind: str, spec: TaskSpec, control_hz: float) -> Weights:
-    """Returns what weighs episodes: 1 or 0 for `moved`, the energy of the goal for `energy`."""
-    if kind == 'energy':
-        return lambda episodes: episode_energy(episodes, spec.goal, control_hz)
-    return lambda episodes: has_moved(episodes).astype(np.float64)
+def episode_weights(kind: str, spec: TaskSpec, control_hz: float, gamble: bool = False) -> Weights:
+    """Returns what weighs episodes: 1 or 0 for `moved`, the energy of the goal for `energy`.
+
+    Args:
+        kind: One of the two.
+        spec: The task.
+        control_hz: Action frequency.
+        gamble: Whether episodes may end in a random landing, which counts as no motion.
+    """
+
+    def weigh(episodes: Episodes) -> NDArray[np.float64]:
+        own = without_landings(episodes, spec) if gamble else episodes
+        if kind == 'energy':
+            return episode_energy(own, spec.goal, control_hz)
+        return has_moved(own).astype(np.float64)
+
+    return weigh
 
 
 def episode_energy(episodes: Episodes, goal: GoalKind, control_hz: float) -> NDArray[np.float64]:

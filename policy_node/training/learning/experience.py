@@ -67,7 +67,7 @@ class Experience:
             spec.robot.action_size
             + (config.longest_hold > 1)
             + subgoal_columns(config.subgoal_every, spec.goal.size),
-            episode_weights(config.episode_weights, spec, config.control_hz),
+            episode_weights(config.episode_weights, spec, config.control_hz, config.gamble),
             self._count_ticks,
         )
 

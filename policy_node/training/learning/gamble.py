@@ -8,6 +8,7 @@ their gripper action, so it can be that special one and everything else stays as
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.simulation import Seeds
 from msgs_spec.arrays import Array
+from msgs_spec.tasks import TaskSpec
 from policy_node.training.learning.config_rules import require_idle_gripper
+from policy_node.training.learning.replay import Episodes
 
 # The idle part of the action, and the value above which it is the gamble.
 GRIPPER_ACTION = 3
@@ -52,11 +55,7 @@ class GambleSimulation(Simulation):
         self._over = np.zeros(count, np.bool_)
         self._landing = np.zeros((count, self.spec.goal.size))
         self._frozen = np.zeros((count, self.spec.observation_size))
-        starts = np.cumsum([0, *(part.size for part in self.spec.observation)]).tolist()
-        self._parts = {
-            part.name: slice(start, start + part.size)
-            for part, start in zip(self.spec.observation, starts, strict=False)
-        }
+        self._parts = _parts(self.spec)
 
     def __getstate__(self) -> dict[str, Any]:
         """That of `Simulation`, and which episodes are over and how they look."""
@@ -106,3 +105,23 @@ class GambleSimulation(Simulation):
         achieved = np.where(over, self._landing, observation['achieved_goal'])
         shown = np.where(over, self._frozen, observation['observation'])
         return {**observation, 'observation': shown, 'achieved_goal': achieved}
+
+
+def without_landings(episodes: Episodes, spec: TaskSpec) -> Episodes:
+    """The episodes with what was achieved by a gamble taken back to their start.
+
+    A landing is no motion of the robot's: which episodes have moved something is decided by what
+    comes before it.
+    """
+    over = episodes.observation[..., _parts(spec)['gripper_state'].start] == _OVER
+    first = episodes.achieved_goal[:, :1]
+    return replace(episodes, achieved_goal=np.where(over[..., None], first, episodes.achieved_goal))
+
+
+def _parts(spec: TaskSpec) -> dict[str, slice]:
+    """Where the parts of an observation lie, by name."""
+    starts = np.cumsum([0, *(part.size for part in spec.observation)]).tolist()
+    return {
+        part.name: slice(start, start + part.size)
+        for part, start in zip(spec.observation, starts, strict=False)
+    }

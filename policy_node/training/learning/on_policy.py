@@ -48,7 +48,9 @@ class OnPolicyExperience(Experience):
         self._newest = workers.share(config.num_envs)
         self._rollouts: Rollouts | None = None
         self._made_after = -1
-        self._weigh = episode_weights(config.episode_weights, spec, config.control_hz)
+        self._weigh = episode_weights(
+            config.episode_weights, spec, config.control_hz, config.gamble
+        )
         self._weight_up_to = np.zeros(0)
 
     def batch(self, env_steps: int) -> Transitions:

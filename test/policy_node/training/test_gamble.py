@@ -11,6 +11,7 @@ import torch
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.episode_weights import episode_weights
 from policy_node.training.learning.gamble import GambleSimulation
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import Episodes
@@ -139,3 +140,27 @@ def test_weights_take_back_what_hindsight_does() -> None:
     assert biased['gamble'] == pytest.approx(-0.4, abs=0.15)
     assert weighted['gamble'] == pytest.approx(-0.8, abs=0.15)
     assert weighted['walk'] == pytest.approx(-1.0, abs=0.1)
+
+
+def test_a_landing_is_no_motion_of_the_robot() -> None:
+    simulation = GambleSimulation('FetchPush', num_envs=2)
+    observations, achieved = [], []
+    for observation in (
+        simulation.reset(seed=3),
+        simulation.step([GAMBLE, WALK]).observation,
+        simulation.step([GAMBLE, WALK]).observation,
+    ):
+        observations.append(observation['observation'].copy())
+        achieved.append(observation['achieved_goal'].copy())
+    episodes = Episodes(
+        np.stack(observations, axis=1).astype(np.float32),
+        np.stack(achieved, axis=1).astype(np.float32),
+        simulation.goals.astype(np.float32),
+        np.zeros((2, 2, 4), np.float32),
+    )
+    # The second block is pushed before its robot gambles.
+    episodes.achieved_goal[1, 1:, 0] += 0.05
+    spec = simulation.spec
+    assert episode_weights('moved', spec, 25.0)(episodes).tolist() == [1.0, 1.0]
+    assert episode_weights('moved', spec, 25.0, gamble=True)(episodes).tolist() == [0.0, 1.0]
+    assert episode_weights('energy', spec, 25.0, gamble=True)(episodes)[0] == 0.0
