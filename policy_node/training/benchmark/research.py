@@ -89,8 +89,8 @@ _SCREENED = {'evaluate_every': 64_000, 'evaluation_episodes': 128}
 # Sparse, with settings that the dense recipe of the task does not have.
 _SPARSE_HAND_REACH = {
     **_LONG,
-    'total_steps': 2_000_000,
-    'evaluate_every': 64_000,
+    'total_steps': 640_000,
+    'evaluate_every': 32_000,
     'reward_type': 'sparse',
     'action_l2': 0.1,
     'gamma': 0.95,
@@ -333,7 +333,8 @@ STUDIES: dict[str, Study] = {
             'What keeps learning alive where actions are very frequent?',
             {
                 'FetchReach': {**_REACH, 'evaluation_episodes': 16},
-                'FetchPush': _PUSH,
+                # A replay that holds all ticks of a run at 250 Hz.
+                'FetchPush': {**_LONG, 'total_steps': 600_000, 'replay_transitions': 6_000_000},
             },
             _rates(),
         ),
