@@ -124,7 +124,7 @@ def _overrides(options: argparse.Namespace) -> dict[str, Any]:
     overrides.update(parse_assignment(text) for text in options.set)
     decided: tuple[str, ...] = ('task', 'recipe', 'seed', 'init_from')
     if (study := _study(options)) is not None:
-        decided = (*decided, *(name for arm in study.arms for name in arm.changes))
+        decided = (*decided, *(name for arm in study.arms for name in arm.own))
     elif options.study == 'paper':
         decided = (*decided, 'reward_type')
     for name in decided:

@@ -36,11 +36,18 @@ class Arm:
         name: Name of the folder and of the command-line option.
         label: Name in figures and tables.
         changes: Fields of `TrainConfig` that are the arm's own.
+        factors: Whole-numbered fields of which it has that many times what the others have.
     """
 
     name: str
     label: str
     changes: Mapping[str, Any] = field(default_factory=dict)
+    factors: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def own(self) -> dict[str, Any]:
+        """Fields in which it differs, and how."""
+        return {**self.changes, **{name: f'x{factor}' for name, factor in self.factors.items()}}
 
 
 _NO_HINDSIGHT = {'strategy': 'none', 'goals': ''}

@@ -7,6 +7,7 @@ one thread it gives the same bits from the same seed.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -194,7 +195,7 @@ def _rates() -> tuple[Arm, ...]:
 
 
 def _ensembles() -> tuple[Arm, ...]:
-    """One critic, and two or five with each way to be one."""
+    """One critic, two or five with each way to be one, quantiles, and more updates per step."""
     several = [
         Arm(
             f'{aggregate}{critics}',
@@ -209,7 +210,19 @@ def _ensembles() -> tuple[Arm, ...]:
             (5, 'truncated'),
         )
     ]
-    return (Arm('one', 'one critic', {'critics': 1}), *several)
+    quantiles = [
+        Arm('quantiles', 'one critic of 25 quantiles', {'quantiles': 25}),
+        Arm(
+            'tqc2',
+            '2 critics of 25 quantiles, truncated (TQC)',
+            {'critics': 2, 'quantiles': 25, 'aggregate': 'truncated'},
+        ),
+    ]
+    more = [
+        Arm(f'updates{times}', f'{times} times the updates', factors={'updates_per_cycle': times})
+        for times in (2, 4)
+    ]
+    return (Arm('one', 'one critic', {'critics': 1}), *several, *quantiles, *more)
 
 
 STUDIES: dict[str, Study] = {
@@ -421,6 +434,8 @@ def research_jobs(
             for arm in arms:
                 values = _at_rate({**shared, **arm.changes, 'seed': seed})
                 config = recipe_config(task, study.recipe, **values)
+                more = {name: getattr(config, name) * by for name, by in arm.factors.items()}
+                config = dataclasses.replace(config, **more)
                 folder = output / task / arm.name / f'seed{seed}'
                 jobs.append(Job(arm, config, folder, final_episodes=episodes))
     return jobs

@@ -228,7 +228,7 @@ def _about(study: Study, jobs: Sequence[Job], command: str, path: Path) -> dict[
         'study': study.name,
         'request': study.request,
         'question': study.question,
-        'arms': {arm.name: dict(arm.changes) for arm in study.arms},
+        'arms': {arm.name: arm.own for arm in study.arms},
         'tasks': tasks,
     }
 
@@ -243,7 +243,7 @@ def _tasks_told(path: Path) -> dict[str, Any]:
 
 def _shared_settings(study: Study, jobs: Sequence[Job]) -> dict[str, dict[str, Any]]:
     """By task, the fields of `TrainConfig` that all arms share."""
-    own = {'seed', *(name for arm in study.arms for name in arm.changes)}
+    own = {'seed', *(name for arm in study.arms for name in arm.own)}
     if 'control_hz' in own:
         own |= set(STEP_COUNTS)
     configs = {job.config.task: dataclasses.asdict(job.config) for job in jobs}

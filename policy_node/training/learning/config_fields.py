@@ -171,6 +171,9 @@ class ConfigFields:
     aggregate: str = 'mean'
     """What targets take of several critics: `mean`, `min` or `truncated` (the mean without the
     highest)."""
+    quantiles: int = 1
+    """Quantiles of the return that each critic learns; 1 is its mean alone. Targets then take all
+    of them (`mean`), or leave out the highest 2 in 25 (`truncated`: TQC, arXiv 2005.04269)."""
 
     random_epsilon: float = 0.3
     """Probability of a uniformly random action."""

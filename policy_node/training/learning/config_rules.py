@@ -19,7 +19,7 @@ RECIPES = (*FROM_NOTHING, 'finetune')
 # Tasks that ignore their gripper action.
 GAMBLE_TASKS = ('FetchReach', 'FetchPush')
 _DEFAULTS = {field.name: field.default for field in dataclasses.fields(ConfigFields)}
-_OF_NETWORKS = 'algorithm longest_hold advantage subgoal_every'.split()
+_OF_NETWORKS = 'algorithm longest_hold advantage subgoal_every quantiles'.split()
 """Fields that decide what kind of networks there are; most runs have their defaults."""
 _ON_POLICY = {
     'overlap': False,
@@ -30,7 +30,7 @@ _ON_POLICY = {
             'noise_spread final_exploration random_steps ticks_after_drop '
             'first_distance first_rotation narrow_above goal_choice condition n_step discount '
             'advantage noise_seconds parameter_noise longest_hold subgoal_every subgoal_prior '
-            'critics norm target policy_delay target_noise temporal_smoothness'
+            'critics quantiles norm target policy_delay target_noise temporal_smoothness'
         ).split()
     },
 }
@@ -73,6 +73,7 @@ RANGES = (
     ('trace', 0, 1 - 1e-6),
     ('cut_distance', 0, 2),
     ('critics', 1, 100),
+    ('quantiles', 1, 1000),
     ('noise_spread', 0, 1),
     ('noise_seconds', 0, 10),
     ('longest_hold', 1, 1000),
@@ -227,8 +228,13 @@ def _contradictions_of_values(config: ConfigFields) -> Iterator[str]:
         yield f'learning_starts needs replay_transitions of {config.learning_starts} or more'
     if config.correction != 'none' and config.n_step == 1:
         yield f'correction {config.correction} needs n_step above 1'
-    if config.aggregate != 'mean' and config.critics == 1:
+    truncates = config.aggregate == 'truncated' and config.quantiles > 1
+    if config.aggregate != 'mean' and config.critics == 1 and not truncates:
         yield f'aggregate {config.aggregate} needs critics above 1'
+    if config.quantiles > 1 and config.aggregate == 'min':
+        yield 'quantiles above 1 exclude aggregate min; allowed: mean, truncated'
+    if config.quantiles > 1 and (config.norm == 'batch' or config.advantage):
+        yield 'quantiles above 1 exclude norm batch and advantage'
     if config.norm != 'none' and config.layer_norm:
         yield f'norm {config.norm} excludes layer_norm, which is for the critic too'
     if config.norm == 'batch' and config.target != 'none':

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import torch
@@ -40,19 +40,27 @@ class Critic(nn.Module):
         inputs: Length of features and action together.
         shape: Its hidden layers.
         norm: What normalises them: `none`, `layer` or `batch`.
+        outputs: Quantiles of the return that it learns; 1 is its mean.
     """
 
-    def __init__(self, inputs: int, shape: NetworkShape, norm: str = 'none') -> None:
+    def __init__(
+        self, inputs: int, shape: NetworkShape, norm: str = 'none', outputs: int = 1
+    ) -> None:
         super().__init__()
         layers = replace(shape, layer_norm=True) if norm == 'layer' else shape
-        self.network = MLP(inputs, 1, layers)
+        self.network = MLP(inputs, outputs, layers)
         if norm == 'batch':
             _add_batch_norm(self.network)
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
-        """Returns values (batch,), float32."""
-        value: Tensor = self.network(torch.cat([features, action], dim=-1))
-        return value.squeeze(-1)
+        """Returns values (batch,), float32: what a mean or quantiles say."""
+        said = self.quantiles(features, action)
+        return said.squeeze(-1) if said.shape[-1] == 1 else said.mean(dim=-1)
+
+    def quantiles(self, features: Tensor, action: Tensor) -> Tensor:
+        """Returns quantiles (batch, outputs) of the return, float32."""
+        said: Tensor = self.network(torch.cat([features, action], dim=-1))
+        return said
 
 
 class Ensemble(nn.Module):
@@ -69,6 +77,15 @@ class Ensemble(nn.Module):
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """Returns values (critics, batch), float32."""
         return torch.stack([member(features, action) for member in self.members])
+
+    def quantiles(self, features: Tensor, action: Tensor) -> Tensor:
+        """Returns quantiles (critics, batch, outputs) of the return, float32."""
+        return torch.stack([member.quantiles(features, action) for member in self._critics()])
+
+    def _critics(self) -> Iterator[Critic]:
+        for member in self.members:
+            assert isinstance(member, Critic)
+            yield member
 
     def completed(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         """These, and its own tensors for the members of which they have nothing."""
@@ -148,9 +165,8 @@ def make_critic(config: TrainConfig, features: int, shape: NetworkShape) -> nn.M
     if config.advantage:
         return AdvantageCritic(features, shape, config.norm, config.tick_share)
     inputs = features + shape.action_size
-    if config.critics == 1:
-        return Critic(inputs, shape, config.norm)
-    return Ensemble([Critic(inputs, shape, config.norm) for _ in range(config.critics)])
+    members = [Critic(inputs, shape, config.norm, config.quantiles) for _ in range(config.critics)]
+    return members[0] if config.critics == 1 else Ensemble(members)
 
 
 def _add_batch_norm(network: MLP) -> None:

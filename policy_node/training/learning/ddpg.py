@@ -15,11 +15,18 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.actor_critic import ActorCritic, Losses
 from policy_node.training.learning.conditions import ACTING_INPUT, fold
 from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.critics import AGGREGATES, AdvantageCritic, make_critic
+from policy_node.training.learning.critics import (
+    AGGREGATES,
+    AdvantageCritic,
+    Critic,
+    Ensemble,
+    make_critic,
+)
 from policy_node.training.learning.density_ratio import DensityRatio, GoalView
 from policy_node.training.learning.devices import uses_bfloat16
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.frame_skip import plain_actor
+from policy_node.training.learning.quantiles import pooled, quantile_costs
 from policy_node.training.learning.replay import Array
 from policy_node.training.learning.transitions import Transitions
 
@@ -114,8 +121,10 @@ class DDPG(ActorCritic):
         """
         config = self.config
         value = next_value if config.critics == 1 else AGGREGATES[config.aggregate](next_value)
-        target: Tensor = reward + discount * value
-        return target.clamp(config.lowest_value, 0.0)
+        return self._clipped(reward + discount * value)
+
+    def _clipped(self, target: Tensor) -> Tensor:
+        return target.clamp(self.config.lowest_value, 0.0)
 
     def _known(self, batch: Transitions) -> Known:
         """What the networks see of a batch."""
@@ -133,11 +142,29 @@ class DDPG(ActorCritic):
 
     def _update_critic(self, known: Known, weight: Tensor | None) -> Tensor:
         with self._precision():
-            error = self._errors(known)
-            square = error.square() if weight is None else weight * error.square()
-            loss = square.mean()
+            cost = self._costs(known)
+            loss = (cost if weight is None else weight * cost).mean()
         self.step(self.critic_optimizer, loss, self.critic_parameters)
         return loss
+
+    def _costs(self, known: Known) -> Tensor:
+        """What the critic's errors cost: (batch,), of several critics (critics, batch)."""
+        if self.config.quantiles > 1:
+            return self._costs_of_quantiles(known)
+        return self._errors(known).square()
+
+    def _costs_of_quantiles(self, known: Known) -> Tensor:
+        """The same where quantiles of the return are learnt."""
+        critic, slow = self.critic, self.target_critic
+        assert isinstance(critic, Critic | Ensemble) and isinstance(slow, Critic | Ensemble)
+        with torch.no_grad():
+            following = slow.quantiles(
+                known.next_features, self._target_action(known.next_features)
+            )
+            following = pooled(following, self.config.aggregate == 'truncated')
+            target = known.reward[:, None] + known.discount[:, None] * following
+        quantiles = critic.quantiles(known.features, known.action)
+        return quantile_costs(quantiles, self._clipped(target))
 
     def _errors(self, known: Known) -> Tensor:
         """Values less targets: (batch,), of several critics (critics, batch)."""

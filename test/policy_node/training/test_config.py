@@ -74,9 +74,9 @@ def test_switches_on_the_page_are_fields_with_values_they_take() -> None:
 def test_what_a_study_switches_is_on_the_page_with_a_request() -> None:
     rows = switches()
     # Settings of any run, which some arms have as well.
-    ordinary = {'strategy', 'goals', 'target_update_interval', 'moved_share'}
+    ordinary = {'strategy', 'goals', 'target_update_interval', 'moved_share', 'updates_per_cycle'}
     arms = [arm for study in STUDIES.values() if study.request for arm in study.arms]
-    for field in {name for arm in arms for name in arm.changes} - ordinary:
+    for field in {name for arm in arms for name in arm.own} - ordinary:
         request = rows[field].split(' | ')[-1]
         assert re.match('[1-9]', request), field
 

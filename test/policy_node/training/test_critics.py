@@ -66,6 +66,8 @@ def chain_batch(count: int, generator: np.random.Generator) -> Transitions:
         {'target': 'none', 'norm': 'batch'},
         {'critics': 3, 'aggregate': 'min', 'target_update_interval': 5},
         {'critics': 2, 'aggregate': 'truncated', 'norm': 'layer', 'target': 'none'},
+        {'quantiles': 5, 'target_update_interval': 5},
+        {'critics': 2, 'quantiles': 5, 'aggregate': 'truncated', 'target_update_interval': 5},
     ],
     ids=str,
 )

@@ -36,7 +36,7 @@ def test_arms_of_a_study_share_all_but_what_is_theirs(study: Study, tmp_path: Pa
         options = ['--study', study.name, '--tasks', task, '--output', str(tmp_path)]
         jobs = jobs_from_arguments(parse_arguments(options))
         assert len(jobs) == study.seeds * len(study.arms)
-        own = {name for arm in study.arms for name in arm.changes} | {'seed'}
+        own = {name for arm in study.arms for name in arm.own} | {'seed'}
         if 'control_hz' in own:
             own |= set(STEP_COUNTS)
             seconds = {job.config.total_steps / job.config.control_hz for job in jobs}

@@ -168,6 +168,9 @@ def test_an_actor_at_one_condition_is_an_actor_like_any_other() -> None:
     [
         ({'correction': 'cut'}, 'correction cut needs n_step above 1'),
         ({'aggregate': 'min'}, 'aggregate min needs critics above 1'),
+        ({'critics': 2, 'aggregate': 'min', 'quantiles': 5}, 'allowed: mean, truncated'),
+        ({'quantiles': 5, 'norm': 'batch', 'target': 'none'}, 'exclude norm batch and advantage'),
+        ({'quantiles': 5, 'init_from': 'FetchReach'}, 'init_from excludes quantiles 5'),
         ({'norm': 'layer', 'layer_norm': True}, 'norm layer excludes layer_norm'),
         ({'norm': 'batch'}, 'norm batch needs target none'),
         ({'goal_choice': 'bellman', 'goals': 'actual=.8'}, 'bellman needs future or near goals'),

@@ -1,0 +1,87 @@
+"""Quantiles of the return, on returns whose quantiles are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.learning.ddpg import DDPG
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.quantiles import levels, pooled, quantile_costs
+from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.learning.transitions import Transitions
+
+torch.set_num_threads(1)
+
+SHAPE = NetworkShape(observation_size=1, goal_size=1, action_size=1, hidden_sizes=(32, 32))
+
+
+def make_learner(**changes: object) -> DDPG:
+    torch.manual_seed(0)
+    options = {'precision': 'float32', 'gamma': 0.95, 'learning_rate': 3e-3, **changes}
+    config = recipe_config('FetchReach', 'paper', **options)
+    return DDPG(SHAPE, config, torch.device('cpu'), Workers())
+
+
+def lottery(count: int, generator: np.random.Generator) -> Transitions:
+    """One state, one step: the return is -1 nine times of ten and else -9."""
+    reward = np.where(generator.random(count) < 0.9, -1.0, -9.0).astype(np.float32)
+    same = np.ones((count, 1), np.float32)
+    action = generator.uniform(-1, 1, (count, 1)).astype(np.float32)
+    return Transitions(same, same, same, action, reward, np.zeros(count, np.float32))
+
+
+def test_the_quantiles_of_a_lottery_are_learnt_and_its_mean_with_them() -> None:
+    learner = make_learner(quantiles=5)
+    generator = np.random.default_rng(0)
+    for _ in range(1500):
+        learner.update(lottery(256, generator))
+    one = torch.ones(1, 1)
+    features = learner.actor.features(one, one)
+    with torch.no_grad():
+        found = learner.critic.quantiles(features, one)[0]
+        value = learner.critic(features, one)
+    # Of five equal shares the lowest is -9 in half of its width: its middle lies on the step.
+    torch.testing.assert_close(found[1:], torch.full((4,), -1.0), atol=0.3, rtol=0.0)
+    assert -9.2 < float(found[0]) < -1.0
+    assert float(value) == float(found.mean())
+
+
+def test_truncated_targets_leave_out_the_highest_of_all_critics_together() -> None:
+    quantiles = torch.arange(50.0).reshape(2, 1, 25)
+    assert pooled(quantiles, truncated=False).shape == (1, 50)
+    assert pooled(quantiles, truncated=True)[0].tolist() == list(range(46))
+    assert pooled(torch.tensor([[3.0, 1.0, 2.0]]), truncated=True).tolist() == [[1.0, 2.0]]
+
+
+def test_the_cost_is_least_at_the_quantiles_of_the_target() -> None:
+    sample = torch.linspace(-20.0, 0.0, 1001)[None]
+    best = torch.quantile(sample[0], levels(4, sample))[None]
+    cost = quantile_costs(best, sample)
+    assert cost.shape == (1,)
+    for index in range(4):
+        for shift in (-1.0, 1.0):
+            moved = best.clone()
+            moved[0, index] += shift
+            assert quantile_costs(moved, sample) > cost
+    assert quantile_costs(best.expand(3, 1, 4), sample).shape == (3, 1)
+
+
+def test_truncated_critics_promise_less_of_a_lottery() -> None:
+    generator = np.random.default_rng(0)
+    options = {'critics': 2, 'quantiles': 25, 'target_update_interval': 1}
+    learner = make_learner(**options, aggregate='truncated')
+    plain = make_learner(**options)
+    one = torch.ones(1, 1)
+    promised = []
+    for each in (learner, plain):
+        for _ in range(600):
+            batch = lottery(128, generator)
+            batch.discount[:] = 0.5
+            each.update(batch)
+        with torch.no_grad():
+            features = each.actor.features(one, one)
+            promised.append(float(each.critic(features, one).mean()))
+    # Rewards are -1.8 in the mean, half of the value follows.
+    assert abs(promised[1] + 3.6) < 0.4 and promised[0] < promised[1] - 0.05
