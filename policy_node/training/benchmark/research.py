@@ -280,11 +280,15 @@ STUDIES: dict[str, Study] = {
             4,
             'Do values of more than a goal help: of how close, or of how soon?',
             {'HandReach': _SPARSE_HAND_REACH, 'FetchReach': _REACH},
-            _arms(
-                'condition',
-                none='the goal alone',
-                threshold='and the success threshold',
-                horizon='and the steps left',
+            (
+                *_arms(
+                    'condition',
+                    none='the goal alone',
+                    threshold='and the success threshold',
+                    horizon='and the steps left',
+                ),
+                # Coarse thresholds without the input.
+                Arm('graded', 'the goal alone, graded rewards', {'reward_grades': '.5,1,2,4,8'}),
             ),
         ),
         Study(

@@ -75,6 +75,7 @@ def test_what_a_study_switches_is_on_the_page_with_a_request() -> None:
     rows = switches()
     # Settings of any run, which some arms have as well.
     ordinary = {'strategy', 'goals', 'target_update_interval', 'moved_share', 'updates_per_cycle'}
+    ordinary |= {'reward_grades'}
     arms = [arm for study in STUDIES.values() if study.request for arm in study.arms]
     for field in {name for arm in arms for name in arm.own} - ordinary:
         request = rows[field].split(' | ')[-1]
