@@ -10,8 +10,8 @@ import numpy as np
 
 from policy_node.training.benchmark.final import read_final
 from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
-from policy_node.training.benchmark.research import ticks_of_40_ms
 from policy_node.training.benchmark.results import Curve, read_curve
+from policy_node.training.learning.recipes import ticks_of_40_ms
 from policy_node.training.learning.run_folder import COMMAND_FILE
 from policy_node.training.learning.run_log import read_progress
 

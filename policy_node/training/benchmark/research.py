@@ -15,7 +15,7 @@ from typing import Any
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from policy_node.training.benchmark.jobs import Arm, Job
-from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.learning.recipes import recipe_config, steps_at_rate
 
 # Fresh episodes behind the final success of a run.
 FINAL_EPISODES = 500
@@ -184,7 +184,11 @@ def _rates() -> tuple[Arm, ...]:
         ),
     }
     plain = [
-        Arm(f'plain{rate}', f'{rate} Hz, as it is', {'control_hz': float(rate)})
+        Arm(
+            f'plain{rate}',
+            f'{rate} Hz, as it is',
+            {'control_hz': float(rate), 'discount': 'tick'},
+        )
         for rate in (250, 125, 25)
     ]
     arms = [
@@ -387,23 +391,10 @@ STUDIES: dict[str, Study] = {
     )
 }
 
-# Fields that count steps. Where arms differ in the rate they mean 40 ms, so that budgets are the
-# same in simulated time.
-STEP_COUNTS = ('total_steps', 'evaluate_every')
-
-
-def ticks_of_40_ms(control_hz: float) -> float:
-    """Ticks in 40 ms: steps are counted in these, so that rates can be compared."""
-    return control_hz / DEFAULT_CONTROL_HZ
-
 
 def _at_rate(values: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a configuration with step counts at its rate."""
-    ticks = ticks_of_40_ms(values.get('control_hz', DEFAULT_CONTROL_HZ))
-    return {
-        name: round(value * ticks) if name in STEP_COUNTS else value
-        for name, value in values.items()
-    }
+    """Fields of a configuration with step counts at its rate: equal budgets in simulated time."""
+    return {**values, **steps_at_rate(values, values.get('control_hz', DEFAULT_CONTROL_HZ))}
 
 
 def research_jobs(

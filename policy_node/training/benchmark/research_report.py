@@ -23,7 +23,7 @@ from policy_node.training.benchmark.measures import (
     measure_run,
     sum_up,
 )
-from policy_node.training.benchmark.research import STEP_COUNTS, Study
+from policy_node.training.benchmark.research import Study
 from policy_node.training.benchmark.results import (
     Band,
     Curve,
@@ -34,6 +34,7 @@ from policy_node.training.benchmark.results import (
     source_revisions,
     write_csv,
 )
+from policy_node.training.learning.recipes import STEP_COUNTS
 
 # The page of a study keeps its table between these lines.
 BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'

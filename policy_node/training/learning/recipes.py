@@ -2,11 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from msgs_spec.tasks import task_spec
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.config_fields import EVALUATE_EVERY
 from policy_node.training.learning.config_rules import RECIPES
+
+# Fields that count steps, which are ticks.
+STEP_COUNTS = ('total_steps', 'evaluate_every')
+# Who sets one of these at another rate than 25 Hz decides what happens there.
+_DECIDE_AT_RATES = (
+    'algorithm discount n_step noise_seconds parameter_noise longest_hold advantage condition '
+    'importance subgoal_every'
+).split()
+
+
+def ticks_of_40_ms(control_hz: float) -> float:
+    """Ticks in 40 ms: steps are counted in these, so that rates can be compared."""
+    return control_hz / DEFAULT_CONTROL_HZ
+
+
+def steps_at_rate(values: Mapping[str, Any], control_hz: float) -> dict[str, Any]:
+    """The fields among these that count steps of 40 ms, in ticks of a rate."""
+    ticks = ticks_of_40_ms(control_hz)
+    return {name: round(values[name] * ticks) for name in STEP_COUNTS if name in values}
 
 
 def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
@@ -24,7 +45,27 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     if recipe not in RECIPES:
         raise ValueError(f'recipe {recipe!r}; allowed: {", ".join(RECIPES)}')
     values = {'paper': _paper, 'best': _best, 'finetune': _finetune}[recipe](task)
+    if recipe == 'best':
+        # Refuses a rate that there is not, before anything is multiplied by it.
+        task_spec(task, control_hz=overrides.get('control_hz', DEFAULT_CONTROL_HZ))
+        values |= _at_rate(values, overrides)
     return TrainConfig(**{'task': task, 'recipe': recipe, **values, **overrides})
+
+
+def _at_rate(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """What `best` changes at another rate, so that a run is as long in simulated time.
+
+    Above 25 Hz also what keeps learning alive: time that is counted as time, and returns that span
+    40 ms (docs/research/rates).
+    """
+    control_hz = overrides.get('control_hz', DEFAULT_CONTROL_HZ)
+    if control_hz == DEFAULT_CONTROL_HZ:
+        return {}
+    counts = steps_at_rate({'evaluate_every': EVALUATE_EVERY, **values}, control_hz)
+    if control_hz < DEFAULT_CONTROL_HZ or any(name in overrides for name in _DECIDE_AT_RATES):
+        return counts
+    ticks = max(round(ticks_of_40_ms(control_hz)), 1)
+    return {**counts, 'discount': 'time', 'noise_seconds': 1 / DEFAULT_CONTROL_HZ, 'n_step': ticks}
 
 
 def _paper(task: str) -> dict[str, Any]:

@@ -108,7 +108,7 @@ def collected(**options: object) -> Episodes:
 
 def test_noise_that_holds_for_40_ms_moves_the_gripper_as_at_25_hz() -> None:
     """Of n independent steps the sum is sqrt(n) of one: held for 10, sqrt(10) times as far."""
-    free, held = collected(), collected(noise_seconds=0.04)
+    free, held = (collected(noise_seconds=seconds) for seconds in (0.0, 0.04))
     assert held.action.shape == (8, TICKS, 4)
     blocks = held.action.reshape(8, TICKS // 10, 10, 4)
     assert (blocks == blocks[:, :, :1]).all()
@@ -249,3 +249,22 @@ def test_what_makes_no_sense_is_refused_in_one_line(
     changes: dict[str, object], message: str
 ) -> None:
     assert_refused(message, **changes)
+
+
+def test_the_best_recipe_counts_time_as_time_at_high_rates() -> None:
+    usual, fast = (recipe_config('FetchPush', 'best', control_hz=rate) for rate in (25.0, 250.0))
+    for name in ('total_steps', 'evaluate_every'):
+        assert getattr(fast, name) == 10 * getattr(usual, name)
+    assert (fast.discount, fast.noise_seconds, fast.n_step) == ('time', 0.04, 10)
+    assert (usual.discount, usual.noise_seconds, usual.n_step) == ('tick', 0.0, 1)
+    own = recipe_config('FetchPush', 'best', control_hz=250.0, longest_hold=5, total_steps=1000)
+    assert (own.discount, own.n_step, own.total_steps) == ('tick', 1, 1000)
+    slow = recipe_config('FetchPush', 'best', control_hz=12.5)
+    assert (slow.n_step, slow.total_steps) == (1, usual.total_steps // 2)
+    paper = recipe_config('FetchPush', 'paper', control_hz=250.0)
+    assert (paper.n_step, paper.total_steps) == (1, recipe_config('FetchPush', 'paper').total_steps)
+
+
+@pytest.mark.parametrize('control_hz', [0.0, -25.0, float('nan'), float('inf'), 60.0])
+def test_the_best_recipe_refuses_a_rate_that_there_is_not(control_hz: float) -> None:
+    assert_refused('control_hz', control_hz=control_hz)

@@ -14,12 +14,13 @@ from policy_node.training.benchmark.command import jobs_from_arguments, main, pa
 from policy_node.training.benchmark.final import FINAL_FILE
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import are_apart, area_under, sum_up
-from policy_node.training.benchmark.research import STEP_COUNTS, STUDIES, Study
+from policy_node.training.benchmark.research import STUDIES, Study
 from policy_node.training.benchmark.research_report import BEGIN, END, format_table, read_rows
 from policy_node.training.benchmark.results import Curve
 from policy_node.training.benchmark.shared_runs import take_from_other_studies
 from policy_node.training.benchmark.studies import PAPER
 from policy_node.training.learning.config import TrainConfig
+from policy_node.training.learning.recipes import STEP_COUNTS
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.training_state import Counters, TrainingState, write_state
 from support import ROOT
