@@ -249,7 +249,8 @@ STUDIES: dict[str, Study] = {
             'Does hindsight take a gamble for a sure thing, and what cures it?',
             {
                 'FetchReach': {**_REACH, 'gamble': True},
-                'FetchPush': {**_PICK, 'gamble': True},
+                # With random actions as often as in the recipe half of the episodes would gamble.
+                'FetchPush': {**_PICK, 'gamble': True, 'random_epsilon': 0.1},
             },
             (
                 Arm('future', 'future goals', {'strategy': 'future'}),
@@ -261,6 +262,11 @@ STUDIES: dict[str, Study] = {
                 Arm('actual', 'desired goals of any episode', {'goals': 'actual=.8'}),
                 Arm('random', 'achieved goals of any episode', {'goals': 'random=.8'}),
                 Arm('mixed', 'half future, half actual', {'goals': 'future=.4,actual=.4'}),
+                Arm(
+                    'displaced',
+                    'half actual, half displaced',
+                    {'goals': 'actual=.4,displaced=.4'},
+                ),
                 Arm('none', 'no hindsight', {'strategy': 'none'}),
             ),
         ),
