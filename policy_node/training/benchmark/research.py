@@ -297,8 +297,17 @@ STUDIES: dict[str, Study] = {
                     threshold='and the success threshold',
                     horizon='and the steps left',
                 ),
-                # Coarse thresholds without the input.
-                Arm('graded', 'the goal alone, graded rewards', {'reward_grades': '.5,1,2,4,8'}),
+                Arm(
+                    'threshold32',
+                    'and the success threshold, four times as wide',
+                    {'condition': 'threshold', 'widest_threshold': 32.0},
+                ),
+                # Such thresholds without the input.
+                Arm(
+                    'graded',
+                    'the goal alone, graded rewards',
+                    {'reward_grades': '.5,1,2,4,8,16,32'},
+                ),
             ),
         ),
         Study(

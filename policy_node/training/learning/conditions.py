@@ -23,25 +23,28 @@ from policy_node.training.learning.replay import Array
 Goals = NDArray[np.float64]
 # Of the layer that takes the inputs, in actors and critics alike.
 _WEIGHT, _BIAS = 'hidden.0.weight', 'hidden.0.bias'
-# Thresholds drawn, as shares of the task's own.
-SMALLEST_THRESHOLD, LARGEST_THRESHOLD = 0.5, 8.0
+# Smallest threshold drawn, as a share of the task's own.
+SMALLEST_THRESHOLD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
     """The success threshold, a multiple of the task's own, log-uniform.
 
-    From coarse goals, which are reached often, the value of fine ones can be generalised.
+    From coarse goals, which are reached often, the value of fine ones can be generalised. Where the
+    widest is narrower than the way that an episode begins with, nothing leads there.
 
     Attributes:
         metric: Distances and thresholds of the task.
+        widest: The largest multiple.
     """
 
     metric: GoalMetric
+    widest: float
 
     def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
         """Draws the values (count,) that transitions are learnt from under: multiples of it."""
-        low, high = np.log(SMALLEST_THRESHOLD), np.log(LARGEST_THRESHOLD)
+        low, high = np.log(SMALLEST_THRESHOLD), np.log(self.widest)
         return np.asarray(np.exp(generator.uniform(low, high, count)))
 
     def inputs(self, drawn: NDArray[np.float64]) -> Array:
@@ -107,10 +110,10 @@ Condition = Threshold | Horizon
 ACTING_INPUT = {'threshold': 0.0, 'horizon': 1.0}
 
 
-def make_condition(kind: str, metric: GoalMetric) -> Condition | None:
+def make_condition(kind: str, metric: GoalMetric, widest: float) -> Condition | None:
     """Returns the condition called `kind`; None for `none`."""
     if kind == 'threshold':
-        return Threshold(metric)
+        return Threshold(metric, widest)
     if kind == 'horizon':
         return Horizon(metric.spec.episode_ticks, metric.reward)
     return None

@@ -83,9 +83,13 @@ class ConfigFields:
     teaches that a drop is final."""
 
     condition: str = 'none'
-    """One input more of actor and critic: `none`, `threshold` (log-uniform, .5 ... 8 times that of
-    success, also in the reward) or `horizon` (steps left, of which values count the rewards). The
-    actor acts at the threshold of the task and with a whole episode left."""
+    """One input more of actor and critic: `none`, `threshold` (log-uniform, .5 ...
+    `widest_threshold` times that of success, also in the reward) or `horizon` (steps left, of which
+    values count the rewards). The actor acts at the threshold of the task and with a whole episode
+    left."""
+    widest_threshold: float = 8.0
+    """Largest threshold of `condition=threshold`, in those of success. It should reach from where
+    episodes begin to their goals."""
     n_step: int = 1
     """Most steps of a return before it bootstraps."""
     correction: str = 'none'

@@ -69,6 +69,7 @@ RANGES = (
     ('narrow_above', 0, 1),
     ('moved_share', 0, 1),
     ('ticks_after_drop', -1, _INFINITY),
+    ('widest_threshold', 1, 10_000),
     ('n_step', 1, 100),
     ('trace', 0, 1 - 1e-6),
     ('cut_distance', 0, 2),
@@ -169,6 +170,7 @@ def _contradictions(config: ConfigFields, spec: TaskSpec) -> Iterator[str]:
     yield from _contradictions_of_subgoals(config)
     yield from _contradictions_of_values(config)
     yield from _contradictions_of_goals(config)
+    yield from _contradictions_of_conditions(config)
     yield from _contradictions_of_algorithm(config)
     yield from _contradictions_of_task(config, spec)
 
@@ -250,12 +252,6 @@ def _contradictions_of_goals(config: ConfigFields) -> Iterator[str]:
         yield f'goal_choice {config.goal_choice} needs future or near goals'
     if config.goal_choice == 'uncertain' and config.critics == 1:
         yield 'goal_choice uncertain needs critics above 1'
-    if conditioned and (chosen or config.importance != 'none'):
-        yield f'condition {config.condition} excludes goal_choice and importance'
-    if config.condition == 'horizon' and config.n_step > 1:
-        yield 'condition horizon excludes n_step above 1'
-    if config.condition == 'threshold' and config.reward_type == 'dense':
-        yield 'condition threshold needs reward_type sparse'
     if config.narrows and (conditioned or config.reward_type == 'dense'):
         yield 'first_distance and first_rotation need reward_type sparse and condition none'
     if config.reward_grades and (conditioned or config.reward_type == 'dense'):
@@ -264,6 +260,19 @@ def _contradictions_of_goals(config: ConfigFields) -> Iterator[str]:
         yield 'narrow_above needs first_distance or first_rotation above 1'
     if config.narrows and config.subgoal_every > 0:
         yield 'first_distance and first_rotation exclude subgoal_every'
+
+
+def _contradictions_of_conditions(config: ConfigFields) -> Iterator[str]:
+    """The same of one input more."""
+    others = config.goal_choice != 'uniform' or config.importance != 'none'
+    if config.condition != 'none' and others:
+        yield f'condition {config.condition} excludes goal_choice and importance'
+    if config.condition == 'horizon' and config.n_step > 1:
+        yield 'condition horizon excludes n_step above 1'
+    if config.widest_threshold != _DEFAULTS['widest_threshold'] and config.condition != 'threshold':
+        yield 'widest_threshold needs condition threshold'
+    if config.condition == 'threshold' and config.reward_type == 'dense':
+        yield 'condition threshold needs reward_type sparse'
 
 
 def _contradictions_of_algorithm(config: ConfigFields) -> Iterator[str]:

@@ -202,7 +202,8 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
     if config.n_step > 1:
         limits = config.correction, config.trace, config.cut_distance
         counter = StepCounter(config.n_step, *limits)
-    condition = make_condition(config.condition, narrowed(metric, config, progress=1.0))
+    finest = narrowed(metric, config, progress=1.0)
+    condition = make_condition(config.condition, finest, config.widest_threshold)
     return TransitionSampler(
         reward_at(1.0),
         config.tick_gamma,

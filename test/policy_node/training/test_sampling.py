@@ -111,7 +111,7 @@ def test_the_best_of_several_future_goals_is_taken(
 
 def test_a_threshold_is_in_the_reward_and_in_the_input() -> None:
     metric = GoalMetric(task_spec('FetchReach'))
-    condition = Threshold(metric)
+    condition = Threshold(metric, widest=8.0)
     drawn = condition.draw(2_000, np.random.default_rng(0))
     assert 0.5 <= drawn.min() < 0.55 and 7.0 < drawn.max() <= 8.0
     assert np.median(drawn) == pytest.approx(2.0, abs=0.2), 'log-uniform'
@@ -177,6 +177,8 @@ def test_an_actor_at_one_condition_is_an_actor_like_any_other() -> None:
         ({'goal_choice': 'uncertain'}, 'goal_choice uncertain needs critics above 1'),
         ({'condition': 'horizon', 'n_step': 3}, 'condition horizon excludes n_step above 1'),
         ({'condition': 'threshold', 'reward_type': 'dense'}, 'needs reward_type sparse'),
+        ({'widest_threshold': 32.0}, 'widest_threshold needs condition threshold'),
+        ({'widest_threshold': 0.5, 'condition': 'threshold'}, 'allowed: 1 ... 10000'),
         ({'condition': 'horizon', 'importance': 'density'}, 'excludes goal_choice and importance'),
         ({'importance': 'density', 'strategy': 'none'}, 'needs goals chosen in hindsight'),
     ],
