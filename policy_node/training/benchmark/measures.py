@@ -16,6 +16,13 @@ from policy_node.training.learning.run_folder import COMMAND_FILE
 from policy_node.training.learning.run_log import read_progress
 
 GOOD_SUCCESS = 0.9
+_SUMMED_UP = (
+    'area',
+    'area_in_time',
+    'final_success',
+    'processor_seconds',
+    'samples_per_processor_second',
+)
 
 
 def area_under(curve: Curve, total_steps: int) -> float:
@@ -27,6 +34,23 @@ def area_under(curve: Curve, total_steps: int) -> float:
     steps = np.concatenate([[0.0], curve.env_steps[inside], [float(total_steps)]])
     success = np.concatenate([[0.0], curve.success[inside], curve.success[inside][-1:]])
     return float(np.trapezoid(success, steps) / total_steps)
+
+
+def area_in_time(curve: Curve, run: Mapping[str, Any], seconds: float) -> float:
+    """Mean success over the first `seconds` of processor time of a run.
+
+    Its steps are taken to cost the same from first to last. A run that took less stays where it
+    ended.
+
+    Args:
+        curve: Its evaluations.
+        run: Its row of `runs.csv`.
+        seconds: Processor time.
+    """
+    end = seconds / run['processor_seconds'] * float(curve.env_steps[-1])
+    steps = np.concatenate([[0.0], curve.env_steps[curve.env_steps < end], [end]])
+    known = np.concatenate([[0.0], curve.env_steps]), np.concatenate([[0.0], curve.success])
+    return float(np.trapezoid(np.interp(steps, *known), steps) / end)
 
 
 def curve_of(job: Job) -> Curve:
@@ -70,10 +94,14 @@ def measure_run(job: Job, curve: Curve) -> dict[str, Any]:
 
 
 def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Medians and quartiles over the seeds of one arm: one row of `arms.csv`."""
+    """Medians and quartiles over the seeds of one arm: one row of `arms.csv`.
+
+    Args:
+        runs: Rows of `runs.csv`, each with its `area_in_time` where that is known.
+    """
     first, reached = runs[0], [run[f'steps_to_{GOOD_SUCCESS}'] for run in runs]
     found = {'task': first['task'], 'arm': first['arm'], 'seeds': len(runs)}
-    for name in ('area', 'final_success', 'processor_seconds', 'samples_per_processor_second'):
+    for name in (name for name in _SUMMED_UP if name in first):
         quartiles = np.percentile([run[name] for run in runs], [25, 50, 75])
         for part, value in zip(('lower', 'median', 'upper'), quartiles, strict=True):
             found[f'{name}_{part}'] = round(float(value), 4)

@@ -19,6 +19,7 @@ from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import (
     GOOD_SUCCESS,
     are_apart,
+    area_in_time,
     curve_of,
     measure_run,
     sum_up,
@@ -39,6 +40,9 @@ from policy_node.training.learning.recipes import STEP_COUNTS
 # The page of a study keeps its table between these lines.
 BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'
 _RUNS, _ARMS, _CURVES, _ABOUT = 'runs.csv', 'arms.csv', 'curves.csv', 'study.json'
+
+_RUN = ('task', 'arm', 'seed')
+"""Columns that name a run."""
 
 Rows = list[dict[str, Any]]
 
@@ -92,7 +96,7 @@ def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -
     measured = [measure_run(job, curve) for job, curve in zip(jobs, found, strict=True)]
     runs = _with_other_tasks(study, measured, output / _RUNS)
     curves = _with_other_tasks(study, curve_rows(jobs, found), output / _CURVES)
-    arms = _arms(study, runs)
+    arms = sum_up_arms(study, runs, curves)
     about = _about(study, jobs, command, output / _ABOUT)
     for name, rows in ((_RUNS, runs), (_ARMS, arms), (_CURVES, curves)):
         write_csv(rows, output / name)
@@ -134,30 +138,44 @@ def _with_other_tasks(study: Study, rows: Rows, path: Path) -> Rows:
     return sorted([*kept, *rows], key=lambda row: order.get(row['task'], len(order)))
 
 
-def _arms(study: Study, runs: Rows) -> Rows:
-    """The rows of `arms.csv`: by task, in the order of the study's arms, those of before last."""
+def sum_up_arms(study: Study, runs: Rows, curves: Rows) -> Rows:
+    """The rows of `arms.csv`: by task, in the order of the study's arms, those of before last.
+
+    Args:
+        study: The study.
+        runs: Rows of `runs.csv`.
+        curves: Rows of `curves.csv`.
+    """
     order = {arm.name: index for index, arm in enumerate(study.arms)}
-    return [
-        sum_up(group)
-        for of_task in _grouped(runs, 'task').values()
-        for (arm,), group in sorted(
+    by_run = {key: _curve(points) for key, points in _grouped(curves, *_RUN).items()}
+    arms = []
+    for of_task in _grouped(runs, 'task').values():
+        groups = sorted(
             _grouped(of_task, 'arm').items(), key=lambda item: order.get(item[0][0], len(order))
         )
-    ]
+        # As long as the first arm took, which is the baseline where that was run.
+        seconds = float(np.median([run['processor_seconds'] for run in groups[0][1]]))
+        for _, group in groups:
+            areas = [area_in_time(by_run[tuple(r[n] for n in _RUN)], r, seconds) for r in group]
+            pairs = zip(group, areas, strict=True)
+            arms.append(sum_up([{**run, 'area_in_time': area} for run, area in pairs]))
+    return arms
+
+
+def _curve(points: Rows) -> Curve:
+    """The evaluations of a run, from its rows of `curves.csv`."""
+    return Curve(
+        env_steps=np.array([row['env_steps'] for row in points], np.float64),
+        success=np.array([float(row['success']) for row in points]),
+        episodes=0,
+    )
 
 
 def _bands(rows: Rows) -> dict[str, dict[str, Band]]:
     """Median and quartiles over seeds, by task and arm, of the rows of `curves.csv`."""
     bands: dict[str, dict[str, Band]] = {}
     for (task, arm), points in _grouped(rows, 'task', 'arm').items():
-        curves = [
-            Curve(
-                env_steps=np.array([row['env_steps'] for row in run], np.float64),
-                success=np.array([float(row['success']) for row in run]),
-                episodes=0,
-            )
-            for run in _grouped(points, 'seed').values()
-        ]
+        curves = [_curve(run) for run in _grouped(points, 'seed').values()]
         bands.setdefault(task, {})[arm] = aggregate(curves)
     return bands
 
@@ -174,8 +192,8 @@ def format_table(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
     labels = {arm.name: arm.label for arm in study.arms}
     lines = [
         f'| task | arm | seeds | area | steps to {GOOD_SUCCESS} (reached) | final success '
-        '| processor time, s | samples per s | against the baseline |',
-        '| --- | --- | --- | --- | --- | --- | --- | --- | --- |',
+        '| processor time, s | area in equal time | samples per s | against the baseline |',
+        '| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |',
     ]
     for row in arms:
         steps = row[f'steps_to_{GOOD_SUCCESS}_median']
@@ -187,6 +205,7 @@ def format_table(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
             f'{steps:,} ({row["reached"]})' if steps != '' else f'censored ({row["reached"]})',
             _quartiles(row, 'final_success'),
             f'{row["processor_seconds_median"]:.0f}',
+            _quartiles(row, 'area_in_time'),
             f'{row["samples_per_processor_second_median"]:,.0f}',
             _against(study, row, arms),
         ]
@@ -203,7 +222,11 @@ def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, A
     if min(row['seeds'], found[0]['seeds']) < 5:
         return 'fewer than five seeds'
     words = []
-    for name, label in (('area', 'area'), ('final_success', 'final')):
+    for name, label in (
+        ('area', 'area'),
+        ('area_in_time', 'area in time'),
+        ('final_success', 'final'),
+    ):
         if are_apart(row, found[0], name):
             better = row[f'{name}_median'] > found[0][f'{name}_median']
             words.append(f'{label} {"better" if better else "worse"}')

@@ -13,9 +13,15 @@ import torch
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.final import FINAL_FILE
 from policy_node.training.benchmark.jobs import Job
-from policy_node.training.benchmark.measures import are_apart, area_under, sum_up
+from policy_node.training.benchmark.measures import are_apart, area_in_time, area_under, sum_up
 from policy_node.training.benchmark.research import STUDIES, Study
-from policy_node.training.benchmark.research_report import BEGIN, END, format_table, read_rows
+from policy_node.training.benchmark.research_report import (
+    BEGIN,
+    END,
+    format_table,
+    read_rows,
+    sum_up_arms,
+)
 from policy_node.training.benchmark.results import Curve
 from policy_node.training.benchmark.shared_runs import take_from_other_studies
 from policy_node.training.benchmark.studies import PAPER
@@ -65,15 +71,14 @@ def test_every_study_has_its_page_and_every_request_its_line() -> None:
 def test_a_page_says_what_its_data_say(study: Study) -> None:
     folder = ROOT / 'docs' / 'research' / study.name
     runs, arms = read_rows(folder / 'runs.csv'), read_rows(folder / 'arms.csv')
-    for arm in arms:
-        own = [run for run in runs if (run['task'], run['arm']) == (arm['task'], arm['arm'])]
-        assert sum_up(own) == arm
+    curves = read_rows(folder / 'curves.csv')
+    assert sum_up_arms(study, runs, curves) == arms
     assert sum(arm['seeds'] for arm in arms) == len(runs)
     assert format_table(study, arms) in (folder / 'README.md').read_text()
     tasks = list(dict.fromkeys(run['task'] for run in runs))
     about = json.loads((folder / 'study.json').read_text())
     assert set(tasks) == set(about['tasks']) <= set(study.tasks)
-    evaluated = {(row['task'], row['arm'], row['seed']) for row in read_rows(folder / 'curves.csv')}
+    evaluated = {(row['task'], row['arm'], row['seed']) for row in curves}
     assert evaluated == {(run['task'], run['arm'], run['seed']) for run in runs}
 
 
@@ -81,6 +86,15 @@ def test_the_area_is_the_mean_success_over_the_budget() -> None:
     curve = Curve(np.array([100.0, 200.0, 400.0]), np.array([0.0, 1.0, 1.0]), 10)
     assert area_under(curve, 400) == pytest.approx((0 + 50 + 200) / 400)
     assert area_under(curve, 200) == pytest.approx(50 / 200)
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'area'), [(20.0, 250 / 400), (10.0, 50 / 200), (5.0, 0.0), (40.0, 650 / 800)]
+)
+def test_the_area_in_time_is_that_of_the_share_of_a_run(seconds: float, area: float) -> None:
+    """The run took 20 s: 10 s are its first half, and after 40 s it is still where it ended."""
+    curve = Curve(np.array([100.0, 200.0, 400.0]), np.array([0.0, 1.0, 1.0]), 10)
+    assert area_in_time(curve, {'processor_seconds': 20.0}, seconds) == pytest.approx(area)
 
 
 def run(area: float, steps: int | str, final: float) -> dict[str, object]:
