@@ -23,6 +23,8 @@ _SUMMED_UP = (
     'processor_seconds',
     'samples_per_processor_second',
 )
+# Processor time is rounded to this.
+_SHORTEST = 0.1
 
 
 def area_under(curve: Curve, total_steps: int) -> float:
@@ -47,7 +49,8 @@ def area_in_time(curve: Curve, run: Mapping[str, Any], seconds: float) -> float:
         run: Its row of `runs.csv`.
         seconds: Processor time.
     """
-    end = seconds / run['processor_seconds'] * float(curve.env_steps[-1])
+    share = max(seconds, _SHORTEST) / max(run['processor_seconds'], _SHORTEST)
+    end = share * float(curve.env_steps[-1])
     steps = np.concatenate([[0.0], curve.env_steps[curve.env_steps < end], [end]])
     known = np.concatenate([[0.0], curve.env_steps]), np.concatenate([[0.0], curve.success])
     return float(np.trapezoid(np.interp(steps, *known), steps) / end)

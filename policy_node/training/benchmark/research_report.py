@@ -62,17 +62,28 @@ def require_all_runs(jobs: Sequence[Job], output: Path) -> None:
     _tasks_told(output / _ABOUT)
     tasks = {job.config.task for job in jobs}
     ours = {(job.config.task, job.arm.name, job.config.seed) for job in jobs}
-    try:
-        found = [(row['task'], row['arm'], row['seed']) for row in read_rows(output / _RUNS)]
-    except KeyError as error:
-        raise ValueError(f'{output / _RUNS} has no column {error}') from None
+    found, evaluated = (_runs_of(output / name) for name in (_RUNS, _CURVES))
+    if missing := [key for key in found if key[0] not in tasks and key not in evaluated]:
+        raise ValueError(f'{output / _CURVES} has no evaluation of {_name(missing[0])}')
     lost = [key for key in found if key[0] in tasks and key not in ours]
     if lost:
-        task, arm, seed = lost[0]
         raise ValueError(
-            f'{output} holds runs that this command has not ({len(lost)}), as {task}/{arm}/seed'
-            f'{seed}: name their arms and seeds too, or another folder with --report'
+            f'{output} holds runs that this command has not ({len(lost)}), as {_name(lost[0])}: '
+            'name their arms and seeds too, or another folder with --report'
         )
+
+
+def _runs_of(path: Path) -> list[tuple[Any, ...]]:
+    """Task, arm and seed of every row of a file."""
+    try:
+        return [tuple(row[name] for name in _RUN) for row in read_rows(path)]
+    except KeyError as error:
+        raise ValueError(f'{path} has no column {error}') from None
+
+
+def _name(run: tuple[Any, ...]) -> str:
+    task, arm, seed = run
+    return f'{task}/{arm}/seed{seed}'
 
 
 def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -> None:
@@ -267,10 +278,12 @@ def _tasks_told(path: Path) -> dict[str, Any]:
 
 def _shared_settings(study: Study, jobs: Sequence[Job]) -> dict[str, dict[str, Any]]:
     """By task, the fields of `TrainConfig` that all arms share."""
-    own = {'seed', *(name for arm in study.arms for name in arm.own)}
+    own = {'seed', *(name for arm in study.arms for name in arm.changes)}
     if 'control_hz' in own:
         own |= set(STEP_COUNTS)
-    configs = {job.config.task: dataclasses.asdict(job.config) for job in jobs}
+    # Last those whose arms multiply nothing: what others multiply is told by its own value.
+    ordered = sorted(jobs, key=lambda job: not job.arm.factors)
+    configs = {job.config.task: dataclasses.asdict(job.config) for job in ordered}
     return {
         task: {name: value for name, value in config.items() if name not in own}
         for task, config in configs.items()

@@ -17,7 +17,12 @@ _KAPPA = 1.0
 
 
 def levels(count: int, like: Tensor) -> Tensor:
-    """Probabilities (count,) that the quantiles are for: the middles of equal shares."""
+    """Probabilities (count,) that the quantiles are for: the middles of equal shares.
+
+    Args:
+        count: How many quantiles.
+        like: Where they are to be.
+    """
     return (torch.arange(count, dtype=torch.float32, device=like.device) + 0.5) / count
 
 

@@ -214,6 +214,17 @@ def test_runs_of_others_are_not_overwritten(
     assert runs.read_text().count('\n') == 3
 
 
+def test_a_page_without_its_curves_is_refused_before_anything_is_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / 'runs.csv').write_text('task,arm,seed,area\nFetchPush,actual,0,0.5\n')
+    arguments = ['--study', 'unbiased', '--arms', 'actual', '--report', str(tmp_path)]
+    assert main([*arguments, '--output', str(tmp_path / 'runs')]) == 2
+    error = capsys.readouterr().err
+    assert 'curves.csv has no evaluation of FetchPush/actual/seed0' in error
+    assert error.count('\n') == 1 and not (tmp_path / 'runs').exists()
+
+
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
