@@ -185,6 +185,12 @@ def format_table(table: Sequence[dict[str, Any]]) -> str:
     return str(console.file.getvalue())  # type: ignore[attr-defined]
 
 
+# Colours there are; the next curves are dashed.
+_COLORS = 10
+# Most curves that a legend inside a panel names.
+_MOST_INSIDE = 4
+
+
 def draw(
     bands: Mapping[str, Mapping[str, Band]],
     labels: Mapping[str, str],
@@ -212,11 +218,28 @@ def draw(
         for index, (arm, label) in enumerate(labels.items()):
             if arm in arms:
                 band, color = arms[arm], f'C{index}'
+                style = '--' if index >= _COLORS else '-'
                 axes.fill_between(band.env_steps, band.lower, band.upper, color=color, alpha=0.2)
-                axes.plot(band.env_steps, band.median, color=color, label=label)
+                axes.plot(band.env_steps, band.median, style, color=color, label=label)
         _label(axes, task, top, paper_epochs)
-    panels[0].legend(loc='best', fontsize='small')
+    _name_curves(figure, list(panels[: len(bands)]), columns)
     figure.savefig(path, dpi=130)
+
+
+def _name_curves(figure: Any, panels: Sequence[Any], columns: int) -> None:
+    """A legend inside the first panel; below all where it would hide the curves."""
+    named: dict[str, Any] = {}
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        named |= zip(labels, handles, strict=True)
+    if len(named) <= _MOST_INSIDE:
+        panels[0].legend(named.values(), named.keys(), loc='best', fontsize='small')
+        return
+    lines = -(-len(named) // columns)
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + 0.2 * lines)
+    place = {'loc': 'outside lower center', 'ncols': columns}
+    figure.legend(named.values(), named.keys(), fontsize='small', **place)
 
 
 def _top_of_axis(bands: Mapping[str, Mapping[str, Band]]) -> float:
