@@ -10,7 +10,7 @@ import numpy as np
 
 from policy_node.training.benchmark.final import read_final
 from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
-from policy_node.training.benchmark.results import Curve, read_curve
+from policy_node.training.benchmark.results import Array, Curve, read_curve
 from policy_node.training.learning.recipes import ticks_of_40_ms
 from policy_node.training.learning.run_folder import COMMAND_FILE
 from policy_node.training.learning.run_log import read_progress
@@ -33,9 +33,7 @@ def area_under(curve: Curve, total_steps: int) -> float:
     Before the first evaluation it rises from 0; after the last it stays.
     """
     inside = curve.env_steps <= total_steps
-    steps = np.concatenate([[0.0], curve.env_steps[inside], [float(total_steps)]])
-    success = np.concatenate([[0.0], curve.success[inside], curve.success[inside][-1:]])
-    return float(np.trapezoid(success, steps) / total_steps)
+    return _mean_until(float(total_steps), curve.env_steps[inside], curve.success[inside])
 
 
 def area_in_time(curve: Curve, run: Mapping[str, Any], seconds: float) -> float:
@@ -50,9 +48,13 @@ def area_in_time(curve: Curve, run: Mapping[str, Any], seconds: float) -> float:
         seconds: Processor time.
     """
     share = max(seconds, _SHORTEST) / max(run['processor_seconds'], _SHORTEST)
-    end = share * float(curve.env_steps[-1])
-    steps = np.concatenate([[0.0], curve.env_steps[curve.env_steps < end], [end]])
-    known = np.concatenate([[0.0], curve.env_steps]), np.concatenate([[0.0], curve.success])
+    return _mean_until(share * float(curve.env_steps[-1]), curve.env_steps, curve.success)
+
+
+def _mean_until(end: float, env_steps: Array, success: Array) -> float:
+    """Mean success over the first `end` steps: from 0 on straight lines, at last as it was."""
+    known = np.concatenate([[0.0], env_steps]), np.concatenate([[0.0], success])
+    steps = np.concatenate([[0.0], env_steps[env_steps < end], [end]])
     return float(np.trapezoid(np.interp(steps, *known), steps) / end)
 
 
@@ -100,11 +102,11 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Medians and quartiles over the seeds of one arm: one row of `arms.csv`.
 
     Args:
-        runs: Rows of `runs.csv`, each with its `area_in_time` where that is known.
+        runs: Rows of `runs.csv`, each with its `area_in_time`.
     """
     first, reached = runs[0], [run[f'steps_to_{GOOD_SUCCESS}'] for run in runs]
     found = {'task': first['task'], 'arm': first['arm'], 'seeds': len(runs)}
-    for name in (name for name in _SUMMED_UP if name in first):
+    for name in _SUMMED_UP:
         quartiles = np.percentile([run[name] for run in runs], [25, 50, 75])
         for part, value in zip(('lower', 'median', 'upper'), quartiles, strict=True):
             found[f'{name}_{part}'] = round(float(value), 4)

@@ -76,9 +76,13 @@ def require_all_runs(jobs: Sequence[Job], output: Path) -> None:
 def _runs_of(path: Path) -> list[tuple[Any, ...]]:
     """Task, arm and seed of every row of a file."""
     try:
-        return [tuple(row[name] for name in _RUN) for row in read_rows(path)]
+        return [_run_of(row) for row in read_rows(path)]
     except KeyError as error:
         raise ValueError(f'{path} has no column {error}') from None
+
+
+def _run_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in _RUN)
 
 
 def _name(run: tuple[Any, ...]) -> str:
@@ -167,7 +171,7 @@ def sum_up_arms(study: Study, runs: Rows, curves: Rows) -> Rows:
         # As long as the first arm took, which is the baseline where that was run.
         seconds = float(np.median([run['processor_seconds'] for run in groups[0][1]]))
         for _, group in groups:
-            areas = [area_in_time(by_run[tuple(r[n] for n in _RUN)], r, seconds) for r in group]
+            areas = (area_in_time(by_run[_run_of(run)], run, seconds) for run in group)
             pairs = zip(group, areas, strict=True)
             arms.append(sum_up([{**run, 'area_in_time': area} for run, area in pairs]))
     return arms

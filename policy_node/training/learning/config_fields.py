@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
-EVALUATE_EVERY = 50_000
-
 
 @dataclass(frozen=True, slots=True)
 class ConfigFields:
@@ -204,7 +202,7 @@ class ConfigFields:
     """Share of `random_epsilon` and `noise_std` left at `total_steps`; both fall linearly in
     the last third of the run. 1 keeps them constant."""
 
-    evaluate_every: int = EVALUATE_EVERY
+    evaluate_every: int = 50_000
     """Environment steps between evaluations; the actor that a run ends with is evaluated too."""
     evaluation_episodes: int = 200
     """Episodes behind a decision which actor is best; hopeless evaluations end earlier."""

@@ -18,14 +18,14 @@ FROM_NOTHING = ('paper', 'best')
 RECIPES = (*FROM_NOTHING, 'finetune')
 # Tasks that ignore their gripper action.
 GAMBLE_TASKS = ('FetchReach', 'FetchPush')
-_DEFAULTS = {field.name: field.default for field in dataclasses.fields(ConfigFields)}
+DEFAULTS = {field.name: field.default for field in dataclasses.fields(ConfigFields)}
 _OF_NETWORKS = 'algorithm longest_hold advantage subgoal_every quantiles'.split()
 """Fields that decide what kind of networks there are; most runs have their defaults."""
 _ON_POLICY = {
     'overlap': False,
     'random_epsilon': 0.0,
     **{
-        name: _DEFAULTS[name]
+        name: DEFAULTS[name]
         for name in (
             'noise_spread final_exploration random_steps ticks_after_drop '
             'first_distance first_rotation narrow_above goal_choice condition n_step discount '
@@ -148,7 +148,7 @@ def _number(value: float) -> str:
 def unusual_networks(config: ConfigFields) -> list[str]:
     """Fields, `name value`, by which a run has networks that few others could start from."""
     found = {name: getattr(config, name) for name in _OF_NETWORKS}
-    return [f'{name} {value}' for name, value in found.items() if value != _DEFAULTS[name]]
+    return [f'{name} {value}' for name, value in found.items() if value != DEFAULTS[name]]
 
 
 def require_idle_gripper(task: str) -> None:
@@ -269,7 +269,7 @@ def _contradictions_of_conditions(config: ConfigFields) -> Iterator[str]:
         yield f'condition {config.condition} excludes goal_choice and importance'
     if config.condition == 'horizon' and config.n_step > 1:
         yield 'condition horizon excludes n_step above 1'
-    if config.widest_threshold != _DEFAULTS['widest_threshold'] and config.condition != 'threshold':
+    if config.widest_threshold != DEFAULTS['widest_threshold'] and config.condition != 'threshold':
         yield 'widest_threshold needs condition threshold'
     if config.condition == 'threshold' and config.reward_type == 'dense':
         yield 'condition threshold needs reward_type sparse'

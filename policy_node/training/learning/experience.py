@@ -58,6 +58,9 @@ class Experience:
             'goal_statistics': RunningStatistics(spec.goal.size),
         }
         self._count_ticks = ticks_until_dropped(spec, config.ticks_after_drop)
+        self._weigh = episode_weights(
+            config.episode_weights, spec, config.control_hz, config.gamble
+        )
         capacity = max(workers.share(config.replay_transitions) // spec.episode_ticks, 1)
         self.replay = EpisodeReplay(
             max(capacity, workers.share(config.num_envs)),
@@ -67,7 +70,7 @@ class Experience:
             spec.robot.action_size
             + (config.longest_hold > 1)
             + subgoal_columns(config.subgoal_every, spec.goal.size),
-            episode_weights(config.episode_weights, spec, config.control_hz, config.gamble),
+            self._weigh,
             self._count_ticks,
         )
 

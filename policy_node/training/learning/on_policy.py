@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from msgs_spec.tasks import TaskSpec
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.episode_weights import episode_weights
 from policy_node.training.learning.experience import Experience
 from policy_node.training.learning.replay import draw_by
 from policy_node.training.learning.rollouts import (
@@ -48,9 +47,6 @@ class OnPolicyExperience(Experience):
         self._newest = workers.share(config.num_envs)
         self._rollouts: Rollouts | None = None
         self._made_after = -1
-        self._weigh = episode_weights(
-            config.episode_weights, spec, config.control_hz, config.gamble
-        )
         self._weight_up_to = np.zeros(0)
 
     def batch(self, env_steps: int) -> Transitions:

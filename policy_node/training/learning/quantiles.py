@@ -8,12 +8,10 @@ leave out the highest quantiles of all critics together, as in TQC (Kuznetsov et
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 # TQC leaves out 2 of 25 for every critic (its table of hyper-parameters, most tasks).
 DROPPED_SHARE = 2 / 25
-# Where the loss turns from squares to absolute errors.
-_KAPPA = 1.0
 
 
 def levels(count: int, like: Tensor) -> Tensor:
@@ -51,8 +49,7 @@ def quantile_costs(quantiles: Tensor, target: Tensor) -> Tensor:
         target: (batch, kept): what the return was, in equal parts.
     """
     error = target.unsqueeze(-2) - quantiles.unsqueeze(-1)
-    distance = error.abs()
-    huber = torch.where(distance > _KAPPA, distance - 0.5 * _KAPPA, 0.5 * error.square() / _KAPPA)
+    huber = nn.functional.huber_loss(error, torch.zeros_like(error), reduction='none')
     level = levels(quantiles.shape[-1], quantiles)[:, None]
     weight = (level - (error.detach() < 0.0).float()).abs()
     cost: Tensor = (weight * huber).mean(dim=(-2, -1))

@@ -7,8 +7,7 @@ from typing import Any
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.config_fields import EVALUATE_EVERY
-from policy_node.training.learning.config_rules import RECIPES
+from policy_node.training.learning.config_rules import DEFAULTS, RECIPES
 
 # Fields that count steps, which are ticks.
 STEP_COUNTS = ('total_steps', 'evaluate_every')
@@ -46,13 +45,11 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
         raise ValueError(f'recipe {recipe!r}; allowed: {", ".join(RECIPES)}')
     values = {'paper': _paper, 'best': _best, 'finetune': _finetune}[recipe](task)
     if recipe == 'best':
-        # Refuses a rate that there is not, before anything is multiplied by it.
-        task_spec(task, control_hz=overrides.get('control_hz', DEFAULT_CONTROL_HZ))
-        values |= _at_rate(values, overrides)
+        values |= _at_rate(task, values, overrides)
     return TrainConfig(**{'task': task, 'recipe': recipe, **values, **overrides})
 
 
-def _at_rate(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """What `best` changes at another rate, so that a run is as long in simulated time.
 
     Above 25 Hz also what keeps learning alive: time that is counted as time, and returns that span
@@ -61,10 +58,12 @@ def _at_rate(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[st
     control_hz = overrides.get('control_hz', DEFAULT_CONTROL_HZ)
     if control_hz == DEFAULT_CONTROL_HZ:
         return {}
-    counts = steps_at_rate({'evaluate_every': EVALUATE_EVERY, **values}, control_hz)
+    # Refuses a rate that there is not, before anything is multiplied by it.
+    task_spec(task, control_hz=control_hz)
+    counts = steps_at_rate({**DEFAULTS, **values}, control_hz)
     if control_hz < DEFAULT_CONTROL_HZ or any(name in overrides for name in _DECIDE_AT_RATES):
         return counts
-    ticks = max(round(ticks_of_40_ms(control_hz)), 1)
+    ticks = round(ticks_of_40_ms(control_hz))
     return {**counts, 'discount': 'time', 'noise_seconds': 1 / DEFAULT_CONTROL_HZ, 'n_step': ticks}
 
 

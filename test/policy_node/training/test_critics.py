@@ -8,24 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.critics import AGGREGATES, Ensemble, make_critic
-from policy_node.training.learning.ddpg import DDPG
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.transitions import Transitions
+from support.learners import SHAPE, make_learner
 
 torch.set_num_threads(1)
-
-SHAPE = NetworkShape(observation_size=1, goal_size=1, action_size=1, hidden_sizes=(32, 32))
-
-
-def make_learner(**changes: object) -> DDPG:
-    torch.manual_seed(0)
-    options = {'precision': 'float32', 'gamma': 0.5, 'learning_rate': 3e-3, **changes}
-    config = recipe_config('FetchReach', 'paper', **options)
-    return DDPG(SHAPE, config, torch.device('cpu'), Workers())
 
 
 @pytest.mark.parametrize(

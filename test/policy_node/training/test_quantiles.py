@@ -5,23 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.ddpg import DDPG
-from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.quantiles import levels, pooled, quantile_costs
-from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.transitions import Transitions
+from support.learners import make_learner
 
 torch.set_num_threads(1)
-
-SHAPE = NetworkShape(observation_size=1, goal_size=1, action_size=1, hidden_sizes=(32, 32))
-
-
-def make_learner(**changes: object) -> DDPG:
-    torch.manual_seed(0)
-    options = {'precision': 'float32', 'gamma': 0.95, 'learning_rate': 3e-3, **changes}
-    config = recipe_config('FetchReach', 'paper', **options)
-    return DDPG(SHAPE, config, torch.device('cpu'), Workers())
 
 
 def lottery(count: int, generator: np.random.Generator) -> Transitions:
@@ -33,7 +21,7 @@ def lottery(count: int, generator: np.random.Generator) -> Transitions:
 
 
 def test_the_quantiles_of_a_lottery_are_learnt_and_its_mean_with_them() -> None:
-    learner = make_learner(quantiles=5)
+    learner = make_learner(quantiles=5, gamma=0.95)
     generator = np.random.default_rng(0)
     for _ in range(1500):
         learner.update(lottery(256, generator))
@@ -70,7 +58,7 @@ def test_the_cost_is_least_at_the_quantiles_of_the_target() -> None:
 
 def test_truncated_critics_promise_less_of_a_lottery() -> None:
     generator = np.random.default_rng(0)
-    options = {'critics': 2, 'quantiles': 25, 'target_update_interval': 1}
+    options = {'critics': 2, 'quantiles': 25, 'target_update_interval': 1, 'gamma': 0.95}
     learner = make_learner(**options, aggregate='truncated')
     plain = make_learner(**options)
     one = torch.ones(1, 1)

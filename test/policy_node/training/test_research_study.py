@@ -99,7 +99,7 @@ def test_the_area_in_time_is_that_of_the_share_of_a_run(seconds: float, area: fl
 
 def run(area: float, steps: int | str, final: float) -> dict[str, object]:
     times = {'processor_seconds': 1.0, 'samples_per_processor_second': 2.0}
-    found = {'area': area, 'steps_to_0.9': steps, 'final_success': final}
+    found = {'area': area, 'area_in_time': area, 'steps_to_0.9': steps, 'final_success': final}
     return {'task': 'FetchReach', 'arm': 'one', **found, **times}
 
 
