@@ -67,17 +67,18 @@ class ImaginingDDPG(DDPG):
 
     def _imagination_loss(self, known: Known) -> Tensor:
         count = -(-len(known.goal) // _EVERY)
-        state, goal = known.observation[:count], known.goal[:count]
         # Transitions of a batch have nothing to do with each other: those that follow are any.
-        visited = [known.observation.roll(-i - 1, dims=0)[:count] for i in range(CANDIDATES)]
-        subgoals = [candidate[:, self._achieved] for candidate in visited]
+        following = [known.observation.roll(-i - 1, dims=0)[:count] for i in range(CANDIDATES)]
+        visited = torch.cat(following)
+        subgoal = visited[:, self._achieved]
+        state = known.observation[:count].repeat(CANDIDATES, 1)
+        goal = known.goal[:count].repeat(CANDIDATES, 1)
         with torch.no_grad():
-            costs = [
-                torch.maximum(-self._value(state, subgoal), -self._value(candidate, goal))
-                for candidate, subgoal in zip(visited, subgoals, strict=True)
-            ]
-            weight = (-torch.stack(costs) / _TEMPERATURE).softmax(dim=0)
-            wanted = torch.stack([self.actor.goal_normalizer(subgoal) for subgoal in subgoals])
+            # All in one pass: what an update costs more is mostly this.
+            value = self._value(torch.cat([state, visited]), torch.cat([subgoal, goal]))
+            cost = torch.maximum(*(-value).chunk(2)).reshape(CANDIDATES, count)
+            weight = (-cost / _TEMPERATURE).softmax(dim=0)
+            wanted = self.actor.goal_normalizer(subgoal).reshape(CANDIDATES, count, -1)
         error = self.imagination(known.features[:count]) - wanted
         loss: Tensor = (weight * error.square().mean(dim=-1)).sum(dim=0).mean()
         return loss
