@@ -210,6 +210,12 @@ def _work(job: Job, command: str) -> None:
     sys.exit(attempt(job, command).value)
 
 
+def _from_anywhere(init_from: str) -> str:
+    """What networks are called from every working directory: shipped actors keep their names."""
+    path = Path(init_from)
+    return str(path.resolve()) if init_from and path.exists() else init_from
+
+
 class Ray:
     """As many jobs as the cluster has cores for; folders must lie where all its machines see."""
 
@@ -226,9 +232,7 @@ class Ray:
     def start(self, job: Job) -> None:
         """Gives the job to the cluster."""
         cores = max(job.config.simulation_threads, job.config.torch_threads, 1)
-        # Paths mean the same from every working directory.
-        start = job.config.init_from and str(Path(job.config.init_from).resolve())
-        config = dataclasses.replace(job.config, init_from=start)
+        config = dataclasses.replace(job.config, init_from=_from_anywhere(job.config.init_from))
         absolute = dataclasses.replace(job, config=config, folder=job.folder.resolve())
         self._running[self._attempt.options(num_cpus=cores).remote(absolute, self._command)] = job
 
