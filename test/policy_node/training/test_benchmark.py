@@ -318,7 +318,12 @@ def test_ray_runs_the_jobs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     ray = pytest.importorskip('ray')
     try:
         assert main(small(tmp_path, '--ray', '--arms', 'her_sparse', 'ddpg_dense')) == 0
+        # One that starts from a shipped actor, whose name is no path.
+        study = ['--study', 'unbiased', '--tasks', 'FetchPush', '--arms', 'future', '--seeds', '0']
+        small_study = ['--steps', '400', '--episodes', '4', '--set', 'num_envs=4']
+        folders = ['--output', str(tmp_path / 'runs'), '--report', str(tmp_path / 'page')]
+        assert main([*study, *small_study, *folders, '--ray']) == 0
     finally:
         ray.shutdown()
     assert 'is finished; 0 to go' in capsys.readouterr().out
-    assert len(list(tmp_path.rglob('latest.safetensors'))) == 2
+    assert len(list(tmp_path.rglob('latest.safetensors'))) == 3
