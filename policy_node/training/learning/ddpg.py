@@ -295,6 +295,17 @@ class DDPG(ActorCritic):
         spread: Array = self.critic(known.features, known.action).std(dim=0).cpu().numpy()
         return spread
 
+    def importance(self, batch: Transitions) -> Array:
+        """Importance weights of a batch, (batch,), from what has just learnt from it as well.
+
+        Raises:
+            ValueError: If the configuration has none.
+        """
+        if self._ratio is None:
+            raise ValueError(f'importance {self.config.importance!r} has no weights of its own')
+        weight: Array = self._weights(self._ratio, self._known(batch)).cpu().numpy()
+        return weight
+
     def modules(self) -> dict[str, nn.Module]:
         """What a training state holds, by name."""
         targets = {'target_actor': self.target_actor, 'target_critic': self.target_critic}

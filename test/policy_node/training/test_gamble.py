@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from policy_node.training.learning.gamble import GambleSimulation
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.sampling import TransitionSampler
+from policy_node.training.learning.transitions import Transitions
 
 torch.set_num_threads(1)
 
@@ -94,8 +96,8 @@ def two_armed_gambles(count: int, generator: np.random.Generator) -> Episodes:
     return Episodes(observation, achieved, goal, action)
 
 
-def learnt_values(importance: str, mixture: dict[str, float]) -> dict[str, float]:
-    """What a critic believes of both arms, for a goal that only gambling ever reaches."""
+def gambler(importance: str, mixture: dict[str, float]) -> tuple[DDPG, Callable[[], Transitions]]:
+    """A learner that knows nothing yet, and what draws its batches."""
     torch.manual_seed(0)
     generator = np.random.default_rng(0)
     config = recipe_config(
@@ -112,11 +114,22 @@ def learnt_values(importance: str, mixture: dict[str, float]) -> dict[str, float
     sampler = TransitionSampler(
         lambda achieved, goal: -1.0 * (np.abs(achieved - goal).max(axis=-1) > 0.5), gamma=0.0
     )
-    for _ in range(500):
+
+    def draw() -> Transitions:
         row = generator.integers(len(episodes), size=256)
-        learner.update(sampler.sample(episodes, row, mixture, generator))
+        return sampler.sample(episodes, row, mixture, generator)
+
+    return learner, draw
+
+
+def learnt_values(importance: str, mixture: dict[str, float]) -> dict[str, float]:
+    """What a critic believes of both arms, for a goal that only gambling ever reaches."""
+    learner, draw = gambler(importance, mixture)
+    for _ in range(500):
+        learner.update(draw())
     goal = torch.tensor([[3.0, 0.0, 0.0]])
-    features = learner.actor.features(torch.tensor(episodes.observation[:1, 0]), goal)
+    start = torch.tensor(draw().observation[:1])
+    features = learner.actor.features(start, goal)
     with torch.no_grad():
         return {
             name: float(learner.critic(features, torch.tensor([[action]])))
@@ -140,6 +153,21 @@ def test_weights_take_back_what_hindsight_does() -> None:
     assert biased['gamble'] == pytest.approx(-0.4, abs=0.15)
     assert weighted['gamble'] == pytest.approx(-0.8, abs=0.15)
     assert weighted['walk'] == pytest.approx(-1.0, abs=0.1)
+
+
+def test_weighted_gambles_succeed_as_often_as_gambles_do() -> None:
+    """Once in five times; in a batch whose goals are half those achieved, three times."""
+    learner, draw = gambler('density', {'future': 0.5, 'real': 0.5})
+    for _ in range(500):
+        learner.importance(draw())
+    batches = [draw() for _ in range(20)]
+    weight = np.concatenate([learner.importance(batch) for batch in batches])
+    gamble = np.concatenate([batch.action[:, 0] > 0.0 for batch in batches])
+    lucky = gamble & np.concatenate([batch.reward == 0.0 for batch in batches])
+    assert lucky.sum() / gamble.sum() == pytest.approx(0.6, abs=0.03)
+    assert weight[lucky].sum() / weight[gamble].sum() == pytest.approx(0.2, abs=0.03)
+    with pytest.raises(ValueError, match="importance 'none' has no weights"):
+        gambler('none', {'future': 1.0})[0].importance(draw())
 
 
 def test_a_landing_is_no_motion_of_the_robot() -> None:

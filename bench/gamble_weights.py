@@ -1,0 +1,100 @@
+"""What importance weights make of luck: FetchPush with a gamble, episodes of the shipped actor.
+
+A goal that is chosen because a gamble led to it makes the gamble look good. Weights should take
+that back, so that gambles succeed as often as landings meet goals, and leave pushes as they are.
+
+python bench/gamble_weights.py
+python bench/gamble_weights.py --random
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from msgs_spec.tasks import task_spec
+from policy_node import load_policy
+from policy_node.policies.policy import RandomPolicy
+from policy_node.training.learning.collector import Collector
+from policy_node.training.learning.ddpg import DDPG
+from policy_node.training.learning.distributed import Workers
+from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.learners import make_learner
+from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.learning.sampling import make_sampler
+from policy_node.training.learning.simulations import make_simulation
+from policy_node.training.learning.transitions import Transitions
+
+TASK = 'FetchPush'
+EPISODES = 600
+UPDATES, MEASURED = 2_000, 100
+# Fingers at 1 m say that an episode is over (`gamble.py`).
+_FINGERS, _OVER = 9, 1.0
+_KINDS = ('gamble, at the goal', 'gamble, elsewhere', 'push into the goal', 'all else')
+
+
+def main() -> int:
+    """Prints a row per kind of transition; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--random', action='store_true', help='episodes of random actions')
+    options = parser.parse_args()
+    torch.manual_seed(0)
+    learner, experience = _learner_of(options.random)
+    for _ in range(UPDATES):
+        learner.importance(experience.batch(0))
+    batches = [experience.batch(0) for _ in range(MEASURED)]
+    weight = np.concatenate([learner.importance(batch) for batch in batches])
+    kind = np.concatenate([_kind(batch) for batch in batches])
+    _print(weight, kind)
+    return 0
+
+
+def _learner_of(random: bool) -> tuple[DDPG, Experience]:
+    """A learner with weights, and episodes with a gamble."""
+    fields = {'goals': 'future=.4,actual=.4', 'importance': 'density', 'gamble': True}
+    config = recipe_config(TASK, 'best', **fields, random_epsilon=0.1, num_envs=EPISODES)
+    spec, generator = task_spec(TASK), np.random.default_rng(0)
+    simulation = make_simulation(config, EPISODES, 1)
+    sampler = make_sampler(config, simulation.metric)
+    parts = config, spec, torch.device('cpu'), Workers(), sampler, generator
+    learner, experience = make_learner(*parts)
+    assert isinstance(learner, DDPG)
+    policy = RandomPolicy(spec.robot.action_size) if random else load_policy(TASK).policy
+    episodes, _ = Collector(simulation, list(range(EPISODES)), config).collect(policy)
+    experience.replay.add(episodes)
+    experience.normalize(episodes, learner.actor, 0)
+    return learner, experience
+
+
+def _kind(batch: Transitions) -> NDArray[np.intp]:
+    """Index of each transition's kind, (batch,)."""
+    start = task_spec(TASK).achieved_goal_start
+    before, after = (
+        np.linalg.norm(state[:, start : start + 3] - batch.goal, axis=1)
+        < task_spec(TASK).distance_threshold
+        for state in (batch.observation, batch.next_observation)
+    )
+    was_over, is_over = (
+        state[:, _FINGERS] == _OVER for state in (batch.observation, batch.next_observation)
+    )
+    gamble = is_over & ~was_over
+    kinds = [gamble & after, gamble, after & ~before & ~is_over]
+    return np.select(kinds, [0, 1, 2], default=3)
+
+
+def _print(weight: NDArray[np.floating], kind: NDArray[np.intp]) -> None:
+    print(f'{"transition":<20} {"number":>8} {"mean weight":>12}')
+    for index, name in enumerate(_KINDS):
+        chosen = weight[kind == index]
+        print(f'{name:<20} {len(chosen):>8,} {chosen.mean():>12.2f}')
+    gambles, lucky = kind <= 1, kind == 0
+    share, weighted = lucky.sum() / gambles.sum(), weight[lucky].sum() / weight[gambles].sum()
+    print(f'gambles at the goal: {share:.2f} as drawn, {weighted:.2f} as weighted')
+
+
+if __name__ == '__main__':
+    sys.exit(main())
