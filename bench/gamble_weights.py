@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import task_spec
 from policy_node import load_policy
 from policy_node.policies.policy import RandomPolicy
@@ -23,6 +24,7 @@ from policy_node.training.learning.collector import Collector
 from policy_node.training.learning.ddpg import DDPG
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.gamble import is_over
 from policy_node.training.learning.learners import make_learner
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.sampling import make_sampler
@@ -32,8 +34,6 @@ from policy_node.training.learning.transitions import Transitions
 TASK = 'FetchPush'
 EPISODES = 600
 UPDATES, MEASURED = 2_000, 100
-# Fingers at 1 m say that an episode is over (`gamble.py`).
-_FINGERS, _OVER = 9, 1.0
 _KINDS = ('gamble, at the goal', 'gamble, elsewhere', 'push into the goal', 'all else')
 
 
@@ -72,18 +72,15 @@ def _learner_of(random: bool) -> tuple[DDPG, Experience]:
 
 def _kind(batch: Transitions) -> NDArray[np.intp]:
     """Index of each transition's kind, (batch,)."""
-    start = task_spec(TASK).achieved_goal_start
+    spec = task_spec(TASK)
+    metric, place = GoalMetric(spec), spec.achieved_goal_start
+    states = batch.observation, batch.next_observation
+    was_over, over = (is_over(state, spec) for state in states)
     before, after = (
-        np.linalg.norm(state[:, start : start + 3] - batch.goal, axis=1)
-        < task_spec(TASK).distance_threshold
-        for state in (batch.observation, batch.next_observation)
+        metric.success(state[:, place : place + spec.goal.size], batch.goal) for state in states
     )
-    was_over, is_over = (
-        state[:, _FINGERS] == _OVER for state in (batch.observation, batch.next_observation)
-    )
-    gamble = is_over & ~was_over
-    kinds = [gamble & after, gamble, after & ~before & ~is_over]
-    return np.select(kinds, [0, 1, 2], default=3)
+    gamble = over & ~was_over
+    return np.select([gamble & after, gamble, after & ~before & ~over], [0, 1, 2], default=3)
 
 
 def _print(weight: NDArray[np.floating], kind: NDArray[np.intp]) -> None:

@@ -12,9 +12,9 @@ from policy_node.training.learning.recipes import recipe_config
 SHAPE = NetworkShape(observation_size=1, goal_size=1, action_size=1, hidden_sizes=(32, 32))
 
 
-def make_learner(**changes: object) -> DDPG:
+def make_learner(shape: NetworkShape = SHAPE, **changes: object) -> DDPG:
     """A learner of one observation, goal and action, with a discount of 0.5."""
     torch.manual_seed(0)
     options = {'precision': 'float32', 'gamma': 0.5, 'learning_rate': 3e-3, **changes}
     config = recipe_config('FetchReach', 'paper', **options)
-    return DDPG(SHAPE, config, torch.device('cpu'), Workers())
+    return DDPG(shape, config, torch.device('cpu'), Workers())

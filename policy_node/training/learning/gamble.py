@@ -107,13 +107,18 @@ class GambleSimulation(Simulation):
         return {**observation, 'observation': shown, 'achieved_goal': achieved}
 
 
+def is_over(observation: NDArray[np.floating], spec: TaskSpec) -> NDArray[np.bool_]:
+    """Whether a gamble has ended the episode, (...,), from observations (..., size)."""
+    return np.asarray(observation[..., _parts(spec)['gripper_state'].start] == _OVER)
+
+
 def without_landings(episodes: Episodes, spec: TaskSpec) -> Episodes:
     """The episodes with what was achieved by a gamble taken back to their start.
 
     A landing is no motion of the robot's: which episodes have moved something is decided by what
     comes before it.
     """
-    over = episodes.observation[..., _parts(spec)['gripper_state'].start] == _OVER
+    over = is_over(episodes.observation, spec)
     first = episodes.achieved_goal[:, :1]
     return replace(episodes, achieved_goal=np.where(over[..., None], first, episodes.achieved_goal))
 

@@ -11,13 +11,13 @@ import torch
 
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.learning.ddpg import DDPG
-from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.episode_weights import episode_weights
 from policy_node.training.learning.gamble import GambleSimulation
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.sampling import TransitionSampler
 from policy_node.training.learning.transitions import Transitions
+from support.learners import make_learner
 
 torch.set_num_threads(1)
 
@@ -98,18 +98,8 @@ def two_armed_gambles(count: int, generator: np.random.Generator) -> Episodes:
 
 def gambler(importance: str, mixture: dict[str, float]) -> tuple[DDPG, Callable[[], Transitions]]:
     """A learner that knows nothing yet, and what draws its batches."""
-    torch.manual_seed(0)
     generator = np.random.default_rng(0)
-    config = recipe_config(
-        'FetchReach',
-        'paper',
-        precision='float32',
-        gamma=0.0,
-        importance=importance,
-        learning_rate=3e-3,
-    )
-    shape = NetworkShape(10, 3, 1, (64, 64))
-    learner = DDPG(shape, config, torch.device('cpu'), Workers())
+    learner = make_learner(NetworkShape(10, 3, 1, (64, 64)), gamma=0.0, importance=importance)
     episodes = two_armed_gambles(2_000, generator)
     sampler = TransitionSampler(
         lambda achieved, goal: -1.0 * (np.abs(achieved - goal).max(axis=-1) > 0.5), gamma=0.0
