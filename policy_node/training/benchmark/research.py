@@ -287,11 +287,18 @@ STUDIES: dict[str, Study] = {
                 'FetchPickAndPlace': _PICK,
                 'HandManipulateBlockRotateXYZ': _ROTATE_XYZ,
                 'FetchReach': _REACH,
+                'FetchPush': _PUSH,
+                'FetchSlide': _SLIDE,
             },
             (
                 Arm('flat', 'no subgoals', {'subgoal_every': 0}),
                 Arm('every10', 'a subgoal every 10 ticks', {'subgoal_every': 10}),
                 Arm('prior', 'imagined subgoals, weight .3', {'subgoal_prior': 0.3}),
+                Arm(
+                    'prior4',
+                    'the same, the network that imagines learns every fourth time',
+                    {'subgoal_prior': 0.3, 'imagination_interval': 4},
+                ),
             ),
         ),
         Study(

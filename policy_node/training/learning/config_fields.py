@@ -198,6 +198,9 @@ class ConfigFields:
     subgoal_prior: float = 0.0
     """Weight of the distance between the actor's actions and those for an imagined subgoal, halfway
     to the goal by value, in the actor loss; 0 imagines none."""
+    imagination_interval: int = 1
+    """Updates of the actor for each of the network that imagines subgoals, which costs almost as
+    much as one of actor and critic."""
     final_exploration: float = 1.0
     """Share of `random_epsilon` and `noise_std` left at `total_steps`; both fall linearly in
     the last third of the run. 1 keeps them constant."""

@@ -80,6 +80,7 @@ RANGES = (
     ('longest_hold', 1, 1000),
     ('subgoal_every', 0, 1000),
     ('subgoal_prior', 0, _INFINITY),
+    ('imagination_interval', 1, 1000),
     ('critic_first', 0, _INFINITY),
     ('total_steps', 1, _INFINITY),
     ('time_limit', 0, _INFINITY),
@@ -220,6 +221,8 @@ def _contradictions_of_subgoals(config: ConfigFields) -> Iterator[str]:
         yield 'subgoal_every needs reward_type sparse: a subgoal is reached or missed'
     if imagined and (guided or conditioned or config.advantage):
         yield 'subgoal_prior excludes subgoal_every, condition and advantage'
+    if config.imagination_interval > 1 and not imagined:
+        yield 'imagination_interval above 1 needs subgoal_prior above 0'
     if imagined and config.longest_hold > 1:
         yield 'subgoal_prior excludes longest_hold above 1'
 

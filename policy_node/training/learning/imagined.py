@@ -60,10 +60,15 @@ class ImaginingDDPG(DDPG):
         self._is_pose = spec.goal is GoalKind.POSE
 
     def _update_actor(self, known: Known) -> tuple[Tensor, Tensor]:
+        actor_updates = self.updates // self.config.policy_delay
+        if actor_updates % self.config.imagination_interval == 0:
+            self._update_imagination(known)
+        return super()._update_actor(known)
+
+    def _update_imagination(self, known: Known) -> None:
         with self._precision():
             loss = self._imagination_loss(known)
         self.step(self._imagination_optimizer, loss, self._imagination_parameters)
-        return super()._update_actor(known)
 
     def _imagination_loss(self, known: Known) -> Tensor:
         count = -(-len(known.goal) // _EVERY)

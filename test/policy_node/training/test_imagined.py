@@ -94,6 +94,18 @@ def test_the_actor_is_drawn_to_what_it_does_for_the_subgoal() -> None:
     assert distance() < 0.1 * before
 
 
+def test_the_network_that_imagines_learns_at_its_interval() -> None:
+    changes = {'subgoal_prior': 0.3, 'imagination_interval': 3}
+    learner, batch = learner_of(**changes), on_a_line(np.random.default_rng(0), 64)
+    learnt = []
+    for _ in range(7):
+        before = [value.clone() for value in learner.imagination.parameters()]
+        learner.update(batch)
+        now = list(learner.imagination.parameters())
+        learnt.append(not all(torch.equal(*pair) for pair in zip(before, now, strict=True)))
+    assert learnt == [True, False, False, True, False, False, True]
+
+
 def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     small = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
     small |= {'simulation_threads': 1, 'torch_threads': 1, 'subgoal_prior': 0.3}
@@ -115,6 +127,7 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
         ({'subgoal_every': 10}, 'subgoal_prior excludes subgoal_every'),
         ({'condition': 'horizon'}, 'subgoal_prior excludes subgoal_every, condition'),
         ({'advantage': True, 'discount': 'time'}, 'condition and advantage'),
+        ({'subgoal_prior': 0.0, 'imagination_interval': 4}, 'needs subgoal_prior above 0'),
         ({'longest_hold': 5}, 'subgoal_prior excludes longest_hold above 1'),
         (
             {'algorithm': 'ppo', 'overlap': False, 'random_epsilon': 0.0},
