@@ -415,6 +415,11 @@ STUDIES: dict[str, Study] = {
                     {'goals': 'actual=.4,displaced=.4'},
                 ),
                 Arm('discount', 'discount 0.95, not 0.98', {'gamma': 0.95}),
+                Arm(
+                    'prior4',
+                    'imagined subgoals',
+                    {'subgoal_prior': 0.3, 'imagination_interval': 4},
+                ),
                 Arm('returns', 'returns of five steps', {'n_step': 5}),
             ),
             seeds=2,
