@@ -17,6 +17,11 @@ _DECIDE_AT_RATES = (
     'importance subgoal_every'
 ).split()
 
+# Who sets one of these does without imagined subgoals, which exclude other values of them.
+_EXCLUDE_IMAGINED = (
+    'subgoal_prior algorithm subgoal_every condition advantage longest_hold'
+).split()
+
 
 def ticks_of_40_ms(control_hz: float) -> float:
     """Ticks in 40 ms: steps are counted in these, so that rates can be compared."""
@@ -46,6 +51,7 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     values = {'paper': _paper, 'best': _best, 'finetune': _finetune}[recipe](task)
     if recipe == 'best':
         values |= _at_rate(task, values, overrides)
+        values |= _imagined(task, overrides)
     return TrainConfig(**{'task': task, 'recipe': recipe, **values, **overrides})
 
 
@@ -65,6 +71,13 @@ def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any])
         return counts
     ticks = round(ticks_of_40_ms(control_hz))
     return {**counts, 'discount': 'time', 'noise_seconds': 1 / DEFAULT_CONTROL_HZ, 'n_step': ticks}
+
+
+def _imagined(task: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Subgoals that `best` imagines where they were measured to pay (docs/research/hierarchy)."""
+    if task != 'FetchPickAndPlace' or any(name in overrides for name in _EXCLUDE_IMAGINED):
+        return {}
+    return {'subgoal_prior': 0.3, 'imagination_interval': 4}
 
 
 def _paper(task: str) -> dict[str, Any]:

@@ -122,6 +122,21 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ('task', 'changes', 'prior'),
+    [
+        ('FetchPickAndPlace', {}, 0.3),
+        ('FetchPickAndPlace', {'subgoal_prior': 0.0}, 0.0),
+        ('FetchPickAndPlace', {'condition': 'threshold'}, 0.0),
+        ('FetchPush', {}, 0.0),
+    ],
+)
+def test_best_imagines_where_it_pays_and_nothing_else_is_asked_for(
+    task: str, changes: dict[str, object], prior: float
+) -> None:
+    assert recipe_config(task, 'best', **changes).subgoal_prior == prior
+
+
+@pytest.mark.parametrize(
     ('changes', 'message'),
     [
         ({'subgoal_every': 10}, 'subgoal_prior excludes subgoal_every'),
