@@ -297,7 +297,7 @@ STUDIES: dict[str, Study] = {
                 Arm('prior', 'imagined subgoals, weight .3', {'subgoal_prior': 0.3}),
                 Arm(
                     'prior4',
-                    'the same, the network that imagines learns every fourth time',
+                    'the same, imagination learnt every 4th time',
                     {'subgoal_prior': 0.3, 'imagination_interval': 4},
                 ),
             ),
