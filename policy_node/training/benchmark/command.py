@@ -9,8 +9,8 @@ the networks of another. At the end it also evaluates each best actor on fresh e
 with its critic, evaluation and curve into <output>/actors.
 
 `--study NAME`, any other: one of the paper's requests for research, or `ingredients`. Trains
-task x arm x seed, measures each run on fresh episodes, and renews data, figure and table in
-docs/research/NAME after each.
+task x arm x seed, measures each run on fresh episodes, and adds it to data, figure and table in
+docs/research/NAME. What these hold already, from whatever machine, is not run again.
 
 Finished jobs are skipped and interrupted ones continued, so the same command goes on where it
 stopped; given twice at once, it shares the work.
@@ -40,8 +40,11 @@ from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.jobs import ARMS, Job
 from policy_node.training.benchmark.reporting import report, require_readable, ship_all
 from policy_node.training.benchmark.research import FINAL_EPISODES, STUDIES, Study, research_jobs
-from policy_node.training.benchmark.research_report import require_all_runs
-from policy_node.training.benchmark.shared_runs import take_from_other_studies
+from policy_node.training.benchmark.shared_runs import (
+    take_from_other_reports,
+    take_from_other_studies,
+)
+from policy_node.training.benchmark.stored_runs import StoredRuns
 from policy_node.training.benchmark.studies import PAPER, best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
 from policy_node.training.learning.config_rules import FROM_NOTHING
@@ -195,24 +198,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace, command: str) -> int:
     if options.ray:
         require_extra('cluster')
+    study = _study(options)
     try:
         jobs = jobs_from_arguments(options)
-        if _study(options) is not None:
-            require_all_runs(jobs, _report_folder(options))
-            if options.output is None:
-                # Who names a folder wants runs of their own.
-                take_from_other_studies(jobs, _output(options).parent)
+        if study is not None:
+            StoredRuns.read(_report_folder(options)).require_alike(study, jobs)
         finished = [job for job in jobs if job.is_finished]
     except (ValueError, TypeError) as error:
         raise UsageError(str(error)) from None
     _make_folder(_output(options), 'runs')
     _make_folder(_report_folder(options), 'a report')
+    if study is not None:
+        jobs = _not_stored(study, jobs, options)
+        finished = [job for job in jobs if job.is_finished]
     require_readable(finished)
     try:
         whole = _run_where_asked(options, jobs, command)
     finally:
         shipped = _report(options, jobs, command)
     return EXIT_SUCCESS if whole and shipped else EXIT_FAILURE
+
+
+def _not_stored(study: Study, jobs: Sequence[Job], options: argparse.Namespace) -> list[Job]:
+    """The jobs whose runs neither the report nor that of another study holds."""
+    folder = _report_folder(options)
+    # Who names a folder wants runs of their own.
+    if options.output is None:
+        take_from_other_studies(jobs, _output(options).parent)
+        if options.report is None:
+            take_from_other_reports(study, jobs, folder)
+    stored = StoredRuns.read(folder)
+    missing = [job for job in jobs if not stored.holds(job)]
+    if len(missing) < len(jobs):
+        count = f'{len(jobs) - len(missing)} of {len(jobs)}'
+        print(f'{count} runs are in {folder}; with another --report they are run again')
+    return missing
 
 
 def _make_folder(folder: Path, content: str) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from policy_node.policies import checkpoint
 from policy_node.policies.files import write_file
+from policy_node.training.benchmark.machines import machine
 from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, wilson_interval
 from policy_node.training.evaluation.evaluator import successes
 from policy_node.training.learning.config import TrainConfig
@@ -40,6 +41,7 @@ def measure_final(config: TrainConfig, folder: Path, episodes: int) -> None:
         'mean_return': float(outcomes.episode_return.mean()),
         'episodes': episodes,
         'first_seed': FIRST_SEED,
+        'machine': machine(),
     }
     write_file(folder / FINAL_FILE, (json.dumps(found, indent=2) + '\n').encode())
 

@@ -66,6 +66,25 @@ ARMS = {
 BEST_ARM = Arm('best', 'DDPG+HER, best recipe')
 
 
+def differing_fields(stored: Mapping[str, Any], config: TrainConfig) -> dict[str, str]:
+    """Fields by which another result is to be expected, each with both values in words.
+
+    Args:
+        stored: What `dataclasses.asdict` gave, through JSON; fields that came later have their
+            default.
+        config: A configuration.
+
+    Raises:
+        ValueError: If the stored one has unknown fields or values that are not allowed.
+    """
+    before, now = dataclasses.asdict(config_from_dict(dict(stored))), dataclasses.asdict(config)
+    return {
+        name: f'{name} {value!r}, now {now[name]!r}'
+        for name, value in before.items()
+        if value != now[name] and name not in _MAY_DIFFER
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class Job:
     """One training run.
@@ -146,14 +165,10 @@ class Job:
         """
         if not self.has_checkpoint:
             return
-        stored = config_from_dict(read_state(self.folder / STATE_FILE).extra['config'])
-        wanted = dataclasses.asdict(self.config)
-        differing = [
-            f'{name} {value!r}, now {wanted[name]!r}'
-            for name, value in dataclasses.asdict(stored).items()
-            if value != wanted[name] and name not in _MAY_DIFFER
-        ]
+        stored = read_state(self.folder / STATE_FILE).extra['config']
+        differing = differing_fields(stored, self.config)
         if differing:
             raise ValueError(
-                f'{self.folder} holds a run with {"; ".join(differing)}: choose another --output'
+                f'{self.folder} holds a run with {"; ".join(differing.values())}: '
+                'choose another --output'
             )

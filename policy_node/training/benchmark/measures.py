@@ -8,21 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark.final import read_final
 from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
+from policy_node.training.benchmark.machines import machine
 from policy_node.training.benchmark.results import Array, Curve, read_curve
 from policy_node.training.learning.recipes import ticks_of_40_ms
-from policy_node.training.learning.run_folder import COMMAND_FILE
+from policy_node.training.learning.run_folder import COMMAND_FILE, LATEST_FILE
 from policy_node.training.learning.run_log import read_progress
 
 GOOD_SUCCESS = 0.9
-_SUMMED_UP = (
-    'area',
-    'area_in_time',
-    'final_success',
-    'processor_seconds',
-    'samples_per_processor_second',
-)
+_SUMMED_UP = ('area', 'final_success')
+# What can be compared on machines alone where the baseline ran too.
+_SUMMED_UP_IN_TIME = ('processor_seconds', 'area_in_time', 'samples_per_processor_second')
 # Processor time is rounded to this.
 _SHORTEST = 0.1
 
@@ -95,6 +93,9 @@ def measure_run(job: Job, curve: Curve) -> dict[str, Any]:
         'samples_per_processor_second': round(samples / processor_seconds, 1),
         'last_mean_value': last.get('mean_value', ''),
         'parts': len((job.folder / COMMAND_FILE).read_text().splitlines()),
+        # Runs of before do not say where they ran: here.
+        'machine': final.get('machine', machine()),
+        'revision': read_info(job.folder / LATEST_FILE).source_revision,
     }
 
 
@@ -102,14 +103,16 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Medians and quartiles over the seeds of one arm: one row of `arms.csv`.
 
     Args:
-        runs: Rows of `runs.csv`, each with its `area_in_time`.
+        runs: Rows of `runs.csv`, each with its `area_in_time`: None where its processor time has
+            nothing to be compared with. Medians of time are those of the others, whose number is
+            `timed`; empty where there are none.
     """
     first, reached = runs[0], [run[f'steps_to_{GOOD_SUCCESS}'] for run in runs]
-    found = {'task': first['task'], 'arm': first['arm'], 'seeds': len(runs)}
-    for name in _SUMMED_UP:
-        quartiles = np.percentile([run[name] for run in runs], [25, 50, 75])
-        for part, value in zip(('lower', 'median', 'upper'), quartiles, strict=True):
-            found[f'{name}_{part}'] = round(float(value), 4)
+    timed = [run for run in runs if run['area_in_time'] is not None]
+    found = {'task': first['task'], 'arm': first['arm'], 'seeds': len(runs), 'timed': len(timed)}
+    for names, group in ((_SUMMED_UP, runs), (_SUMMED_UP_IN_TIME, timed)):
+        for name in names:
+            found |= _quartiles(name, [float(run[name]) for run in group])
     # A censored run counts as slower than any other; the middle of an even number with one has no
     # value, so the slower one counts.
     ordered = sorted(float('inf') if steps == '' else float(steps) for steps in reached)
@@ -117,6 +120,15 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     found[f'steps_to_{GOOD_SUCCESS}_median'] = '' if np.isinf(middle) else int(middle)
     found['reached'] = sum(steps != '' for steps in reached)
     return found
+
+
+def _quartiles(name: str, values: Sequence[float]) -> dict[str, float | str]:
+    """Median and quartiles under names of their own; of no values empty."""
+    parts = ('lower', 'median', 'upper')
+    if not values:
+        return {f'{name}_{part}': '' for part in parts}
+    quartiles = np.percentile(values, [25, 50, 75])
+    return {f'{name}_{part}': round(float(q), 4) for part, q in zip(parts, quartiles, strict=True)}
 
 
 def are_apart(first: Mapping[str, Any], second: Mapping[str, Any], name: str) -> bool:

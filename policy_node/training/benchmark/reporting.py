@@ -12,12 +12,13 @@ from policy_node.training.benchmark.measures import curve_of, measure_run
 from policy_node.training.benchmark.research import Study
 from policy_node.training.benchmark.research_report import write_study
 from policy_node.training.benchmark.results import write_report
+from policy_node.training.benchmark.stored_runs import RUNS
 from policy_node.training.evaluation.shipping import ship
 from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE
 
 
 def report(jobs: Sequence[Job], study: Study | None, output: Path, command: str) -> None:
-    """Writes what finished jobs gave; where none is finished, nothing.
+    """Writes what finished jobs gave; where none is finished, a study's page from what it holds.
 
     Args:
         jobs: Finished jobs.
@@ -31,7 +32,7 @@ def report(jobs: Sequence[Job], study: Study | None, output: Path, command: str)
     """
     require_readable(jobs)
     try:
-        if jobs and study is not None:
+        if study is not None and (jobs or (output / RUNS).is_file()):
             write_study(study, jobs, output, command)
         elif jobs:
             write_report(jobs, output, command)

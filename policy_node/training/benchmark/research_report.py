@@ -1,14 +1,10 @@
 """Data, figure and table of a study, under `docs/research/<name>`; renewed after every run.
 
-A command renews the tasks that it runs; what is there of other tasks, from another day or machine,
-stays.
+A command adds its runs; what is there already, from another day or machine, stays.
 """
 
 from __future__ import annotations
 
-import csv
-import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,82 +16,25 @@ from policy_node.training.benchmark.measures import (
     GOOD_SUCCESS,
     are_apart,
     area_in_time,
-    curve_of,
-    measure_run,
     sum_up,
 )
 from policy_node.training.benchmark.research import Study
-from policy_node.training.benchmark.results import (
-    Band,
-    Curve,
-    aggregate,
-    curve_rows,
-    draw,
-    machine,
-    source_revisions,
-    write_csv,
-)
-from policy_node.training.learning.recipes import STEP_COUNTS
+from policy_node.training.benchmark.results import Band, Curve, aggregate, draw, write_csv
+from policy_node.training.benchmark.stored_runs import RUN, Rows, StoredRuns, locked, run_of
 
 # The page of a study keeps its table between these lines.
 BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'
-_RUNS, _ARMS, _CURVES, _ABOUT = 'runs.csv', 'arms.csv', 'curves.csv', 'study.json'
-
-_RUN = ('task', 'arm', 'seed')
-"""Columns that name a run."""
-
-Rows = list[dict[str, Any]]
-
-
-def require_all_runs(jobs: Sequence[Job], output: Path) -> None:
-    """Refuses a folder that holds runs of the jobs' tasks which are not among the jobs.
-
-    They would be gone.
-
-    Args:
-        jobs: Jobs of a study, finished or not.
-        output: Folder that `write_study` is to write.
-
-    Raises:
-        ValueError: If a run would be lost, or it cannot be seen whether; the line names one.
-    """
-    _tasks_told(output / _ABOUT)
-    tasks = {job.config.task for job in jobs}
-    ours = {(job.config.task, job.arm.name, job.config.seed) for job in jobs}
-    found, evaluated = (_runs_of(output / name) for name in (_RUNS, _CURVES))
-    if missing := [key for key in found if key[0] not in tasks and key not in evaluated]:
-        raise ValueError(f'{output / _CURVES} has no evaluation of {_name(missing[0])}')
-    lost = [key for key in found if key[0] in tasks and key not in ours]
-    if lost:
-        raise ValueError(
-            f'{output} holds runs that this command has not ({len(lost)}), as {_name(lost[0])}: '
-            'name their arms and seeds too, or another folder with --report'
-        )
-
-
-def _runs_of(path: Path) -> list[tuple[Any, ...]]:
-    """Task, arm and seed of every row of a file."""
-    try:
-        return [_run_of(row) for row in read_rows(path)]
-    except KeyError as error:
-        raise ValueError(f'{path} has no column {error}') from None
-
-
-def _run_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in _RUN)
-
-
-def _name(run: tuple[Any, ...]) -> str:
-    task, arm, seed = run
-    return f'{task}/{arm}/seed{seed}'
+ARMS = 'arms.csv'
+# A difference is claimed from so many seeds on.
+_ENOUGH_SEEDS = 5
 
 
 def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -> None:
-    """Writes what the finished jobs of a study gave, beside what is there of other tasks.
+    """Writes what the finished jobs of a study gave, beside the runs that are there.
 
     `runs.csv` (one row per run), `arms.csv` (medians and quartiles), `curves.csv` (every
-    evaluation), `study.json` (by task: command, machine, revisions, settings), `figure.png`, and
-    the table between its marks in `README.md`, which is made where there is none.
+    evaluation), `study.json` (by task: commands and settings), `figure.png`, and the table between
+    its marks in `README.md`, which is made where there is none.
 
     Args:
         study: The study.
@@ -106,51 +45,15 @@ def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -
     Raises:
         ValueError: If a file of the folder cannot be read.
     """
-    output.mkdir(parents=True, exist_ok=True)
-    found = [curve_of(job) for job in jobs]
-    measured = [measure_run(job, curve) for job, curve in zip(jobs, found, strict=True)]
-    runs = _with_other_tasks(study, measured, output / _RUNS)
-    curves = _with_other_tasks(study, curve_rows(jobs, found), output / _CURVES)
-    arms = sum_up_arms(study, runs, curves)
-    about = _about(study, jobs, command, output / _ABOUT)
-    for name, rows in ((_RUNS, runs), (_ARMS, arms), (_CURVES, curves)):
-        write_csv(rows, output / name)
-    (output / _ABOUT).write_text(json.dumps(about, indent=2) + '\n')
-    labels = {arm.name: arm.label for arm in study.arms}
-    draw(_bands(curves), labels, output / 'figure.png', paper_epochs=False)
-    _renew(output / 'README.md', format_table(study, arms))
-
-
-def read_rows(path: Path) -> Rows:
-    """Rows of a CSV file, numbers as numbers; none where there is no file.
-
-    Raises:
-        ValueError: If it cannot be read.
-    """
-    if not path.is_file():
-        return []
-    try:
-        rows = list(csv.DictReader(path.read_text().splitlines()))
-    except OSError as error:
-        raise ValueError(f'{path} cannot be read: {error.strerror}') from None
-    return [{name: _value(text) for name, text in row.items()} for row in rows]
-
-
-def _value(text: str | None) -> int | float | str:
-    for kind in (int, float):
-        try:
-            return kind(text or '')
-        except ValueError:
-            continue
-    return text or ''
-
-
-def _with_other_tasks(study: Study, rows: Rows, path: Path) -> Rows:
-    """New rows and those that a file has of other tasks, in the order of the study's tasks."""
-    tasks = {row['task'] for row in rows}
-    kept = [row for row in read_rows(path) if row['task'] not in tasks]
-    order = {name: index for index, name in enumerate(study.tasks)}
-    return sorted([*kept, *rows], key=lambda row: order.get(row['task'], len(order)))
+    with locked(output):
+        stored = StoredRuns.read(output)
+        stored.add(jobs, command)
+        stored.write(study)
+        arms = sum_up_arms(study, stored.runs, stored.curves)
+        write_csv(arms, output / ARMS)
+        labels = {arm.name: arm.label for arm in study.arms}
+        draw(_bands(stored.curves), labels, output / 'figure.png', paper_epochs=False)
+        _renew(output / 'README.md', format_table(study, arms))
 
 
 def sum_up_arms(study: Study, runs: Rows, curves: Rows) -> Rows:
@@ -162,19 +65,36 @@ def sum_up_arms(study: Study, runs: Rows, curves: Rows) -> Rows:
         curves: Rows of `curves.csv`.
     """
     order = {arm.name: index for index, arm in enumerate(study.arms)}
-    by_run = {key: _curve(points) for key, points in _grouped(curves, *_RUN).items()}
+    by_run = {key: _curve(points) for key, points in _grouped(curves, *RUN).items()}
     arms = []
     for of_task in _grouped(runs, 'task').values():
         groups = sorted(
             _grouped(of_task, 'arm').items(), key=lambda item: order.get(item[0][0], len(order))
         )
         # As long as the first arm took, which is the baseline where that was run.
-        seconds = float(np.median([run['processor_seconds'] for run in groups[0][1]]))
+        seconds = _median_seconds(groups[0][1])
         for _, group in groups:
-            areas = (area_in_time(by_run[_run_of(run)], run, seconds) for run in group)
+            areas = (_area_in_time(by_run[run_of(run)], run, seconds) for run in group)
             pairs = zip(group, areas, strict=True)
             arms.append(sum_up([{**run, 'area_in_time': area} for run, area in pairs]))
     return arms
+
+
+def _median_seconds(runs: Rows) -> dict[str, float]:
+    """Median processor time of runs, by machine."""
+    return {
+        machine: float(np.median([run['processor_seconds'] for run in group]))
+        for (machine,), group in _grouped(runs, 'machine').items()
+    }
+
+
+def _area_in_time(
+    curve: Curve, run: Mapping[str, Any], seconds: Mapping[str, float]
+) -> float | None:
+    """Area in as much time as the baseline took on the same machine; None if it never ran there."""
+    if run['machine'] not in seconds:
+        return None
+    return area_in_time(curve, run, seconds[run['machine']])
 
 
 def _curve(points: Rows) -> Curve:
@@ -219,13 +139,23 @@ def format_table(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
             _quartiles(row, 'area'),
             f'{steps:,} ({row["reached"]})' if steps != '' else f'censored ({row["reached"]})',
             _quartiles(row, 'final_success'),
-            f'{row["processor_seconds_median"]:.0f}',
-            _quartiles(row, 'area_in_time'),
-            f'{row["samples_per_processor_second_median"]:,.0f}',
+            *_times(row),
             _against(study, row, arms),
         ]
         lines.append(f'| {" | ".join(cells)} |')
     return '\n'.join(lines) + '\n'
+
+
+def _times(row: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Processor time, area in equal time, samples per second: of the runs that have them."""
+    if not row['timed']:
+        return ('-',) * 3
+    some = '' if row['timed'] == row['seeds'] else f', of {row["timed"]}'
+    return (
+        f'{row["processor_seconds_median"]:.0f}{some}',
+        _quartiles(row, 'area_in_time') + some,
+        f'{row["samples_per_processor_second_median"]:,.0f}{some}',
+    )
 
 
 def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, Any]]) -> str:
@@ -234,15 +164,16 @@ def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, A
     found = [other for other in arms if (other['task'], other['arm']) == (row['task'], base)]
     if row['arm'] == base or not found:
         return ''
-    if min(row['seeds'], found[0]['seeds']) < 5:
+    if min(row['seeds'], found[0]['seeds']) < _ENOUGH_SEEDS:
         return 'fewer than five seeds'
     words = []
-    for name, label in (
-        ('area', 'area'),
-        ('area_in_time', 'area in time'),
-        ('final_success', 'final'),
+    for name, label, runs in (
+        ('area', 'area', 'seeds'),
+        ('area_in_time', 'area in time', 'timed'),
+        ('final_success', 'final', 'seeds'),
     ):
-        if are_apart(row, found[0], name):
+        enough = min(row[runs], found[0][runs]) >= _ENOUGH_SEEDS
+        if enough and are_apart(row, found[0], name):
             better = row[f'{name}_median'] > found[0][f'{name}_median']
             words.append(f'{label} {"better" if better else "worse"}')
     return ', '.join(words) or 'not apart'
@@ -251,47 +182,6 @@ def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, A
 def _quartiles(row: Mapping[str, Any], name: str) -> str:
     values = (row[f'{name}_{part}'] for part in ('median', 'lower', 'upper'))
     return '{:.3f} ({:.3f} ... {:.3f})'.format(*values)
-
-
-def _about(study: Study, jobs: Sequence[Job], command: str, path: Path) -> dict[str, Any]:
-    """What `study.json` says; of other tasks, what it says already."""
-    tasks = _tasks_told(path)
-    for task, settings in _shared_settings(study, jobs).items():
-        tasks[task] = {
-            'command': command,
-            'source_revisions': source_revisions([j for j in jobs if j.config.task == task]),
-            'machine': machine(),
-            'settings': settings,
-        }
-    return {
-        'study': study.name,
-        'request': study.request,
-        'question': study.question,
-        'arms': {arm.name: arm.own for arm in study.arms},
-        'tasks': tasks,
-    }
-
-
-def _tasks_told(path: Path) -> dict[str, Any]:
-    """What a `study.json` says of its tasks."""
-    try:
-        return dict(json.loads(path.read_text())['tasks']) if path.is_file() else {}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f'{path} is no record of a study: {error!r}') from None
-
-
-def _shared_settings(study: Study, jobs: Sequence[Job]) -> dict[str, dict[str, Any]]:
-    """By task, the fields of `TrainConfig` that all arms share."""
-    own = {'seed', *(name for arm in study.arms for name in arm.changes)}
-    if 'control_hz' in own:
-        own |= set(STEP_COUNTS)
-    # Last those whose arms multiply nothing: what others multiply is told by its own value.
-    ordered = sorted(jobs, key=lambda job: not job.arm.factors)
-    configs = {job.config.task: dataclasses.asdict(job.config) for job in ordered}
-    return {
-        task: {name: value for name, value in config.items() if name not in own}
-        for task, config in configs.items()
-    }
 
 
 def _renew(page: Path, table: str) -> None:

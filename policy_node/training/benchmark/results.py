@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +18,7 @@ from rich.table import Table
 from msgs_spec.tasks import task_spec
 from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, PROGRESS_FILE, Job
+from policy_node.training.benchmark.machines import machine
 from policy_node.training.benchmark.published import BEST, RERUN
 from policy_node.training.learning.run_folder import LATEST_FILE
 from policy_node.training.learning.run_log import read_progress
@@ -151,14 +150,6 @@ def write_report(jobs: Sequence[Job], output: Path, command: str) -> None:
     (output / 'benchmark.txt').write_text(text)
     print(text, end='')
     print(f'figure and tables in {output}')
-
-
-def machine() -> str:
-    """Processor and number of cores."""
-    info = Path('/proc/cpuinfo')
-    lines = info.read_text().splitlines() if info.is_file() else []
-    models = [line.split(':')[1].strip() for line in lines if line.startswith('model name')]
-    return f'{models[0] if models else platform.machine()}, {os.cpu_count()} cores'
 
 
 def format_table(table: Sequence[dict[str, Any]]) -> str:

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from policy_node.training.benchmark.jobs import Job
+from policy_node.training.benchmark.research import Study
+from policy_node.training.benchmark.stored_runs import ABOUT, StoredRuns, locked, run_of
 from policy_node.training.learning.run_folder import STATE_FILE
 
 
@@ -32,6 +34,37 @@ def take_from_other_studies(jobs: Sequence[Job], studies: Path) -> None:
             shutil.rmtree(copy)
         else:
             print(f'{job.name} is the run in {found}', flush=True)
+
+
+def take_from_other_reports(study: Study, jobs: Sequence[Job], report: Path) -> None:
+    """Copies rows of runs that reports beside this one have of jobs that are configured alike.
+
+    So a run of another machine, which is not among the runs here, is not made twice either. A row
+    keeps machine, revision and processor time.
+
+    Args:
+        study: The study of the jobs.
+        jobs: Its jobs; those that its report holds, or that have begun, are left alone.
+        report: Its report, among those of the other studies.
+    """
+    with locked(report):
+        stored, others = StoredRuns.read(report), _reports_beside(report)
+        for job in jobs:
+            if job.folder.exists() or stored.holds(job):
+                continue
+            for other in others:
+                if (run := other.equal_run(job)) is not None:
+                    curve = [row for row in other.curves if run_of(row) == run_of(run)]
+                    name = '{}/{}/seed{} of {}'.format(*run_of(run), other.folder)
+                    stored.put(job, run, curve, f'as {name}')
+                    print(f'{job.name} is {name}', flush=True)
+                    break
+        stored.write(study)
+
+
+def _reports_beside(report: Path) -> list[StoredRuns]:
+    folders = [path.parent for path in sorted(report.parent.glob(f'*/{ABOUT}'))]
+    return [StoredRuns.read(folder) for folder in folders if folder != report]
 
 
 def _equal_run(job: Job, studies: Path) -> Path | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -14,19 +15,16 @@ from policy_node.training.benchmark.command import jobs_from_arguments, main, pa
 from policy_node.training.benchmark.final import FINAL_FILE
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import are_apart, area_in_time, area_under, sum_up
-from policy_node.training.benchmark.research import STUDIES, Study
-from policy_node.training.benchmark.research_report import (
-    BEGIN,
-    END,
-    format_table,
-    read_rows,
-    sum_up_arms,
-)
+from policy_node.training.benchmark.research import STUDIES, Study, research_jobs
+from policy_node.training.benchmark.research_report import BEGIN, END, format_table, sum_up_arms
 from policy_node.training.benchmark.results import Curve
-from policy_node.training.benchmark.shared_runs import take_from_other_studies
+from policy_node.training.benchmark.shared_runs import (
+    take_from_other_reports,
+    take_from_other_studies,
+)
+from policy_node.training.benchmark.stored_runs import StoredRuns, locked, own_fields, read_rows
 from policy_node.training.benchmark.studies import PAPER
 from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.recipes import STEP_COUNTS
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.training_state import Counters, TrainingState, write_state
 from support import ROOT
@@ -43,9 +41,8 @@ def test_arms_of_a_study_share_all_but_what_is_theirs(study: Study, tmp_path: Pa
         options = ['--study', study.name, '--tasks', task, '--output', str(tmp_path)]
         jobs = jobs_from_arguments(parse_arguments(options))
         assert len(jobs) == study.seeds * len(study.arms)
-        own = {name for arm in study.arms for name in arm.own} | {'seed'}
+        own = own_fields(study) | {'seed'}
         if 'control_hz' in own:
-            own |= set(STEP_COUNTS)
             seconds = {job.config.total_steps / job.config.control_hz for job in jobs}
             assert len(seconds) == 1, 'budgets are the same in simulated time'
         shared = [name for name in TrainConfig.__slots__ if name not in own]
@@ -80,6 +77,17 @@ def test_a_page_says_what_its_data_say(study: Study) -> None:
     assert set(tasks) == set(about['tasks']) <= set(study.tasks)
     evaluated = {(row['task'], row['arm'], row['seed']) for row in curves}
     assert evaluated == {(run['task'], run['arm'], run['seed']) for run in runs}
+    assert len(evaluated) == len(runs) and all(run['machine'] and run['revision'] for run in runs)
+
+
+@pytest.mark.parametrize('study', [*STUDIES.values(), PAPER], ids=lambda study: study.name)
+def test_runs_of_today_may_stand_beside_those_of_a_page(study: Study) -> None:
+    """Arms are still configured as their runs were: another seed can be added."""
+    stored = StoredRuns.read(ROOT / 'docs' / 'research' / study.name)
+    for task, told in stored.tasks.items():
+        arms = [study.arm(name) for name in told['arms']]
+        jobs = research_jobs(study, [task], arms, range(9), {}, Path('runs'))
+        stored.require_alike(study, jobs)
 
 
 def test_the_area_is_the_mean_success_over_the_budget() -> None:
@@ -100,7 +108,7 @@ def test_the_area_in_time_is_that_of_the_share_of_a_run(seconds: float, area: fl
 def run(area: float, steps: int | str, final: float) -> dict[str, object]:
     times = {'processor_seconds': 1.0, 'samples_per_processor_second': 2.0}
     found = {'area': area, 'area_in_time': area, 'steps_to_0.9': steps, 'final_success': final}
-    return {'task': 'FetchReach', 'arm': 'one', **found, **times}
+    return {'task': 'FetchReach', 'arm': 'one', 'machine': 'A', **found, **times}
 
 
 def test_a_censored_run_is_slower_than_any_other() -> None:
@@ -125,17 +133,19 @@ def test_a_study_runs_measures_and_gives_the_same_bits_again(
     """Beside what the folder holds of another task."""
     report = tmp_path / 'report'
     report.mkdir()
-    for name in ('runs.csv', 'arms.csv', 'curves.csv', 'study.json'):
-        before = (ROOT / 'docs' / 'research' / 'unbiased' / name).read_text()
-        (report / name).write_text(before.replace('FetchReach', 'FetchPush'))
-    kept = read_rows(report / 'runs.csv')
+    stored = StoredRuns.read(ROOT / 'docs' / 'research' / 'unbiased')
+    for rows in (stored.runs, stored.curves):
+        rows[:] = [row for row in rows if row['task'] == 'FetchPush']
+    del stored.tasks['FetchReach']
+    kept = list(stored.runs)
+    dataclasses.replace(stored, folder=report).write(STUDIES['unbiased'])
     (report / 'README.md').write_text(f'# Before\n{BEGIN}\nold\n{END}\nafter\n')
     arguments = [*SMALL, '--arms', 'future', 'weighted', '--report', str(report)]
     assert main([*arguments, '--output', str(tmp_path / 'first')]) == 0
     assert 'FetchReach/weighted/seed0 is finished; 0 to go' in capsys.readouterr().out
     runs = read_rows(report / 'runs.csv')
     others = [row for row in runs if row['task'] == 'FetchPush']
-    assert [{name: row[name] for name in kept[0]} for row in others] == kept
+    assert others == kept
     runs = [row for row in runs if row['task'] == 'FetchReach']
     assert [row['arm'] for row in runs] == ['future', 'weighted']
     assert {row['env_steps'] for row in runs} == {800} and {row['parts'] for row in runs} == {1}
@@ -148,7 +158,7 @@ def test_a_study_runs_measures_and_gives_the_same_bits_again(
     assert (report / 'figure.png').read_bytes()[:4] == b'\x89PNG'
     about = json.loads((report / 'study.json').read_text())
     assert about['request'] == 2 and set(about['tasks']) == {'FetchReach', 'FetchPush'}
-    assert len(about['tasks']['FetchReach']['source_revisions']) == 1
+    assert len(about['tasks']['FetchReach']['commands']) == 1
     assert '\n| FetchPush | `future`' in page
     again = tmp_path / 'again'
     assert main([*SMALL, '--arms', 'future', '--report', str(again), '--output', str(again)]) == 0
@@ -199,30 +209,135 @@ def test_a_run_that_another_study_has_is_taken_from_there(
     assert (half.folder / STATE_FILE).read_bytes() == before and not same[0].is_finished
 
 
-def test_runs_of_others_are_not_overwritten(
+def test_a_seed_of_another_day_stands_beside_those_that_are_there(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A command with fewer arms or seeds would leave a page with those alone."""
-    runs = tmp_path / 'runs.csv'
-    runs.write_text('task,arm,seed,area\nFetchReach,actual,0,0.5\nFetchReach,actual,1,0.5\n')
-    arguments = ['--study', 'unbiased', '--arms', 'actual', '--seeds', '1']
-    arguments += ['--report', str(tmp_path), '--output', str(tmp_path / 'runs')]
+    """What a report holds is not run again, be the run itself gone with its machine."""
+    report = tmp_path / 'report'
+    arguments = [*SMALL, '--arms', 'actual', '--report', str(report), '--output']
+    assert main([*arguments, str(tmp_path / 'gone')]) == 0
+    first = read_rows(report / 'runs.csv')
+    assert [run['seed'] for run in first] == [0] and first[0]['machine'].endswith(' cores')
+    today = tmp_path / 'today'
+    capsys.readouterr()
+    assert main([*arguments, str(today), '--seeds', '0', '1']) == 0
+    assert f'1 of 2 runs are in {report}; with another --report' in capsys.readouterr().out
+    assert not list(today.glob('*/*/seed0')) and list(today.glob('*/*/seed1'))
+    runs = read_rows(report / 'runs.csv')
+    assert runs[0] == first[0] and [run['seed'] for run in runs] == [0, 1]
+    assert '| 2 | ' in (report / 'README.md').read_text()
+    kept = {path.name: path.read_bytes() for path in report.iterdir()}
+    for other in (['--arms', 'actual'], ['--arms', 'random']):
+        refused = [*arguments, str(tmp_path / 'other'), *other, '--set', 'batch_size=32']
+        assert main(refused) == 2
+        error = capsys.readouterr().err
+        assert f'{report} holds runs of FetchReach/actual with batch_size 256, now 32: ' in error
+        assert error.count('\n') == 1 and not (tmp_path / 'other').exists()
+    assert {path.name: path.read_bytes() for path in report.iterdir()} == kept
+
+
+def stored_runs(folder: Path, jobs: list[Job], machine: str = 'A', seconds: float = 10.0) -> None:
+    """Puts a run of each job into a report, as long as its seed makes it."""
+    stored = StoredRuns.read(folder)
+    for job in jobs:
+        run = {
+            'env_steps': 400,
+            'area': 0.5,
+            'steps_to_0.9': '',
+            'final_success': 0.5,
+            'final_episodes': job.final_episodes,
+            'processor_seconds': seconds + job.config.seed,
+            'samples_per_processor_second': 7.0,
+            'machine': machine,
+            'revision': 'abc',
+        }
+        curve = [{'env_steps': 200, 'success': '0.5'}, {'env_steps': 400, 'success': '0.5'}]
+        stored.put(job, run, [dict(point) for point in curve], 'a command')
+    stored.write(STUDIES['returns'])
+
+
+def jobs_of(study: str, *more: str, task: str = 'FetchPush') -> list[Job]:
+    return jobs_from_arguments(parse_arguments(['--study', study, '--tasks', task, *more]))
+
+
+def test_time_is_compared_where_the_baseline_ran_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    report, study = tmp_path / 'report', STUDIES['returns']
+    stored_runs(report, jobs_of('returns', '--arms', 'one'))
+    stored_runs(report, jobs_of('returns', '--arms', 'none5', '--seeds', '0', '1'))
+    stored_runs(report, jobs_of('returns', '--arms', 'none5', '--seeds', '2', '3', '4'), 'B', 1.0)
+    stored_runs(report, jobs_of('returns', '--arms', 'none3', '--seeds', '0'), 'B', 1.0)
+    stored = StoredRuns.read(report)
+    assert [run['seed'] for run in stored.runs] == [0, 0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+    one, none3, none5 = sum_up_arms(study, stored.runs, stored.curves)
+    assert (one['timed'], one['processor_seconds_median']) == (5, 12.0)
+    assert (none5['seeds'], none5['timed'], none5['processor_seconds_median']) == (5, 2, 10.5)
+    assert (none3['timed'], none3['area_in_time_median']) == (0, '')
+    lines = format_table(study, [one, none3, none5]).splitlines()
+    assert lines[3].endswith('| 0.500 (0.500 ... 0.500) | - | - | - | fewer than five seeds |')
+    assert lines[4].count(', of 2 | ') == 3 and lines[4].endswith('| not apart |')
+
+
+def test_a_run_that_another_report_tells_of_is_taken_from_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    there, here = Path('docs/targets'), Path('docs/returns')
+    stored_runs(there, jobs_of('targets', '--arms', 'polyak4', 'polyak1', '--seeds', '0', '1'))
+    jobs = jobs_of('returns', '--arms', 'one', 'none3', '--seeds', '1', '2')
+    for _ in range(2):
+        take_from_other_reports(STUDIES['returns'], jobs, here)
+    assert capsys.readouterr().out == (
+        'FetchPush/one/seed1 is FetchPush/polyak4/seed1 of docs/targets\n'
+    )
+    stored = StoredRuns.read(here)
+    assert [stored.holds(job) for job in jobs] == [True, False, False, False]
+    (run,) = stored.runs
+    assert (run['arm'], run['processor_seconds'], run['revision']) == ('one', 11.0, 'abc')
+    assert [row['arm'] for row in stored.curves] == ['one', 'one']
+    assert stored.configuration('FetchPush', 'one')['n_step'] == 1
+    # Measured on other episodes it is another run.
+    (other,) = jobs_of('returns', '--arms', 'one', '--seeds', '0', '--episodes', '20')
+    take_from_other_reports(STUDIES['returns'], [other], here)
+    assert not StoredRuns.read(here).holds(other)
+
+
+def test_reports_that_renew_a_page_at_once_lose_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    report, jobs = tmp_path / 'report', jobs_of('returns', '--arms', 'one')
+
+    def renew(job: Job) -> None:
+        with locked(report):
+            stored_runs(report, [job])
+
+    with ThreadPoolExecutor(len(jobs)) as pool:
+        list(pool.map(renew, jobs))
+    assert [run['seed'] for run in StoredRuns.read(report).runs] == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ('name', 'text', 'message'),
+    [
+        ('curves.csv', None, 'curves.csv has no evaluation of FetchPush/one/seed0'),
+        ('study.json', '{"tasks": {}}', 'study.json has no settings of FetchPush/one/seed0'),
+        ('study.json', '[]', 'study.json is no record of a study: '),
+        ('runs.csv', 'task,arm\nFetchPush,one\n', "runs.csv has no column 'seed'"),
+    ],
+)
+def test_a_damaged_report_is_refused_before_anything_is_trained(
+    name: str, text: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report, runs = tmp_path / 'report', tmp_path / 'runs'
+    stored_runs(report, jobs_of('returns', '--arms', 'one', '--output', str(runs)))
+    (report / name).unlink() if text is None else (report / name).write_text(text)
+    arguments = ['--study', 'returns', '--report', str(report), '--output', str(runs)]
     assert main(arguments) == 2
     error = capsys.readouterr().err
-    assert 'holds runs that this command has not (1), as FetchReach/actual/seed0: ' in error
-    assert error.count('\n') == 1 and not (tmp_path / 'runs').exists()
-    assert runs.read_text().count('\n') == 3
-
-
-def test_a_page_without_its_curves_is_refused_before_anything_is_trained(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / 'runs.csv').write_text('task,arm,seed,area\nFetchPush,actual,0,0.5\n')
-    arguments = ['--study', 'unbiased', '--arms', 'actual', '--report', str(tmp_path)]
-    assert main([*arguments, '--output', str(tmp_path / 'runs')]) == 2
-    error = capsys.readouterr().err
-    assert 'curves.csv has no evaluation of FetchPush/actual/seed0' in error
-    assert error.count('\n') == 1 and not (tmp_path / 'runs').exists()
+    assert message in error and error.count('\n') == 1 and not runs.exists()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,277 @@
+"""What a report under `docs/research` holds of a study: its runs, from any day and machine.
+
+`runs.csv` has a row per run, `curves.csv` every evaluation, and `study.json` how each arm was
+configured; runs that were configured otherwise are not put beside them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import dataclasses
+import fcntl
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from policy_node.training.benchmark.jobs import Job, differing_fields
+from policy_node.training.benchmark.measures import curve_of, measure_run
+from policy_node.training.benchmark.research import Study
+from policy_node.training.benchmark.results import curve_rows, write_csv
+from policy_node.training.learning.recipes import STEP_COUNTS
+
+RUNS, CURVES, ABOUT = 'runs.csv', 'curves.csv', 'study.json'
+RUN = ('task', 'arm', 'seed')
+"""Columns that name a run."""
+
+Rows = list[dict[str, Any]]
+
+
+@dataclass(slots=True)
+class StoredRuns:
+    """The runs of a study that a folder holds, and those that are put beside them.
+
+    Attributes:
+        folder: The report.
+        runs: Rows of `runs.csv`.
+        curves: Rows of `curves.csv`.
+        tasks: By task: the `commands` that ran, the `settings` that all its arms share, and `arms`,
+            by name the fields that are an arm's own. Both together are a whole configuration.
+    """
+
+    folder: Path
+    runs: Rows
+    curves: Rows
+    tasks: dict[str, dict[str, Any]]
+
+    @classmethod
+    def read(cls, folder: Path) -> StoredRuns:
+        """Reads a report; one that is not there holds nothing.
+
+        Raises:
+            ValueError: If a file cannot be read, or the files do not fit each other.
+        """
+        stored = cls(
+            folder,
+            read_rows(folder / RUNS),
+            read_rows(folder / CURVES),
+            _read_tasks(folder / ABOUT),
+        )
+        evaluated = {run_of(row, folder / CURVES) for row in stored.curves}
+        for row in stored.runs:
+            task, arm, _ = run = run_of(row, folder / RUNS)
+            if run not in evaluated:
+                raise ValueError(f'{folder / CURVES} has no evaluation of {_name(run)}')
+            if arm not in stored.tasks.get(task, {'arms': {}})['arms']:
+                raise ValueError(f'{folder / ABOUT} has no settings of {_name(run)}')
+        return stored
+
+    def holds(self, job: Job) -> bool:
+        """Whether it has a run of the job's name, measured on as many episodes."""
+        wanted = (*_name_of(job), job.final_episodes)
+        return any((*run_of(row), row['final_episodes']) == wanted for row in self.runs)
+
+    def configuration(self, task: str, arm: str) -> dict[str, Any]:
+        """Fields of `TrainConfig` of an arm, without the seed."""
+        told = self.tasks[task]
+        return {**told['settings'], **told['arms'][arm]}
+
+    def require_alike(self, study: Study, jobs: Sequence[Job]) -> None:
+        """Refuses jobs that are configured otherwise than what they would stand beside.
+
+        Raises:
+            ValueError: The line names one run and its fields.
+        """
+        own = own_fields(study)
+        for job in {(job.config.task, job.arm.name): job for job in jobs}.values():
+            task = job.config.task
+            for arm in self.tasks.get(task, {'arms': ()})['arms']:
+                differing = differing_fields(self._configured(task, arm, job), job.config)
+                if arm != job.arm.name:
+                    differing = {name: text for name, text in differing.items() if name not in own}
+                if differing:
+                    raise ValueError(
+                        f'{self.folder} holds runs of {task}/{arm} with '
+                        f'{"; ".join(differing.values())}: name another folder with --report'
+                    )
+
+    def equal_run(self, job: Job) -> dict[str, Any] | None:
+        """Row of a run, of whatever arm, that is configured and measured as a job; None."""
+        for row in self.runs:
+            task, arm, seed = run_of(row)
+            wanted = (job.config.task, job.config.seed, job.final_episodes)
+            if (task, seed, row['final_episodes']) != wanted:
+                continue
+            stored = self._configured(task, arm, job)
+            same_start = stored.get('init_from', '') == job.config.init_from
+            if same_start and not differing_fields(stored, job.config):
+                return row
+        return None
+
+    def _configured(self, task: str, arm: str, job: Job) -> dict[str, Any]:
+        return {**self.configuration(task, arm), 'seed': job.config.seed}
+
+    def add(self, jobs: Sequence[Job], command: str) -> None:
+        """Puts finished jobs beside what is there; what is there of the same name goes.
+
+        Args:
+            jobs: Finished jobs.
+            command: Command line, for the record.
+        """
+        for job in jobs:
+            curve = curve_of(job)
+            self.put(job, measure_run(job, curve), curve_rows([job], [curve]), command)
+
+    def put(self, job: Job, run: Mapping[str, Any], curve: Rows, command: str) -> None:
+        """Puts one run there.
+
+        Args:
+            job: Whose task, arm, seed and configuration it has.
+            run: Its row of `runs.csv`.
+            curve: Its rows of `curves.csv`.
+            command: Command line, for the record.
+        """
+        name = dict(zip(RUN, _name_of(job), strict=True))
+        self.runs = [row for row in self.runs if run_of(row) != _name_of(job)]
+        self.curves = [row for row in self.curves if run_of(row) != _name_of(job)]
+        self.runs.append({**run, **name})
+        self.curves += [{**row, **name} for row in curve]
+        self._tell(job, command)
+
+    def _tell(self, job: Job, command: str) -> None:
+        """Notes how an arm is configured, in what all arms share and what is its own."""
+        task = job.config.task
+        told = self.tasks.setdefault(task, {'commands': [], 'settings': {}, 'arms': {}})
+        if command not in told['commands']:
+            told['commands'].append(command)
+        configurations = {arm: self.configuration(task, arm) for arm in told['arms']}
+        values = json.loads(json.dumps(dataclasses.asdict(job.config)))
+        configurations[job.arm.name] = {k: v for k, v in values.items() if k != 'seed'}
+        told['settings'], told['arms'] = _split(configurations)
+
+    def write(self, study: Study) -> None:
+        """Writes the three files, in the order of the study's tasks and arms."""
+        self._sort(study)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_csv(self.runs, self.folder / RUNS)
+        write_csv(self.curves, self.folder / CURVES)
+        about = {
+            'study': study.name,
+            'request': study.request,
+            'question': study.question,
+            'tasks': self.tasks,
+        }
+        (self.folder / ABOUT).write_text(json.dumps(about, indent=2) + '\n')
+
+    def _sort(self, study: Study) -> None:
+        tasks, arms = list(study.tasks), [arm.name for arm in study.arms]
+
+        def place(row: Mapping[str, Any]) -> tuple[int, int, int]:
+            task, arm, seed = run_of(row)
+            return _index(tasks, task), seed, _index(arms, arm)
+
+        self.runs.sort(key=place)
+        self.curves.sort(key=place)
+        self.tasks = dict(sorted(self.tasks.items(), key=lambda item: _index(tasks, item[0])))
+        for told in self.tasks.values():
+            ordered = sorted(told['arms'].items(), key=lambda item: _index(arms, item[0]))
+            told['arms'] = dict(ordered)
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Makes a report's folder and waits until no other process renews it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def own_fields(study: Study) -> set[str]:
+    """Fields in which arms of a study may differ."""
+    own = {name for arm in study.arms for name in arm.own}
+    return own | set(STEP_COUNTS) if 'control_hz' in own else own
+
+
+def run_of(row: Mapping[str, Any], path: Path | None = None) -> tuple[str, str, int]:
+    """Task, arm and seed of a row.
+
+    Raises:
+        ValueError: If it has not all three; the line names the file.
+    """
+    try:
+        task, arm, seed = (row[name] for name in RUN)
+    except KeyError as error:
+        raise ValueError(f'{path} has no column {error}') from None
+    return task, arm, seed
+
+
+def read_rows(path: Path) -> Rows:
+    """Rows of a CSV file, numbers as numbers; none where there is no file.
+
+    Raises:
+        ValueError: If it cannot be read.
+    """
+    if not path.is_file():
+        return []
+    try:
+        rows = list(csv.DictReader(path.read_text().splitlines()))
+    except OSError as error:
+        raise ValueError(f'{path} cannot be read: {error.strerror}') from None
+    return [{name: _value(text) for name, text in row.items()} for row in rows]
+
+
+def _read_tasks(path: Path) -> dict[str, dict[str, Any]]:
+    try:
+        tasks = dict(json.loads(path.read_text())['tasks']) if path.is_file() else {}
+        for told in tasks.values():
+            told['commands'], told['settings'], told['arms'].items()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f'{path} is no record of a study: {error!r}') from None
+    return tasks
+
+
+def _value(text: str | None) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(text or '')
+        except ValueError:
+            continue
+    return text or ''
+
+
+def _split(
+    configurations: Mapping[str, Mapping[str, Any]],
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Configurations of arms as what all share and what each has besides."""
+    first, *others = configurations.values()
+    shared = {
+        name: value
+        for name, value in first.items()
+        if all(name in other and other[name] == value for other in others)
+    }
+    own = {
+        arm: {name: value for name, value in values.items() if name not in shared}
+        for arm, values in configurations.items()
+    }
+    return shared, own
+
+
+def _index(names: Sequence[str], name: str) -> int:
+    """Place of a name; behind all where it is none of them."""
+    return names.index(name) if name in names else len(names)
+
+
+def _name_of(job: Job) -> tuple[str, str, int]:
+    return job.config.task, job.arm.name, job.config.seed
+
+
+def _name(run: tuple[str, str, int]) -> str:
+    task, arm, seed = run
+    return f'{task}/{arm}/seed{seed}'
