@@ -247,7 +247,11 @@ STUDIES: dict[str, Study] = {
             'goals',
             1,
             'Are goals worth more that the critic errs on, or that critics differ in?',
-            {'FetchReach': _REACH, 'FetchPush': _PUSH, 'FetchPickAndPlace': _PICK},
+            {
+                'FetchReach': _REACH,
+                'FetchPush': {**_LONG, 'total_steps': 600_000},
+                'FetchPickAndPlace': _PICK,
+            },
             (
                 Arm('uniform', 'any future goal', {'goal_choice': 'uniform', 'critics': 2}),
                 Arm('bellman', 'greatest error of 8', {'goal_choice': 'bellman', 'critics': 2}),
