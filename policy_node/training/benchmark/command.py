@@ -19,8 +19,9 @@ stopped; given twice at once, it shares the work.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -199,17 +200,15 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if options.ray:
         require_extra('cluster')
     study = _study(options)
-    try:
+    with _refusing():
         jobs = jobs_from_arguments(options)
         if study is not None:
             StoredRuns.read(_report_folder(options)).require_alike(study, jobs)
-        finished = [job for job in jobs if job.is_finished]
-    except (ValueError, TypeError) as error:
-        raise UsageError(str(error)) from None
     _make_folder(_output(options), 'runs')
     _make_folder(_report_folder(options), 'a report')
-    if study is not None:
-        jobs = _not_stored(study, jobs, options)
+    with _refusing():
+        if study is not None:
+            jobs = _not_stored(study, jobs, options)
         finished = [job for job in jobs if job.is_finished]
     require_readable(finished)
     try:
@@ -217,6 +216,15 @@ def _run(options: argparse.Namespace, command: str) -> int:
     finally:
         shipped = _report(options, jobs, command)
     return EXIT_SUCCESS if whole and shipped else EXIT_FAILURE
+
+
+@contextlib.contextmanager
+def _refusing() -> Iterator[None]:
+    """What does not fit is said in one line."""
+    try:
+        yield
+    except (ValueError, TypeError) as error:
+        raise UsageError(str(error)) from None
 
 
 def _not_stored(study: Study, jobs: Sequence[Job], options: argparse.Namespace) -> list[Job]:

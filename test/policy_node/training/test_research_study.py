@@ -304,6 +304,18 @@ def test_a_run_that_another_report_tells_of_is_taken_from_there(
     assert not StoredRuns.read(here).holds(other)
 
 
+def test_a_damaged_report_of_another_study_is_said_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    stored_runs(Path('docs/research/targets'), jobs_of('targets', '--arms', 'polyak4'))
+    Path('docs/research/targets/study.json').write_text('{')
+    assert main(['--study', 'returns', '--tasks', 'FetchPush', '--arms', 'one']) == 2
+    error = capsys.readouterr().err
+    assert 'docs/research/targets/study.json is no record of a study: ' in error
+    assert error.count('\n') == 1
+
+
 def test_reports_that_renew_a_page_at_once_lose_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
