@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from policy_node.training.benchmark.command import main
+from policy_node.training.benchmark.research import STUDIES
+from policy_node.training.benchmark.stored_runs import StoredRuns, read_rows
 
 torch.set_num_threads(1)
 
@@ -22,6 +24,12 @@ STUDY += ['--set', 'evaluate_every=400']
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('study')
     assert main([*STUDY, '--output', str(folder / 'runs'), '--report', str(folder / 'told')]) == 0
+    shutil.copytree(folder / 'told', folder / 'held')
+    # The report of another seed, so that this one is still to be told of.
+    stored = StoredRuns.read(folder / 'told')
+    for row in (*stored.runs, *stored.curves):
+        row['seed'] = 1
+    stored.write(STUDIES['values'])
     return folder
 
 
@@ -31,8 +39,8 @@ def study(finished: Path, tmp_path: Path) -> Path:
     return shutil.copytree(finished, tmp_path / 'study')
 
 
-def again(study: Path) -> int:
-    return main([*STUDY, '--output', str(study / 'runs'), '--report', str(study / 'told')])
+def again(study: Path, report: str = 'told') -> int:
+    return main([*STUDY, '--output', str(study / 'runs'), '--report', str(study / report)])
 
 
 @pytest.mark.parametrize('content', ['{', '[]', '{"episodes": 2}'])
@@ -42,6 +50,15 @@ def test_a_damaged_measure_is_taken_again(study: Path, content: str) -> None:
     final.write_text(content)
     assert again(study) == 0
     assert final.read_text() == before
+    assert len(read_rows(study / 'told' / 'runs.csv')) == 2
+
+
+def test_a_damaged_run_that_the_report_holds_is_left_alone(study: Path) -> None:
+    final = study / 'runs' / 'FetchReach' / 'none' / 'seed0' / 'final.json'
+    final.write_text('{')
+    before = (study / 'held' / 'runs.csv').read_bytes()
+    assert again(study, 'held') == 0
+    assert final.read_text() == '{' and (study / 'held' / 'runs.csv').read_bytes() == before
 
 
 @pytest.mark.parametrize(
