@@ -57,9 +57,9 @@ def take_from_other_reports(study: Study, jobs: Sequence[Job], report: Path) -> 
                     curve = [row for row in other.curves if run_of(row) == run_of(run)]
                     name = '{}/{}/seed{} of {}'.format(*run_of(run), other.folder)
                     stored.put(job, run, curve, f'as {name}')
+                    stored.write(study)
                     print(f'{job.name} is {name}', flush=True)
                     break
-        stored.write(study)
 
 
 def _reports_beside(report: Path) -> list[StoredRuns]:

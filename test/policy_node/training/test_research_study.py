@@ -298,6 +298,10 @@ def test_a_run_that_another_report_tells_of_is_taken_from_there(
     assert (run['arm'], run['processor_seconds'], run['revision']) == ('one', 11.0, 'abc')
     assert [row['arm'] for row in stored.curves] == ['one', 'one']
     assert stored.configuration('FetchPush', 'one')['n_step'] == 1
+    # Where nothing is taken nothing is written.
+    elsewhere = Path('other/returns')
+    take_from_other_reports(STUDIES['returns'], jobs, elsewhere)
+    assert not list(elsewhere.iterdir())
     # Measured on other episodes it is another run.
     (other,) = jobs_of('returns', '--arms', 'one', '--seeds', '0', '--episodes', '20')
     take_from_other_reports(STUDIES['returns'], [other], here)
