@@ -106,7 +106,7 @@ def jobs_from_arguments(options: argparse.Namespace) -> list[Job]:
     if options.episodes is not None and options.study == 'paper' and not options.page:
         raise ValueError('--episodes does not belong to --study paper without --page')
     if options.page and (options.full or options.recipe):
-        raise ValueError('--page shows the reduced budget: leave out --full and --recipe')
+        raise ValueError('--page has settings of its own: leave out --full and --recipe')
     overrides = _overrides(options)
     of_a_page = _study(options)
     if of_a_page is not None:

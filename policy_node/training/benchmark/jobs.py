@@ -85,6 +85,11 @@ def differing_fields(stored: Mapping[str, Any], config: TrainConfig) -> dict[str
     }
 
 
+def run_name(task: str, arm: str, seed: int) -> str:
+    """Task, arm and seed of a run, as in the path of its folder."""
+    return f'{task}/{arm}/seed{seed}'
+
+
 @dataclass(frozen=True, slots=True)
 class Job:
     """One training run.
@@ -106,7 +111,7 @@ class Job:
     @property
     def name(self) -> str:
         """Task, arm and seed, as in the path of the folder."""
-        return f'{self.config.task}/{self.arm.name}/seed{self.config.seed}'
+        return run_name(self.config.task, self.arm.name, self.config.seed)
 
     @property
     def is_finished(self) -> bool:

@@ -1,8 +1,8 @@
 """The studies: what each compares, as data. Nine answer the paper's requests for research.
 
 All arms of a study share task, budget and settings and differ in `changes` alone. Settings are the
-`best` recipe, or the study's own, but for what is named here. Every run is one of `train_her`: on
-one thread it gives the same bits from the same seed.
+`best` recipe, or another that they name, but for what stands here. Every run is one of `train_her`:
+on one thread it gives the same bits from the same seed.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class Study:
             answers none of them.
         question: What it asks.
         settings: Fields of `TrainConfig` for all arms, by task; the first task is the default.
+            They replace those of the recipe `best`, or of the one that they name as `recipe`.
         arms: What is compared; the first is the baseline.
         seeds: How many by default.
-        recipe: That all arms start from.
     """
 
     name: str
@@ -49,7 +49,6 @@ class Study:
     settings: Mapping[str, Mapping[str, Any]]
     arms: tuple[Arm, ...]
     seeds: int = 5
-    recipe: str = 'best'
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -95,8 +94,8 @@ _SKILLED_PUSH = {
     'random_epsilon': 0.1,
 }
 _SLIDE = {**_LONG, 'total_steps': 2_000_000, 'evaluate_every': 64_000}
-_ROTATE = {**_LONG, 'total_steps': 1_000_000, 'evaluate_every': 64_000}
-_ROTATE_XYZ = {**_ROTATE, 'total_steps': 2_000_000}
+HAND: dict[str, Any] = {**_LONG, 'total_steps': 1_000_000, 'evaluate_every': 64_000}
+_ROTATE_XYZ = {**HAND, 'total_steps': 2_000_000}
 _SCREENED = {'evaluate_every': 64_000, 'evaluation_episodes': 128}
 # Sparse, with settings that the dense recipe of the task does not have.
 _SPARSE_HAND_REACH = {
@@ -380,7 +379,7 @@ STUDIES: dict[str, Study] = {
             {
                 'FetchReach': _REACH,
                 'FetchPickAndPlace': _PICK,
-                'HandManipulateBlockRotateZ': _ROTATE,
+                'HandManipulateBlockRotateZ': HAND,
             },
             _ensembles(),
         ),
@@ -465,11 +464,11 @@ def research_jobs(
     for task in tasks:
         if task not in study.settings:
             raise ValueError(f'--tasks {task}; allowed in {study.name}: {", ".join(study.tasks)}')
-        shared = {**REPEATABLE, **study.settings[task], **overrides}
+        shared = {'recipe': 'best', **REPEATABLE, **study.settings[task], **overrides}
         for seed in seeds:
             for arm in arms:
                 values = _at_rate({**shared, **arm.changes, 'seed': seed})
-                config = recipe_config(task, study.recipe, **values)
+                config = recipe_config(task, **values)
                 more = {name: getattr(config, name) * by for name, by in arm.factors.items()}
                 config = dataclasses.replace(config, **more)
                 folder = output / task / arm.name / f'seed{seed}'

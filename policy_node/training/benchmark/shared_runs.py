@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from policy_node.training.benchmark.jobs import Job
+from policy_node.training.benchmark.jobs import Job, run_name
 from policy_node.training.benchmark.research import Study
 from policy_node.training.benchmark.stored_runs import ABOUT, StoredRuns, locked, run_of
 from policy_node.training.learning.run_folder import STATE_FILE
@@ -55,7 +55,7 @@ def take_from_other_reports(study: Study, jobs: Sequence[Job], report: Path) -> 
             for other in others:
                 if (run := other.equal_run(job)) is not None:
                     curve = [row for row in other.curves if run_of(row) == run_of(run)]
-                    name = '{}/{}/seed{} of {}'.format(*run_of(run), other.folder)
+                    name = f'{run_name(*run_of(run))} of {other.folder}'
                     stored.put(job, run, curve, f'as {name}')
                     stored.write(study)
                     print(f'{job.name} is {name}', flush=True)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from policy_node.training.benchmark.jobs import Job, differing_fields
+from policy_node.training.benchmark.jobs import Job, differing_fields, run_name
 from policy_node.training.benchmark.measures import curve_of, measure_run
 from policy_node.training.benchmark.research import Study
 from policy_node.training.benchmark.results import curve_rows, write_csv
@@ -64,9 +64,9 @@ class StoredRuns:
         for row in stored.runs:
             task, arm, _ = run = run_of(row, folder / RUNS)
             if run not in evaluated:
-                raise ValueError(f'{folder / CURVES} has no evaluation of {_name(run)}')
+                raise ValueError(f'{folder / CURVES} has no evaluation of {run_name(*run)}')
             if arm not in stored.tasks.get(task, {'arms': {}})['arms']:
-                raise ValueError(f'{folder / ABOUT} has no settings of {_name(run)}')
+                raise ValueError(f'{folder / ABOUT} has no settings of {run_name(*run)}')
         return stored
 
     def holds(self, job: Job) -> bool:
@@ -270,8 +270,3 @@ def _index(names: Sequence[str], name: str) -> int:
 
 def _name_of(job: Job) -> tuple[str, str, int]:
     return job.config.task, job.arm.name, job.config.seed
-
-
-def _name(run: tuple[str, str, int]) -> str:
-    task, arm, seed = run
-    return f'{task}/{arm}/seed{seed}'

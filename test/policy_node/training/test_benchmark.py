@@ -97,15 +97,17 @@ def test_all_jobs_but_for_arm_and_seed_have_one_configuration(tmp_path: Path) ->
     assert jobs[0].config.evaluation_episodes <= jobs[0].config.num_envs, 'else cut short'
 
 
-def test_the_page_of_the_paper_shows_its_reduced_budget_on_every_task() -> None:
+def test_the_page_of_the_paper_shows_a_budget_for_two_cores_on_every_task() -> None:
     options = parse_arguments(['--page', '--tasks', *TASKS, '--seeds', '0'])
     jobs = jobs_from_arguments(options)
     assert len(jobs) == 4 * len(TASKS)
     for job in jobs:
-        assert job.folder.parts[:3] == ('runs', 'research', 'paper')
-        assert job.config.recipe == 'paper' and job.final_episodes == 500
-        task = job.config.task
-        budget = {**REPEATABLE, **reduced_budget(task)}
+        assert job.folder.parts[:3] == ('runs', 'research', 'paper') and job.final_episodes == 500
+        task, budget = job.config.task, {**REPEATABLE, **job.arm.changes}
+        if task.startswith('Fetch'):
+            budget |= {'recipe': 'paper', **reduced_budget(task)}
+        else:
+            budget |= {'recipe': 'best', 'total_steps': 1_000_000}
         if task != 'FetchReach':
             budget['precision'] = 'bfloat16'
         if task in ('FetchPush', 'FetchSlide', 'FetchPickAndPlace'):
