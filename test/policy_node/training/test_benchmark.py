@@ -279,7 +279,7 @@ def test_another_budget_in_the_same_folder_is_refused(
         (['--study', 'best', '--arms', 'her_sparse'], '--arms does not belong to --study best'),
         (['--study', 'best', '--full'], '--full belongs to --study paper'),
         (['--episodes', '10'], '--episodes does not belong to --study paper without --page'),
-        (['--page', '--full'], '--page shows the reduced budget: leave out --full and --recipe'),
+        (['--page', '--full'], '--page has settings of its own: leave out --full and --recipe'),
         (['--study', 'goals', '--page'], '--page belongs to --study paper'),
         (['--set', 'init_from=FetchReach'], '--set init_from is not possible'),
         (['--set', 'time_limit=2'], '--set time_limit is not possible: a job ends when its steps'),
