@@ -58,7 +58,8 @@ class ConfigFields:
     goals: str = ''
     """Goal sources as a mixture instead of `strategy`: `future=.4,actual=.3,near=.1`; what is left
     of 1 keeps the goal. Also `next` (what this step achieved), `near` (one of the next
-    ten) and `displaced` (near what was achieved before it)."""
+    ten) and `displaced` (near what was achieved before it); of `ppo` also `outcome` (what another
+    episode brought about, from where this one began)."""
     retry_failed: float = 0.0
     """Share of the episodes whose goal is one that an earlier episode, with a goal as the task
     draws it, failed to meet: hard goals come more often. Evaluation draws as the task does."""
@@ -101,6 +102,9 @@ class ConfigFields:
     init_from: str = ''
     """Networks and normalisers to start from: a run folder, a shipped actor or the file of one;
     their mean where several are given with commas; empty starts from nothing."""
+    first_value: float = 0.0
+    """What the critic of `ppo` says before it has learnt: with -1 / (1 - gamma), what failing for
+    ever is worth, nothing looks good because it is new."""
     critic_first: int = 0
     """Updates of the critics alone before the actor learns too; 0 is 5,000 where `init_from` is an
     actor without its critic, or with fewer than `critics`, else none."""

@@ -10,7 +10,7 @@ from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
 from policy_node.training.learning.config_fields import ConfigFields
 from policy_node.training.learning.goal_choice import GOAL_CHOICES
 from policy_node.training.learning.graded import parse_grades
-from policy_node.training.learning.hindsight import parse_mixture
+from policy_node.training.learning.hindsight import OUTCOME, parse_mixture
 from policy_node.training.learning.multi_step import CORRECTIONS
 
 # Recipes of runs that start from nothing.
@@ -81,6 +81,7 @@ RANGES = (
     ('subgoal_every', 0, 1000),
     ('subgoal_prior', 0, _INFINITY),
     ('imagination_interval', 1, 1000),
+    ('first_value', -1_000_000, 0),
     ('critic_first', 0, _INFINITY),
     ('total_steps', 1, _INFINITY),
     ('time_limit', 0, _INFINITY),
@@ -287,6 +288,11 @@ def _contradictions_of_algorithm(config: ConfigFields) -> Iterator[str]:
         yield f'importance {config.importance} needs goals chosen in hindsight'
     if weighted and on_policy != (config.importance == 'decision'):
         yield f'importance {config.importance} excludes algorithm {config.algorithm}'
+    outcomes = bool(config.goals) and OUTCOME in parse_mixture(config.goals)
+    if outcomes and (not on_policy or config.reward_type != 'sparse'):
+        yield 'goals outcome needs algorithm ppo and reward_type sparse'
+    if config.first_value != DEFAULTS['first_value'] and not on_policy:
+        yield 'first_value needs algorithm ppo'
     if on_policy and config.noise_std == 0.0:
         yield 'algorithm ppo needs noise_std above 0'
     needed = {name: value for name, value in _ON_POLICY.items() if getattr(config, name) != value}

@@ -24,8 +24,12 @@ SuccessFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[n
 # Where the goal of a transition comes from: the episode's own; a later achieved goal of the
 # episode; its last; any of it; any achieved goal of the replay; a desired goal of any episode; what
 # this very step achieved; what one of the next ten achieved; what the state before it achieved,
-# displaced.
-SOURCES = ('real', 'future', 'final', 'episode', 'random', 'actual', 'next', 'near', 'displaced')
+# displaced; of whole episodes, what another one brought about (`outcomes.py`).
+OUTCOME = 'outcome'
+SOURCES = (
+    *('real', 'future', 'final', 'episode', 'random', 'actual', 'next', 'near', 'displaced'),
+    OUTCOME,
+)
 _NEAR_TICKS = 10
 # One more, where there is a high level: what it had the actor pursue.
 _SUBGOAL = 'subgoal'
@@ -147,7 +151,11 @@ def _displaced(starts: Starts, generator: np.random.Generator) -> Array:
     tick = generator.integers(episodes.ticks + 1 - span)
     achieved = episodes.achieved_goal
     here = achieved[starts.row, starts.tick]
-    before, after = achieved[row, tick], achieved[row, tick + span]
+    return displace(here, achieved[row, tick], achieved[row, tick + span])
+
+
+def displace(here: Array, before: Array, after: Array) -> Array:
+    """Goals (batch, goal_size) as far from `here` as `after` is from `before`, poses turned too."""
     moved: Array = here + (after - before)
     if moved.shape[-1] == GoalKind.POSE.size:
         turn = quaternion_multiply(after[:, 3:], quaternion_conjugate(before[:, 3:]))

@@ -9,6 +9,8 @@ from msgs_spec.tasks import TaskSpec
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
+from policy_node.training.learning.hindsight import OUTCOME
+from policy_node.training.learning.outcomes import EPISODES, Outcomes, with_outcomes_achieved
 from policy_node.training.learning.replay import draw_by
 from policy_node.training.learning.rollouts import (
     Critique,
@@ -44,6 +46,7 @@ class OnPolicyExperience(Experience):
         super().__init__(config, spec, workers, sampler, generator)
         limits = config.gamma, config.trace, config.importance == 'decision'
         self._maker = RolloutMaker(critique, sampler.compute_reward, *limits)
+        self._compute_reward = sampler.compute_reward
         self._newest = workers.share(config.num_envs)
         self._rollouts: Rollouts | None = None
         self._made_after = -1
@@ -65,10 +68,19 @@ class OnPolicyExperience(Experience):
             row[chosen] = draw_by(self._weight_up_to, len(chosen), generator)
         return row
 
+    def mixture(self, env_steps: int) -> dict[str, float]:
+        """Probability of each goal source of single transitions."""
+        return with_outcomes_achieved(super().mixture(env_steps))
+
     def _roll_out(self, env_steps: int) -> Rollouts:
         episodes = self.replay.newest(self._newest)
-        mixture = self.mixture(env_steps)
+        mixture = super().mixture(env_steps)
         mixture.pop('real', None)
-        copies = self.config.hindsight_k if mixture else 0
-        goals = [goals_in_hindsight(episodes, mixture, self.generator) for _ in range(copies)]
+        copies, outcomes = self.config.hindsight_k if mixture else 0, None
+        if OUTCOME in mixture:
+            past = self.replay.newest(EPISODES)
+            outcomes = Outcomes.of(past, self._compute_reward, self.generator)
+        goals = [
+            goals_in_hindsight(episodes, mixture, self.generator, outcomes) for _ in range(copies)
+        ]
         return self._maker.make(episodes, goals)

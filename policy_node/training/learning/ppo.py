@@ -40,6 +40,7 @@ class PPO(ActorCritic):
         self, shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
     ) -> None:
         actor, critic = Actor(shape), MLP(shape.feature_size, 1, shape)
+        torch.nn.init.constant_(critic.output.bias, config.first_value)
         super().__init__(actor, critic, config, device, workers)
 
     def update(self, batch: Transitions) -> Losses:

@@ -19,7 +19,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from policy_node.training.learning.hindsight import RewardFunction, draw_sources, goals_of
+from policy_node.training.learning.hindsight import (
+    OUTCOME,
+    RewardFunction,
+    draw_sources,
+    goals_of,
+)
+from policy_node.training.learning.outcomes import Outcomes
 from policy_node.training.learning.replay import Array, Array64, Episodes
 from policy_node.training.learning.transitions import Starts, Transitions
 
@@ -180,12 +186,30 @@ def decision_weights(log_ratio: NDArray[np.floating]) -> Array64:
 
 
 def goals_in_hindsight(
-    episodes: Episodes, mixture: dict[str, float], generator: np.random.Generator
+    episodes: Episodes,
+    mixture: dict[str, float],
+    generator: np.random.Generator,
+    outcomes: Outcomes | None = None,
 ) -> Array:
-    """A goal for each episode as a whole, (episodes, goal_size), from the sources of a mixture."""
-    count = len(episodes)
+    """A goal for each episode as a whole, (episodes, goal_size), from the sources of a mixture.
+
+    Args:
+        episodes: The episodes.
+        mixture: Probability of each source.
+        generator: Source of all randomness.
+        outcomes: Of other episodes, where the mixture has them; while there are none, an episode
+            keeps its goal.
+    """
+    count, names = len(episodes), list(mixture)
     starts = Starts(episodes, np.arange(count), np.zeros(count, np.int64))
-    return goals_of(starts, draw_sources(mixture, count, generator), list(mixture), generator)
+    source = draw_sources(mixture, count, generator)
+    sources = ['real' if name == OUTCOME else name for name in names]
+    goal = goals_of(starts, source, sources, generator)
+    if outcomes is None or not len(outcomes):
+        return goal
+    transferred = np.flatnonzero(np.array(names)[source] == OUTCOME)
+    goal[transferred] = outcomes.goals(episodes, generator)[transferred]
+    return goal
 
 
 def _joined(parts: Sequence[Rollouts]) -> Rollouts:
