@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from policy_node.training.learning.exploration import ActionNoise
 from policy_node.training.learning.outcomes import Outcomes
 from policy_node.training.learning.replay import Episodes
@@ -43,7 +44,7 @@ def main() -> int:
     simulation = Simulation(_TASK, num_envs=options.episodes)
     episodes, noise = _collect(simulation, options.noise)
     generator = np.random.default_rng(1)
-    outcomes = Outcomes.of(episodes, simulation.compute_reward, generator)
+    outcomes = Outcomes.of(episodes, GoalMetric(simulation.spec), generator)
     gripper, block = (episodes.observation[:, :-1, at : at + 3] for at in (0, 3))
     towards = (block - gripper) / np.linalg.norm(block - gripper, axis=-1, keepdims=True)
     print(f'{"goals":36s} return   towards the block      upwards')

@@ -120,6 +120,20 @@ _ON_POLICY = {
     'batch_size': 1024,
     'updates_per_cycle': 40,
 }
+# Pushes are rare: four times the episodes in a cycle, four times the goals, more noise, smaller
+# steps, the distance left as an input, and a critic that does not take what is new for good.
+_ON_POLICY_PUSH = {
+    **_ON_POLICY,
+    'num_envs': 256,
+    'updates_per_cycle': 200,
+    'hindsight_k': 16,
+    'noise_std': 0.5,
+    'learning_rate': 2e-4,
+    'action_l2': 0.003,
+    'goal_features': 'relative',
+    'first_value': -50.0,
+    'actor_average': 0.65,
+}
 
 
 def _arms(field: str, **labels: str) -> tuple[Arm, ...]:
@@ -355,7 +369,7 @@ STUDIES: dict[str, Study] = {
                     'total_steps': 96_000,
                     'evaluate_every': 9_600,
                 },
-                'FetchPush': {**_PUSH, **_ON_POLICY, 'total_steps': 1_000_000},
+                'FetchPush': {**_LONG, **_ON_POLICY_PUSH, 'total_steps': 1_000_000},
             },
             (
                 Arm('none', 'no hindsight', {'strategy': 'none'}),
@@ -370,6 +384,7 @@ STUDIES: dict[str, Study] = {
                     'as if acted for, 4 of 5 from episodes that moved something',
                     {'strategy': 'future', 'moved_share': 0.8},
                 ),
+                Arm('outcome', 'what other episodes brought about', {'goals': 'outcome=.9'}),
             ),
         ),
         Study(

@@ -58,8 +58,8 @@ class ConfigFields:
     goals: str = ''
     """Goal sources as a mixture instead of `strategy`: `future=.4,actual=.3,near=.1`; what is left
     of 1 keeps the goal. Also `next` (what this step achieved), `near` (one of the next
-    ten) and `displaced` (near what was achieved before it); of `ppo` also `outcome` (what another
-    episode brought about, from where this one began)."""
+    ten) and `displaced` (near what was achieved before it); of `ppo` also `outcome` (what other
+    episodes brought about, from where this one began)."""
     retry_failed: float = 0.0
     """Share of the episodes whose goal is one that an earlier episode, with a goal as the task
     draws it, failed to meet: hard goals come more often. Evaluation draws as the task does."""

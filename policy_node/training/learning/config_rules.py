@@ -288,9 +288,8 @@ def _contradictions_of_algorithm(config: ConfigFields) -> Iterator[str]:
         yield f'importance {config.importance} needs goals chosen in hindsight'
     if weighted and on_policy != (config.importance == 'decision'):
         yield f'importance {config.importance} excludes algorithm {config.algorithm}'
-    outcomes = bool(config.goals) and OUTCOME in parse_mixture(config.goals)
-    if outcomes and (not on_policy or config.reward_type != 'sparse'):
-        yield 'goals outcome needs algorithm ppo and reward_type sparse'
+    if config.goals and OUTCOME in parse_mixture(config.goals) and not on_policy:
+        yield 'goals outcome needs algorithm ppo'
     if config.first_value != DEFAULTS['first_value'] and not on_policy:
         yield 'first_value needs algorithm ppo'
     if on_policy and config.noise_std == 0.0:

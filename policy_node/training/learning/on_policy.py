@@ -46,7 +46,7 @@ class OnPolicyExperience(Experience):
         super().__init__(config, spec, workers, sampler, generator)
         limits = config.gamma, config.trace, config.importance == 'decision'
         self._maker = RolloutMaker(critique, sampler.compute_reward, *limits)
-        self._compute_reward = sampler.compute_reward
+        self._metric = sampler.metric
         self._newest = workers.share(config.num_envs)
         self._rollouts: Rollouts | None = None
         self._made_after = -1
@@ -77,9 +77,9 @@ class OnPolicyExperience(Experience):
         mixture = super().mixture(env_steps)
         mixture.pop('real', None)
         copies, outcomes = self.config.hindsight_k if mixture else 0, None
-        if OUTCOME in mixture:
+        if OUTCOME in mixture and self._metric is not None:
             past = self.replay.newest(EPISODES)
-            outcomes = Outcomes.of(past, self._compute_reward, self.generator)
+            outcomes = Outcomes.of(past, self._metric, self.generator)
         goals = [
             goals_in_hindsight(episodes, mixture, self.generator, outcomes) for _ in range(copies)
         ]

@@ -4,21 +4,26 @@ An episode that is replayed for what it achieved itself always succeeds, so that
 on-policy gradient to act at all: leaving the block alone is a success too, and touching it delays
 one (`bench/hindsight_pull.py`). Hindsight policy gradients (Rauber et al. 2019, arXiv 1711.06006)
 sum over goals that do not depend on the episode. Here these are outcomes of other episodes,
-transferred to where this one began; those that would be met there already are left out.
+transferred to where this one began; those that would be met there already are left out. Of a few of
+them the nearest to what the episode was asked for is taken (as HGG does, Ren et al. 2019,
+arXiv 1906.04279), so that goals grow towards those of the task as the actor can do more.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from policy_node.training.learning.hindsight import OUTCOME, RewardFunction, displace
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from policy_node.training.learning.hindsight import OUTCOME, displace
 from policy_node.training.learning.replay import Array, Episodes
 
 # Episodes whose outcomes are drawn from, and states of each.
 EPISODES = 2000
 _STATES = 4
+# Outcomes of which the nearest is taken.
+_CANDIDATES = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,38 +32,43 @@ class Outcomes:
 
     Attributes:
         before: (count, goal_size) achieved in first states.
-        after: (count, goal_size) achieved in later ones, which do not meet what was before as a
-            goal.
+        after: (count, goal_size) achieved in later ones, which would not be met by what was before.
+        metric: Says what is met, and what is near.
     """
 
     before: Array
     after: Array
+    metric: GoalMetric
 
     @classmethod
-    def of(
-        cls, episodes: Episodes, compute_reward: RewardFunction, generator: np.random.Generator
-    ) -> Outcomes:
+    def of(cls, episodes: Episodes, metric: GoalMetric, generator: np.random.Generator) -> Outcomes:
         """Some states of each episode, without those that changed too little.
 
         Args:
             episodes: Whose outcomes these are.
-            compute_reward: (achieved_goal, desired_goal) -> reward, 0 for success.
+            metric: Of the task.
             generator: Draws the states.
         """
         row = np.repeat(np.arange(len(episodes)), _STATES)
         tick = generator.integers(1, episodes.ticks + 1, size=len(row))
         before, after = episodes.achieved_goal[row, 0], episodes.achieved_goal[row, tick]
-        reward = compute_reward(after.astype(np.float64), before.astype(np.float64))
-        changed = np.flatnonzero(np.asarray(reward) < 0.0)
-        return cls(before[changed], after[changed])
+        changed = np.flatnonzero(~metric.success(before, after))
+        return cls(before[changed], after[changed], metric)
 
     def __len__(self) -> int:
         return len(self.after)
 
     def goals(self, episodes: Episodes, generator: np.random.Generator) -> Array:
-        """A goal for each episode as a whole, (episodes, goal_size): any of these outcomes."""
-        drawn = generator.integers(len(self), size=len(episodes))
-        return displace(episodes.achieved_goal[:, 0], self.before[drawn], self.after[drawn])
+        """A goal for each episode as a whole, (episodes, goal_size)."""
+        count = len(episodes)
+        drawn = generator.integers(len(self), size=_CANDIDATES * count)
+        start = np.tile(episodes.achieved_goal[:, 0], (_CANDIDATES, 1))
+        candidates = displace(start, self.before[drawn], self.after[drawn])
+        asked = np.tile(episodes.desired_goal, (_CANDIDATES, 1))
+        near = replace(self.metric, reward_type='dense').reward(candidates, asked)
+        best = near.reshape(_CANDIDATES, count).argmax(axis=0)
+        goals: Array = candidates[best * count + np.arange(count)]
+        return goals
 
 
 def with_outcomes_achieved(mixture: dict[str, float]) -> dict[str, float]:

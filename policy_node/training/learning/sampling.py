@@ -38,6 +38,7 @@ class TransitionSampler:
             still to be learnt.
         reward_at: How far goals have narrowed, 0 ... 1 -> `compute_reward` of then; None if they
             do not.
+        metric: Of the task, whatever rewards are.
     """
 
     compute_reward: RewardFunction
@@ -48,6 +49,7 @@ class TransitionSampler:
     reward_scale: float = 1.0
     lost_value: float | None = None
     reward_at: Callable[[float], RewardFunction] | None = None
+    metric: GoalMetric | None = None
 
     def at(self, progress: float) -> TransitionSampler:
         """The sampler of a run in which goals have narrowed this far, 0 ... 1."""
@@ -213,6 +215,7 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
         config.tick_share,
         config.lowest_value if config.drop_is_lost else None,
         reward_at if config.narrows else None,
+        metric,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.rotations import quaternion_from_axis_angle
 from msgs_spec.tasks import task_spec
 from policy_node.policies.network_shape import NetworkShape
@@ -139,29 +140,32 @@ def test_ppo_learns_to_do_what_the_goal_says(changes: dict[str, object]) -> None
     assert np.abs(action - goal).mean() < 0.1
 
 
-def push(action: np.ndarray) -> np.ndarray:
-    """A block that a strong push moves by 0.3."""
-    return np.where(action > 0.5, np.float32(0.3), np.float32(0.0))
+def pushed(action: np.ndarray) -> np.ndarray:
+    """Places (episodes, 2, 3) of a block that a strong push moves by 0.3, before and after it."""
+    places = np.zeros((len(action), 2, 3), np.float32)
+    places[:, 1, :1] = np.where(action > 0.5, 0.3, 0.0)
+    return places
 
 
 @pytest.mark.parametrize(('source', 'pushes'), [('final', False), ('outcome', True)])
 def test_outcomes_of_others_teach_to_push_and_own_ones_do_not(source: str, pushes: bool) -> None:
-    """No goal that was asked for can be met; what 1 in 20 episodes does by accident is learnt."""
+    """No goal that is asked for can be met; what 1 in 20 episodes does by accident is learnt."""
     torch.manual_seed(0)
     generator = np.random.default_rng(0)
     config = configured(learning_rate=3e-3, action_l2=0.0, gamma=0.5, first_value=-2.0)
-    learner = PPO(NetworkShape(1, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
-    maker = RolloutMaker(learner, reached, config.gamma, 0.95, False)
-    goal = np.full((256, 1), -0.3, np.float32)
+    learner = PPO(NetworkShape(1, 3, 1, (32, 32)), config, torch.device('cpu'), Workers())
+    metric = GoalMetric(task_spec('FetchPush'))
+    maker = RolloutMaker(learner, metric.reward, config.gamma, 0.95, False)
+    goal = np.full((256, 3), -0.3, np.float32)
     observation = np.zeros((256, 2, 1), np.float32)
     for _ in range(20):
         mean, _ = learner.acting_actor().predict(
             {'observation': observation[:, 0], 'desired_goal': goal}
         )
         action = (mean + 0.3 * generator.standard_normal((256, 1))).clip(-1, 1)
-        achieved = np.stack([np.zeros_like(action), push(action)], axis=1)
-        episodes = Episodes(observation, achieved, goal, action[:, None].astype(np.float32))
-        outcomes = Outcomes.of(episodes, reached, generator)
+        actions = action[:, None].astype(np.float32)
+        episodes = Episodes(observation, pushed(action), goal, actions)
+        outcomes = Outcomes.of(episodes, metric, generator)
         mixture = {source: 1.0}
         goals = [goals_in_hindsight(episodes, mixture, generator, outcomes) for _ in range(4)]
         rollouts = maker.make(episodes, goals)
@@ -169,29 +173,42 @@ def test_outcomes_of_others_teach_to_push_and_own_ones_do_not(source: str, pushe
             row = generator.integers(len(rollouts.episodes), size=256)
             learner.update(rollouts.draw(row, config.gamma, generator))
         learner.average()
-    asked = {'observation': np.zeros((1, 1), np.float32), 'desired_goal': np.full((1, 1), 0.3)}
+    asked = {'observation': np.zeros((1, 1)), 'desired_goal': np.array([[0.3, 0.0, 0.0]])}
     action, _ = learner.evaluation_actor().predict(asked)
     assert (action[0, 0] > 0.5) == pushes
 
 
 def test_outcomes_are_what_others_made_of_where_they_began() -> None:
     generator = np.random.default_rng(0)
-    achieved = np.zeros((3, 11, 1), np.float32)
+    achieved = np.zeros((3, 11, 3), np.float32)
     achieved[:, :, 0] = np.array([[0.0], [1.0], [2.0]])
-    achieved[0, 5:] += 0.5
-    achieved[1] += np.linspace(0, 0.09, 11, dtype=np.float32)[:, None]
-    nothing = np.zeros((3, 11, 1), np.float32)
+    achieved[0, 5:, 0] += 0.5
+    achieved[1, :, 0] += np.linspace(0, 0.04, 11, dtype=np.float32)
+    nothing = np.zeros((3, 11, 3), np.float32)
     episodes = Episodes(nothing, achieved, nothing[:, 0], nothing[:, 1:])
-    outcomes = Outcomes.of(episodes, reached, generator)
+    metric = GoalMetric(task_spec('FetchPush'))
+    outcomes = Outcomes.of(episodes, metric, generator)
     assert 0 < len(outcomes) <= 4, 'what would be met where it began is none'
     assert set(outcomes.before[:, 0]) == {0.0} and set(outcomes.after[:, 0]) == {0.5}
-    np.testing.assert_allclose(outcomes.goals(episodes, generator)[:, 0], [0.5, 1.5, 2.5])
     goal = goals_in_hindsight(episodes, {'outcome': 1.0}, generator, outcomes)
-    np.testing.assert_allclose(goal[:, 0], [0.5, 1.5, 2.5])
-    none = Outcomes.of(episodes.select(np.array([1, 2])), reached, generator)
+    np.testing.assert_allclose(goal, [[0.5, 0.0, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0]])
+    none = Outcomes.of(episodes.select(np.array([1, 2])), metric, generator)
     assert len(none) == 0
     goal = goals_in_hindsight(episodes, {'outcome': 1.0}, generator, none)
     np.testing.assert_array_equal(goal, episodes.desired_goal)
+
+
+def test_outcomes_near_what_was_asked_for_come_first() -> None:
+    achieved = np.zeros((2, 2, 3), np.float32)
+    achieved[:, 1, 0] = 0.3, -0.3
+    asked = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], np.float32)
+    nothing = np.zeros((2, 2, 3), np.float32)
+    episodes = Episodes(nothing, achieved, asked, nothing[:, 1:])
+    generator = np.random.default_rng(0)
+    outcomes = Outcomes.of(episodes, GoalMetric(task_spec('FetchPush')), generator)
+    drawn = np.concatenate([outcomes.goals(episodes, generator)[:, 0] for _ in range(100)])
+    # Of eight, one at least is on the side of the goal in 255 of 256.
+    assert (drawn * np.tile([1.0, -1.0], 100) > 0).mean() > 0.97
 
 
 def test_outcomes_of_poses_turn_as_the_others_turned() -> None:
@@ -201,12 +218,9 @@ def test_outcomes_of_poses_turn_as_the_others_turned() -> None:
     achieved[0, 1, 3:] = turned
     achieved[1, :, :3] = 0.2
     nothing = np.zeros((2, 2, 7), np.float32)
-    episodes = Episodes(nothing, achieved, nothing[:, 0], nothing[:, 1:])
-
-    def same(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        return -1.0 * (np.abs(achieved - goal).max(axis=-1) > 0.01)
-
-    outcomes = Outcomes.of(episodes, same, np.random.default_rng(0))
+    episodes = Episodes(nothing, achieved, achieved[:, 0], nothing[:, 1:])
+    metric = GoalMetric(task_spec('HandManipulateBlockRotateZ'))
+    outcomes = Outcomes.of(episodes, metric, np.random.default_rng(0))
     goal = outcomes.goals(episodes, np.random.default_rng(0))
     np.testing.assert_allclose(goal[1], [0.2, 0.2, 0.2, *turned], atol=1e-6)
 
@@ -306,7 +320,6 @@ def test_ppo_refuses_transitions_that_nobody_rolled_out() -> None:
         ({'importance': 'decision', 'strategy': 'none'}, 'decision needs goals chosen'),
         ({'noise_std': 0.0}, 'algorithm ppo needs noise_std above 0'),
         ({'algorithm': 'ddpg', 'goals': 'outcome=.8'}, 'goals outcome needs algorithm ppo'),
-        ({'reward_type': 'dense', 'goals': 'outcome=.8'}, 'and reward_type sparse'),
         ({'algorithm': 'ddpg', 'first_value': -50.0}, 'first_value needs algorithm ppo'),
         ({'first_value': 1.0}, 'first_value 1.0; allowed: -1000000 ... 0'),
     ],
