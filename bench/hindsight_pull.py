@@ -42,7 +42,8 @@ def main() -> int:
     parser.add_argument('--episodes', type=int, default=2048, help='default: 2048')
     options = parser.parse_args()
     simulation = Simulation(_TASK, num_envs=options.episodes)
-    episodes, noise = _collect(simulation, options.noise)
+    episodes = _collect(simulation, options.noise)
+    noise = episodes.action
     generator = np.random.default_rng(1)
     outcomes = Outcomes.of(episodes, GoalMetric(simulation.spec), generator)
     gripper, block = (episodes.observation[:, :-1, at : at + 3] for at in (0, 3))
@@ -61,8 +62,8 @@ def main() -> int:
     return 0
 
 
-def _collect(simulation: Simulation, deviation: float) -> tuple[Episodes, Array]:
-    """Episodes of noise around no action, and that noise after clipping (episodes, T, 4)."""
+def _collect(simulation: Simulation, deviation: float) -> Episodes:
+    """Episodes of noise around no action."""
     spec, count = simulation.spec, simulation.num_envs
     shape = count, spec.robot.action_size
     disturb = ActionNoise(np.random.default_rng(0), shape, deviation, epsilon=0.0)
@@ -72,9 +73,8 @@ def _collect(simulation: Simulation, deviation: float) -> tuple[Episodes, Array]
         states.append(simulation.step(actions[-1]).observation)
     parts = (np.stack([state[name] for state in states], 1) for name in states[0])
     found = dict(zip(states[0], parts, strict=True))
-    noise = np.stack(actions, axis=1)
-    goal = found['desired_goal'][:, 0]
-    return Episodes(found['observation'], found['achieved_goal'], goal, noise), noise
+    goal, action = found['desired_goal'][:, 0], np.stack(actions, axis=1)
+    return Episodes(found['observation'], found['achieved_goal'], goal, action)
 
 
 def _returns(simulation: Simulation, episodes: Episodes, goal: Array) -> Array:

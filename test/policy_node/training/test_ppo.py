@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.rollouts import (
     RolloutMaker,
+    Rollouts,
     advantages,
     decision_weights,
     goals_in_hindsight,
@@ -101,6 +103,31 @@ def reached(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return -1.0 * (np.abs(achieved - goal)[..., 0] > 0.1)
 
 
+def one_step(
+    learner: PPO,
+    goal: np.ndarray,
+    generator: np.random.Generator,
+    achieve: Callable[[np.ndarray], np.ndarray],
+) -> Episodes:
+    """An episode of one tick per goal, from where all is 0 to what the action achieves."""
+    observation, goal = np.zeros((len(goal), 2, 1), np.float32), goal.astype(np.float32)
+    mean, _ = learner.acting_actor().predict(
+        {'observation': observation[:, 0], 'desired_goal': goal}
+    )
+    action = (mean + 0.3 * generator.standard_normal((len(goal), 1))).clip(-1, 1)
+    after = achieve(action)
+    achieved = np.stack([np.zeros_like(after), after], axis=1)
+    return Episodes(observation, achieved, goal, action[:, None].astype(np.float32))
+
+
+def improve(learner: PPO, rollouts: Rollouts, generator: np.random.Generator) -> None:
+    """The updates of one cycle."""
+    for _ in range(20):
+        row = generator.integers(len(rollouts.episodes), size=256)
+        learner.update(rollouts.draw(row, learner.config.gamma, generator))
+    learner.average()
+
+
 def learn(cycles: int, **changes: object) -> tuple[PPO, RolloutMaker]:
     """One step, whose action is what is achieved; goals lie anywhere from -.8 to .8."""
     torch.manual_seed(0)
@@ -110,22 +137,10 @@ def learn(cycles: int, **changes: object) -> tuple[PPO, RolloutMaker]:
     corrects = config.importance == 'decision'
     maker = RolloutMaker(learner, reached, config.gamma, 0.95, corrects)
     for _ in range(cycles):
-        count = 256
-        goal = generator.uniform(-0.8, 0.8, (count, 1)).astype(np.float32)
-        observation = np.zeros((count, 2, 1), np.float32)
-        mean, _ = learner.acting_actor().predict(
-            {'observation': observation[:, 0], 'desired_goal': goal}
-        )
-        action = (mean + 0.3 * generator.standard_normal((count, 1))).clip(-1, 1)
-        achieved = np.stack([np.zeros_like(action), action], axis=1)
-        episodes = Episodes(observation, achieved, goal, action[:, None].astype(np.float32))
+        episodes = one_step(learner, generator.uniform(-0.8, 0.8, (256, 1)), generator, np.copy)
         copies = 0 if config.strategy == 'none' else 4
         goals = [goals_in_hindsight(episodes, {'random': 1.0}, generator) for _ in range(copies)]
-        rollouts = maker.make(episodes, goals)
-        for _ in range(20):
-            row = generator.integers(len(rollouts.episodes), size=256)
-            learner.update(rollouts.draw(row, config.gamma, generator))
-        learner.average()
+        improve(learner, maker.make(episodes, goals), generator)
     return learner, maker
 
 
@@ -141,10 +156,8 @@ def test_ppo_learns_to_do_what_the_goal_says(changes: dict[str, object]) -> None
 
 
 def pushed(action: np.ndarray) -> np.ndarray:
-    """Places (episodes, 2, 3) of a block that a strong push moves by 0.3, before and after it."""
-    places = np.zeros((len(action), 2, 3), np.float32)
-    places[:, 1, :1] = np.where(action > 0.5, 0.3, 0.0)
-    return places
+    """Places (episodes, 3) of a block that a strong push moves by 0.3."""
+    return np.where(action > 0.5, np.float32(0.3), np.float32(0.0)) * np.eye(1, 3, dtype=np.float32)
 
 
 @pytest.mark.parametrize(('source', 'pushes'), [('final', False), ('outcome', True)])
@@ -156,23 +169,13 @@ def test_outcomes_of_others_teach_to_push_and_own_ones_do_not(source: str, pushe
     learner = PPO(NetworkShape(1, 3, 1, (32, 32)), config, torch.device('cpu'), Workers())
     metric = GoalMetric(task_spec('FetchPush'))
     maker = RolloutMaker(learner, metric.reward, config.gamma, 0.95, False)
-    goal = np.full((256, 3), -0.3, np.float32)
-    observation = np.zeros((256, 2, 1), np.float32)
+    goal = np.full((256, 3), -0.3)
     for _ in range(20):
-        mean, _ = learner.acting_actor().predict(
-            {'observation': observation[:, 0], 'desired_goal': goal}
-        )
-        action = (mean + 0.3 * generator.standard_normal((256, 1))).clip(-1, 1)
-        actions = action[:, None].astype(np.float32)
-        episodes = Episodes(observation, pushed(action), goal, actions)
+        episodes = one_step(learner, goal, generator, pushed)
         outcomes = Outcomes.of(episodes, metric, generator)
         mixture = {source: 1.0}
         goals = [goals_in_hindsight(episodes, mixture, generator, outcomes) for _ in range(4)]
-        rollouts = maker.make(episodes, goals)
-        for _ in range(20):
-            row = generator.integers(len(rollouts.episodes), size=256)
-            learner.update(rollouts.draw(row, config.gamma, generator))
-        learner.average()
+        improve(learner, maker.make(episodes, goals), generator)
     asked = {'observation': np.zeros((1, 1)), 'desired_goal': np.array([[0.3, 0.0, 0.0]])}
     action, _ = learner.evaluation_actor().predict(asked)
     assert (action[0, 0] > 0.5) == pushes
