@@ -15,11 +15,12 @@ import argparse
 import sys
 
 import numpy as np
+from noisy_episodes import noisy_episodes
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
-from policy_node.training.learning.exploration import ActionNoise
+from policy_node.policies.policy import RestingPolicy
 from policy_node.training.learning.outcomes import Outcomes
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.rollouts import advantages, goals_in_hindsight
@@ -42,7 +43,8 @@ def main() -> int:
     parser.add_argument('--episodes', type=int, default=2048, help='default: 2048')
     options = parser.parse_args()
     simulation = Simulation(_TASK, num_envs=options.episodes)
-    episodes = _collect(simulation, options.noise)
+    resting = RestingPolicy(simulation.spec.robot.action_size)
+    episodes = noisy_episodes(simulation, resting, options.noise, range(options.episodes))
     noise = episodes.action
     generator = np.random.default_rng(1)
     outcomes = Outcomes.of(episodes, GoalMetric(simulation.spec), generator)
@@ -60,21 +62,6 @@ def main() -> int:
         columns = '  '.join(_with_error(pull) for pull in pulls)
         print(f'{label:36s} {returns[:, 0].mean():6.2f}  {columns}')
     return 0
-
-
-def _collect(simulation: Simulation, deviation: float) -> Episodes:
-    """Episodes of noise around no action."""
-    spec, count = simulation.spec, simulation.num_envs
-    shape = count, spec.robot.action_size
-    disturb = ActionNoise(np.random.default_rng(0), shape, deviation, epsilon=0.0)
-    states, actions = [simulation.reset(seed=list(range(count)))], []
-    for tick in range(spec.episode_ticks):
-        actions.append(disturb.around(np.zeros(shape), tick).clip(-1.0, 1.0))
-        states.append(simulation.step(actions[-1]).observation)
-    parts = (np.stack([state[name] for state in states], 1) for name in states[0])
-    found = dict(zip(states[0], parts, strict=True))
-    goal, action = found['desired_goal'][:, 0], np.stack(actions, axis=1)
-    return Episodes(found['observation'], found['achieved_goal'], goal, action)
 
 
 def _returns(simulation: Simulation, episodes: Episodes, goal: Array) -> Array:

@@ -13,13 +13,13 @@ import argparse
 import sys
 
 import numpy as np
+from noisy_episodes import noisy_episodes
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import task_spec
 from policy_node import load_policy
 from policy_node.policies.policy import Policy, RestingPolicy
 from policy_node.training.evaluation.episodes import FIRST_SEED
-from policy_node.training.learning.exploration import ActionNoise
 from policy_node.training.learning.replay import MOVED_DISTANCE
 
 _TASK = 'FetchPush'
@@ -46,17 +46,10 @@ def main() -> int:
 def _run(policy: Policy, noise: float, episodes: int) -> tuple[float, np.ndarray]:
     """Share of episodes that move the block, and the mean way of the gripper (3,), metres."""
     simulation = Simulation(_TASK, num_envs=episodes)
-    spec = simulation.spec
-    shape = episodes, spec.robot.action_size
-    disturb = ActionNoise(np.random.default_rng(0), shape, noise, epsilon=0.0)
-    start = simulation.reset(seed=list(range(FIRST_SEED, FIRST_SEED + episodes)))
-    observation, farthest = start, np.zeros(episodes)
-    for tick in range(spec.episode_ticks):
-        action, _ = policy.predict(observation)
-        observation = simulation.step(disturb.around(action, tick)).observation
-        offset = observation['achieved_goal'] - start['achieved_goal']
-        farthest = np.maximum(farthest, np.linalg.norm(offset, axis=-1))
-    way = (observation['observation'] - start['observation'])[:, :3].mean(axis=0)
+    found = noisy_episodes(simulation, policy, noise, range(FIRST_SEED, FIRST_SEED + episodes))
+    offset = found.achieved_goal - found.achieved_goal[:, :1]
+    farthest = np.linalg.norm(offset, axis=-1).max(axis=1)
+    way = (found.observation[:, -1] - found.observation[:, 0])[:, :3].mean(axis=0)
     return float((farthest > MOVED_DISTANCE).mean()), way
 
 

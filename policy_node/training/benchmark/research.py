@@ -121,7 +121,8 @@ _ON_POLICY = {
     'updates_per_cycle': 40,
 }
 # Pushes are rare: four times the episodes in a cycle, four times the goals, more noise, smaller
-# steps, the distance left as an input, and a critic that does not take what is new for good.
+# steps, the distance left as an input, a critic that does not take what is new for good, and an
+# actor that does not begin by leaving the table.
 _ON_POLICY_PUSH = {
     **_ON_POLICY,
     'num_envs': 256,
@@ -132,6 +133,7 @@ _ON_POLICY_PUSH = {
     'action_l2': 0.003,
     'goal_features': 'relative',
     'first_value': -50.0,
+    'first_action_gain': 0.01,
     'actor_average': 0.65,
 }
 

@@ -105,6 +105,9 @@ class ConfigFields:
     first_value: float = 0.0
     """What the critic of `ppo` says before it has learnt: with -1 / (1 - gamma), what failing for
     ever is worth, nothing looks good because it is new."""
+    first_action_gain: float = 1.0
+    """Factor on the last layer of the actor of `ppo` before it has learnt: near 0 it begins with
+    noise around no action, whatever the seed."""
     critic_first: int = 0
     """Updates of the critics alone before the actor learns too; 0 is 5,000 where `init_from` is an
     actor without its critic, or with fewer than `critics`, else none."""

@@ -82,6 +82,7 @@ RANGES = (
     ('subgoal_prior', 0, _INFINITY),
     ('imagination_interval', 1, 1000),
     ('first_value', -1_000_000, 0),
+    ('first_action_gain', 0, 1),
     ('critic_first', 0, _INFINITY),
     ('total_steps', 1, _INFINITY),
     ('time_limit', 0, _INFINITY),
@@ -290,8 +291,9 @@ def _contradictions_of_algorithm(config: ConfigFields) -> Iterator[str]:
         yield f'importance {config.importance} excludes algorithm {config.algorithm}'
     if config.goals and OUTCOME in parse_mixture(config.goals) and not on_policy:
         yield 'goals outcome needs algorithm ppo'
-    if config.first_value != DEFAULTS['first_value'] and not on_policy:
-        yield 'first_value needs algorithm ppo'
+    for name in ('first_value', 'first_action_gain'):
+        if getattr(config, name) != DEFAULTS[name] and not on_policy:
+            yield f'{name} needs algorithm ppo'
     if on_policy and config.noise_std == 0.0:
         yield 'algorithm ppo needs noise_std above 0'
     needed = {name: value for name, value in _ON_POLICY.items() if getattr(config, name) != value}

@@ -41,6 +41,8 @@ class PPO(ActorCritic):
     ) -> None:
         actor, critic = Actor(shape), MLP(shape.feature_size, 1, shape)
         torch.nn.init.constant_(critic.output.bias, config.first_value)
+        with torch.no_grad():
+            actor.network.output.weight.mul_(config.first_action_gain)
         super().__init__(actor, critic, config, device, workers)
 
     def update(self, batch: Transitions) -> Losses:

@@ -181,6 +181,18 @@ def test_outcomes_of_others_teach_to_push_and_own_ones_do_not(source: str, pushe
     assert (action[0, 0] > 0.5) == pushes
 
 
+def test_gain_makes_the_first_actions_small_and_leaves_their_direction() -> None:
+    actions = []
+    for gain in (1.0, 0.01):
+        torch.manual_seed(0)
+        config = configured(first_action_gain=gain)
+        learner = PPO(NetworkShape(1, 1, 4, (32, 32)), config, torch.device('cpu'), Workers())
+        asked = {'observation': np.ones((1, 1)), 'desired_goal': np.ones((1, 1))}
+        actions.append(learner.evaluation_actor().predict(asked)[0])
+    assert np.abs(actions[0]).max() > 0.1
+    np.testing.assert_allclose(actions[1], 0.01 * np.arctanh(actions[0]), rtol=1e-3)
+
+
 def test_outcomes_are_what_others_made_of_where_they_began() -> None:
     generator = np.random.default_rng(0)
     achieved = np.zeros((3, 11, 3), np.float32)
@@ -325,6 +337,8 @@ def test_ppo_refuses_transitions_that_nobody_rolled_out() -> None:
         ({'algorithm': 'ddpg', 'goals': 'outcome=.8'}, 'goals outcome needs algorithm ppo'),
         ({'algorithm': 'ddpg', 'first_value': -50.0}, 'first_value needs algorithm ppo'),
         ({'first_value': 1.0}, 'first_value 1.0; allowed: -1000000 ... 0'),
+        ({'algorithm': 'ddpg', 'first_action_gain': 0.1}, 'first_action_gain needs algorithm ppo'),
+        ({'first_action_gain': 2.0}, 'first_action_gain 2.0; allowed: 0 ... 1'),
     ],
 )
 def test_what_ppo_would_not_look_at_is_refused(changes: dict[str, object], message: str) -> None:
