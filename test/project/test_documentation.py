@@ -16,6 +16,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from importlib import import_module
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import yaml
@@ -188,7 +189,9 @@ def _run_python(words: list[str]) -> None:
         script = compile((ROOT / words[0]).read_text(), words[0], 'exec')
         sys.argv = words
         if 'argparse' in script.co_names:
-            exec(script, {'__name__': '__main__', '__file__': str(ROOT / words[0])})
+            file = ROOT / words[0]
+            with patch.object(sys, 'path', [str(file.parent), *sys.path]):
+                exec(script, {'__name__': '__main__', '__file__': str(file)})
     else:
         assert words[0] in ('my_controller.py', 'my_robot.py'), words
 
