@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 # The largest actor of the paper's size has 0.7 MB.
@@ -31,23 +33,53 @@ def read_file(path: Path, largest: int = LARGEST_POLICY) -> bytes:
 def write_file(path: Path, data: bytes) -> None:
     """Writes a file under a temporary name and moves it into place.
 
+    What is no regular file, such as a pipe, is written to as it is.
+
     Raises:
         OSError: If that fails, and names the file; nothing is left behind.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f'.{path.name}.partial')
+    if path.exists() and not path.is_file() and not path.is_dir():
+        with _named(path):
+            path.write_bytes(data)
+    else:
+        write_files({path: data})
+
+
+def write_files(files: Mapping[Path, bytes]) -> None:
+    """Writes files that belong together: none is replaced before there was room for all.
+
+    Args:
+        files: Contents by path.
+
+    Raises:
+        OSError: If that fails, and names the file; nothing is left behind.
+    """
+    partials = {path: path.with_name(f'.{path.name}.partial') for path in files}
     try:
-        with partial.open('wb') as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except BaseException as error:
-        partial.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            # Of a full disk Python names no file, and of others the partial one.
-            raise type(error)(error.errno, error.strerror, str(path)) from None
+        for path, partial in partials.items():
+            with _named(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with partial.open('wb') as file:
+                    file.write(files[path])
+                    file.flush()
+                    os.fsync(file.fileno())
+        for path, partial in partials.items():
+            with _named(path):
+                os.replace(partial, path)
+    except BaseException:
+        for partial in partials.values():
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
         raise
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Of a full disk Python names no file, and of others the partial one."""
+    try:
+        yield
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from None
 
 
 def sha256(data: bytes) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import json
 import sys
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
+from policy_node.policies.files import write_file
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import (
     FIRST_SEED,
@@ -90,18 +92,17 @@ def _run(options: argparse.Namespace) -> int:
         'touched_rule': options.success_rule,
     }
     text = json.dumps(report, indent=2)
-    if options.json == _STDOUT:
-        print(text)
-    else:
-        print_table(report)
     try:
+        if options.json == _STDOUT:
+            print(text, flush=True)
+        else:
+            print_table(report)
         if options.json not in (None, _STDOUT):
-            options.json.parent.mkdir(parents=True, exist_ok=True)
-            options.json.write_text(text + '\n')
+            write_file(options.json, f'{text}\n'.encode())
         if options.csv is not None:
-            write_csv(outcomes, options.csv)
+            write_file(options.csv, to_csv(outcomes))
     except OSError as error:
-        raise CommandError(f'{error.filename}: {error.strerror}') from None
+        raise CommandError(f'{error.filename or "output"}: {error.strerror}') from None
     return code
 
 
@@ -126,16 +127,16 @@ def _evaluate(
             return finished[-1], EXIT_INTERRUPTED
 
 
-def write_csv(outcomes: EpisodeOutcomes, path: Path) -> None:
-    """Writes one row per episode."""
+def to_csv(outcomes: EpisodeOutcomes) -> bytes:
+    """A CSV file with a row per episode."""
     names = EpisodeOutcomes.__slots__
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open('w', newline='') as file:
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(names)
-        columns = [np.asarray(getattr(outcomes, name)) for name in names]
-        integers = [c.astype(int) if c.dtype == np.bool_ else c for c in columns]
-        writer.writerows(zip(*(column.tolist() for column in integers), strict=True))
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator='\n')
+    writer.writerow(names)
+    columns = [np.asarray(getattr(outcomes, name)) for name in names]
+    integers = [c.astype(int) if c.dtype == np.bool_ else c for c in columns]
+    writer.writerows(zip(*(column.tolist() for column in integers), strict=True))
+    return file.getvalue().encode()
 
 
 if __name__ == '__main__':

@@ -72,9 +72,23 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
         overrides['strategy'] = 'none'
     if options.resume is not None:
         return _resumed_config(options, overrides)
-    if options.task is None:
+    task, recipe = (_own_option(options, overrides, name) for name in _OWN_OPTIONS)
+    if task is None:
         raise ValueError(f'--task is missing; allowed: {", ".join(TASKS)}')
-    return recipe_config(options.task, options.recipe or 'best', **overrides)
+    return recipe_config(task, recipe or 'best', **overrides)
+
+
+def _own_option(options: argparse.Namespace, overrides: dict[str, Any], name: str) -> str | None:
+    """What an option or `--set` says of a field, which leaves `overrides`; None if neither does.
+
+    Raises:
+        ValueError: If they contradict each other.
+    """
+    option: str | None = getattr(options, name)
+    assigned: str | None = overrides.pop(name, None)
+    if None not in (option, assigned) and option != assigned:
+        raise ValueError(f'--{name} {option} excludes --set {name}={assigned}')
+    return option or assigned
 
 
 def _resumed_config(options: argparse.Namespace, overrides: dict[str, Any]) -> TrainConfig:

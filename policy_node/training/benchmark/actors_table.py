@@ -12,7 +12,11 @@ from policy_node.training.learning.origins import steps_behind
 
 
 def actors_table(actors: Path) -> str:
-    """Returns the Markdown table of the actors in a folder."""
+    """Returns the Markdown table of the actors in a folder.
+
+    Raises:
+        ValueError: If a file is no evaluation of an actor; the line names it.
+    """
     lines = [
         '| task | success (95 % interval) | at most | in Gymnasium-Robotics | touched once '
         '| mean return | episodes | env steps | best published (how read; who, steps) |',
@@ -21,7 +25,10 @@ def actors_table(actors: Path) -> str:
     for task in TASKS:
         report = actors / f'{task}.json'
         if report.is_file():
-            lines.append(_row(task, json.loads(report.read_text())))
+            try:
+                lines.append(_row(task, json.loads(report.read_text())))
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
+                raise ValueError(f'{report} is no evaluation of an actor: {error!r}') from None
     return '\n'.join(lines)
 
 

@@ -29,6 +29,7 @@ from typing import Any
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
+    CommandError,
     CommandParser,
     UsageError,
     given_command,
@@ -37,6 +38,7 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.tasks import TASKS
+from policy_node.policies.files import write_file
 from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.jobs import ARMS, Job
 from policy_node.training.benchmark.reporting import report, require_readable, ship_all
@@ -239,7 +241,7 @@ def _not_stored(study: Study, jobs: Sequence[Job], options: argparse.Namespace) 
     missing = [job for job in jobs if not stored.holds(job)]
     if len(missing) < len(jobs):
         count = f'{len(jobs) - len(missing)} of {len(jobs)}'
-        print(f'{count} runs are in {folder}; with another --report they are run again')
+        print(f'{count} runs are in {folder}; with other --report and --output they are run again')
     return missing
 
 
@@ -278,7 +280,10 @@ def _report(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> b
         whole = ship_all(finished, actors, options.episodes or 2000)
         if whole and actors.is_dir():
             table = _report_folder(options) / ACTORS_TABLE
-            table.write_text(actors_table(actors) + '\n')
+            try:
+                write_file(table, f'{actors_table(actors)}\n'.encode())
+            except (OSError, ValueError) as error:
+                raise CommandError(f'no {table}: {error}') from None
     if len(finished) < len(jobs):
         print(f'{len(finished)} of {len(jobs)} jobs are finished; the same command goes on')
     return whole

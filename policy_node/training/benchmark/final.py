@@ -14,6 +14,7 @@ from policy_node.training.evaluation.evaluator import successes
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.run_folder import LATEST_FILE
 from policy_node.training.learning.simulations import make_simulation
+from policy_node.training.learning.state_checks import is_finite
 
 FINAL_FILE = 'final.json'
 _MOST_AT_ONCE = 64
@@ -52,5 +53,10 @@ def read_final(folder: Path) -> dict[str, Any] | None:
         found = json.loads((folder / FINAL_FILE).read_text())
     except (OSError, ValueError):
         return None
-    whole = isinstance(found, dict) and found.keys() >= {'success', 'episodes'}
-    return found if whole else None
+    return found if isinstance(found, dict) and _is_whole(found) else None
+
+
+def _is_whole(found: dict[str, Any]) -> bool:
+    success = found.get('success')
+    is_rate = is_finite(success) and 0.0 <= success <= 1.0
+    return is_rate and type(found.get('episodes')) is int

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from policy_node.policies.files import write_files
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import (
     GOOD_SUCCESS,
@@ -19,12 +20,12 @@ from policy_node.training.benchmark.measures import (
     sum_up,
 )
 from policy_node.training.benchmark.research import Study
-from policy_node.training.benchmark.results import Band, Curve, aggregate, draw, write_csv
+from policy_node.training.benchmark.results import Band, Curve, aggregate, draw, to_csv
 from policy_node.training.benchmark.stored_runs import RUN, Rows, StoredRuns, locked, run_of
 
 # The page of a study keeps its table between these lines.
 BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'
-ARMS = 'arms.csv'
+ARMS, FIGURE, PAGE = 'arms.csv', 'figure.png', 'README.md'
 # A difference is claimed from so many seeds on.
 _ENOUGH_SEEDS = 5
 
@@ -44,16 +45,21 @@ def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -
 
     Raises:
         ValueError: If a file of the folder cannot be read.
+        OSError: If the report cannot be written; that of before stays then.
     """
     with locked(output):
         stored = StoredRuns.read(output)
         stored.add(jobs, command)
-        stored.write(study)
+        data = stored.files(study)
         arms = sum_up_arms(study, stored.runs, stored.curves)
-        write_csv(arms, output / ARMS)
         labels = {arm.name: arm.label for arm in study.arms}
-        draw(_bands(stored.curves), labels, output / 'figure.png', paper_epochs=False)
-        _renew(output / 'README.md', format_table(study, arms))
+        contents = {
+            ARMS: to_csv(arms),
+            FIGURE: draw(_bands(stored.curves), labels, paper_epochs=False),
+            PAGE: _renewed(output / PAGE, format_table(study, arms)),
+        }
+        # The page last: it is what people look at, the rest is what it is made of.
+        write_files(data | {output / name: content for name, content in contents.items()})
 
 
 def sum_up_arms(study: Study, runs: Rows, curves: Rows) -> Rows:
@@ -184,9 +190,10 @@ def _quartiles(row: Mapping[str, Any], name: str) -> str:
     return '{:.3f} ({:.3f} ... {:.3f})'.format(*values)
 
 
-def _renew(page: Path, table: str) -> None:
-    """Puts the table between its marks."""
+def _renewed(page: Path, table: str) -> bytes:
+    """A page with the table between its marks; one that has none stays as it is."""
     text = page.read_text() if page.is_file() else f'{BEGIN}\n{END}\n'
     if BEGIN in text and END in text:
         before, after = text.split(BEGIN)[0], text.split(END, 1)[1]
-        page.write_text(f'{before}{BEGIN}\n{table}{END}{after}')
+        text = f'{before}{BEGIN}\n{table}{END}{after}'
+    return text.encode()

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from msgs_spec.tasks import task_spec
 from policy_node.policies.checkpoint import read_info
+from policy_node.policies.files import write_files
 from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, PROGRESS_FILE, Job
 from policy_node.training.benchmark.machines import machine
 from policy_node.training.benchmark.published import BEST, RERUN
@@ -135,19 +136,25 @@ def write_report(jobs: Sequence[Job], output: Path, command: str) -> None:
         jobs: Finished jobs.
         output: Folder.
         command: Command line, for the record.
+
+    Raises:
+        ValueError: If a file of a job cannot be read.
+        OSError: If the report cannot be written; that of before stays then.
     """
     found = [read_curve(job.folder / PROGRESS_FILE) for job in jobs]
     revisions, groups = source_revisions(jobs), by_arm(jobs, found)
     table = [summarize(t, a, curves) for t, arms in groups.items() for a, curves in arms.items()]
-    output.mkdir(parents=True, exist_ok=True)
-    write_csv(curve_rows(jobs, found), output / 'benchmark_curves.csv')
-    write_csv(table, output / 'benchmark.csv')
     about = {'command': command, 'source_revisions': revisions, 'machine': machine()}
-    (output / 'benchmark.json').write_text(json.dumps({**about, 'results': table}, indent=2) + '\n')
     bands = {t: {a: aggregate(curves) for a, curves in arms.items()} for t, arms in groups.items()}
-    draw(bands, {arm.name: arm.label for arm in _ARMS.values()}, output / 'benchmark.png')
     text = format_table(table)
-    (output / 'benchmark.txt').write_text(text)
+    contents = {
+        'benchmark_curves.csv': to_csv(curve_rows(jobs, found)),
+        'benchmark.csv': to_csv(table),
+        'benchmark.json': to_json({**about, 'results': table}),
+        'benchmark.png': draw(bands, {arm.name: arm.label for arm in _ARMS.values()}),
+        'benchmark.txt': text.encode(),
+    }
+    write_files({output / name: content for name, content in contents.items()})
     print(text, end='')
     print(f'figure and tables in {output}')
 
@@ -185,15 +192,13 @@ _MOST_INSIDE = 4
 def draw(
     bands: Mapping[str, Mapping[str, Band]],
     labels: Mapping[str, str],
-    path: Path,
     paper_epochs: bool = True,
-) -> None:
-    """Draws one panel per task: the median of each arm over its quartiles.
+) -> bytes:
+    """A PNG with one panel per task: the median of each arm over its quartiles.
 
     Args:
         bands: By task and arm.
         labels: By arm, in the order of their colours.
-        path: PNG file to write.
         paper_epochs: Whether the epochs of the paper are marked on a second axis.
     """
     from matplotlib.figure import Figure
@@ -214,7 +219,9 @@ def draw(
                 axes.plot(band.env_steps, band.median, style, color=color, label=label)
         _label(axes, task, top, paper_epochs)
     _name_curves(figure, list(panels[: len(bands)]), columns)
-    figure.savefig(path, dpi=130)
+    file = io.BytesIO()
+    figure.savefig(file, dpi=130)
+    return file.getvalue()
 
 
 def _name_curves(figure: Any, panels: Sequence[Any], columns: int) -> None:
@@ -269,11 +276,17 @@ def curve_rows(jobs: Sequence[Job], curves: Sequence[Curve]) -> list[dict[str, A
     ]
 
 
-def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Writes rows as CSV; a column that a row has not is empty."""
+def to_csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """Rows as CSV; a column that a row has not is empty."""
     # The last rows are the newest: files of before lack columns that came later.
     columns = dict.fromkeys(name for row in reversed(rows) for name in row)
-    with path.open('w', newline='') as file:
-        writer = csv.DictWriter(file, list(columns), lineterminator='\n')
-        writer.writeheader()
-        writer.writerows(rows)
+    file = io.StringIO()
+    writer = csv.DictWriter(file, list(columns), lineterminator='\n')
+    writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue().encode()
+
+
+def to_json(values: Mapping[str, Any]) -> bytes:
+    """A JSON file."""
+    return (json.dumps(values, indent=2) + '\n').encode()

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from policy_node.policies.files import write_files
 from policy_node.training.benchmark.jobs import Job, run_name
 from policy_node.training.benchmark.research import Study
 from policy_node.training.benchmark.stored_runs import ABOUT, StoredRuns, locked, run_of
@@ -57,7 +58,7 @@ def take_from_other_reports(study: Study, jobs: Sequence[Job], report: Path) -> 
                     curve = [row for row in other.curves if run_of(row) == run_of(run)]
                     name = f'{run_name(*run_of(run))} of {other.folder}'
                     stored.put(job, run, curve, f'as {name}')
-                    stored.write(study)
+                    write_files(stored.files(study))
                     print(f'{job.name} is {name}', flush=True)
                     break
 

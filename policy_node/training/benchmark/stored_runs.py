@@ -11,6 +11,7 @@ import csv
 import dataclasses
 import fcntl
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,8 @@ from typing import Any
 from policy_node.training.benchmark.jobs import Job, differing_fields, run_name
 from policy_node.training.benchmark.measures import curve_of, measure_run
 from policy_node.training.benchmark.research import Study
-from policy_node.training.benchmark.results import curve_rows, write_csv
+from policy_node.training.benchmark.results import curve_rows, to_csv, to_json
+from policy_node.training.learning.config_values import config_from_dict
 from policy_node.training.learning.recipes import STEP_COUNTS
 
 RUNS, CURVES, ABOUT = 'runs.csv', 'curves.csv', 'study.json'
@@ -28,6 +30,19 @@ RUN = ('task', 'arm', 'seed')
 """Columns that name a run."""
 
 Rows = list[dict[str, Any]]
+
+# Columns that a report reckons with; others may be empty.
+_NUMBERS = {
+    RUNS: (
+        'seed',
+        'area',
+        'final_success',
+        'final_episodes',
+        'processor_seconds',
+        'samples_per_processor_second',
+    ),
+    CURVES: ('seed', 'env_steps', 'success'),
+}
 
 
 @dataclass(slots=True)
@@ -60,6 +75,8 @@ class StoredRuns:
             read_rows(folder / CURVES),
             _read_tasks(folder / ABOUT),
         )
+        for name, rows in ((RUNS, stored.runs), (CURVES, stored.curves)):
+            _require_numbers(rows, folder / name, _NUMBERS[name])
         evaluated = {run_of(row, folder / CURVES) for row in stored.curves}
         for row in stored.runs:
             task, arm, _ = run = run_of(row, folder / RUNS)
@@ -67,7 +84,17 @@ class StoredRuns:
                 raise ValueError(f'{folder / CURVES} has no evaluation of {run_name(*run)}')
             if arm not in stored.tasks.get(task, {'arms': {}})['arms']:
                 raise ValueError(f'{folder / ABOUT} has no settings of {run_name(*run)}')
+        stored._require_settings()
         return stored
+
+    def _require_settings(self) -> None:
+        """Refuses settings that are no configuration."""
+        for task, told in self.tasks.items():
+            for arm in told['arms']:
+                try:
+                    config_from_dict(self.configuration(task, arm))
+                except (TypeError, ValueError) as error:
+                    raise ValueError(f'{self.folder / ABOUT}, {task}/{arm}: {error}') from None
 
     def holds(self, job: Job) -> bool:
         """Whether it has a run of the job's name, measured on as many episodes."""
@@ -152,19 +179,17 @@ class StoredRuns:
         configurations[job.arm.name] = {k: v for k, v in values.items() if k != 'seed'}
         told['settings'], told['arms'] = _split(configurations)
 
-    def write(self, study: Study) -> None:
-        """Writes the three files, in the order of the study's tasks and arms."""
+    def files(self, study: Study) -> dict[Path, bytes]:
+        """What the three files hold then, in the order of the study's tasks and arms."""
         self._sort(study)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        write_csv(self.runs, self.folder / RUNS)
-        write_csv(self.curves, self.folder / CURVES)
         about = {
             'study': study.name,
             'request': study.request,
             'question': study.question,
             'tasks': self.tasks,
         }
-        (self.folder / ABOUT).write_text(json.dumps(about, indent=2) + '\n')
+        contents = {RUNS: to_csv(self.runs), CURVES: to_csv(self.curves), ABOUT: to_json(about)}
+        return {self.folder / name: content for name, content in contents.items()}
 
     def _sort(self, study: Study) -> None:
         tasks, arms = list(study.tasks), [arm.name for arm in study.arms]
@@ -212,6 +237,25 @@ def run_of(row: Mapping[str, Any], path: Path | None = None) -> tuple[str, str, 
     return task, arm, seed
 
 
+def _require_numbers(rows: Rows, path: Path, names: Sequence[str]) -> None:
+    """Refuses rows that were cut or edited into something else.
+
+    Raises:
+        ValueError: The line names file, line and column.
+    """
+    for line, row in enumerate(rows, 2):
+        if None in row:
+            raise ValueError(f'{path}, line {line}, has more cells than there are columns')
+        for name in names:
+            if name not in row:
+                raise ValueError(f'{path} has no column {name!r}')
+            value = row[name]
+            if isinstance(value, str) or not math.isfinite(value):
+                raise ValueError(f'{path}, line {line}: {name} {value!r} is no number')
+        if not isinstance(row['seed'], int):
+            raise ValueError(f'{path}, line {line}: seed {row["seed"]} is no whole number')
+
+
 def read_rows(path: Path) -> Rows:
     """Rows of a CSV file, numbers as numbers; none where there is no file.
 
@@ -224,6 +268,8 @@ def read_rows(path: Path) -> Rows:
         rows = list(csv.DictReader(path.read_text().splitlines()))
     except OSError as error:
         raise ValueError(f'{path} cannot be read: {error.strerror}') from None
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f'{path} is no table: {error}') from None
     return [{name: _value(text) for name, text in row.items()} for row in rows]
 
 
@@ -237,13 +283,16 @@ def _read_tasks(path: Path) -> dict[str, dict[str, Any]]:
     return tasks
 
 
-def _value(text: str | None) -> int | float | str:
+def _value(text: str | list[str] | None) -> int | float | str:
+    # The cells of a row that is too long are a list, those of one too short None.
+    if not isinstance(text, str):
+        return ''
     for kind in (int, float):
         try:
-            return kind(text or '')
+            return kind(text)
         except ValueError:
             continue
-    return text or ''
+    return text
 
 
 def _split(

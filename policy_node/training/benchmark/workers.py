@@ -109,7 +109,7 @@ def attempt(job: Job, command: str) -> Outcome:
     except RunTakenError:
         print(f'{job.name} is being run by another process', flush=True)
         return Outcome.TAKEN
-    except CommandError as error:
+    except (CommandError, ValueError, OSError) as error:
         complain('benchmark', f'{job.name}: {error}')
         return Outcome.FAILED
     return Outcome.FINISHED

@@ -19,6 +19,7 @@ from policy_node.training.learning.run_folder import (
     companion_file,
 )
 from policy_node.training.learning.run_log import draw_curve, read_progress
+from policy_node.training.learning.state_checks import is_finite
 from policy_node.training.learning.training_state import TrainingState, read_state, write_state
 
 # What decides which of two actors is better, the first first.
@@ -77,6 +78,8 @@ def ship(
     if old and not is_better(summary, old):
         print(f'ship_actor: the actor in {actors} is at least as good; nothing changed')
         return False
+    recipe = info.config.get('recipe', 'an unknown')
+    title = f'{info.task}, {recipe} recipe, seed {info.seed}'
     target = actors / f'{info.task}.safetensors'
     command = commands_of(run) or info.command
     checkpoint.save(target, actor, replace(info, success=summary, command=command))
@@ -92,7 +95,6 @@ def ship(
     }
     if state is not None:
         ship_critic(state, target)
-    title = f'{info.task}, {info.config["recipe"]} recipe, seed {info.seed}'
     curve = target.with_suffix('.png')
     # A mean of networks, taken as it is, has no curve of its own: that of a part stays.
     if progress[-1].get('updates') or not curve.is_file():
@@ -113,7 +115,8 @@ def _evaluation_in(file: Path) -> dict[str, Any]:
     try:
         found = json.loads(file.read_text())
         for key in (*_BETTER, 'episodes'):
-            float(found[key])
+            if not is_finite(found[key]):
+                raise ValueError(f'{key} {found[key]!r} is no number')
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f'{file} is no evaluation of an actor: {error!r}') from None
     return dict(found)

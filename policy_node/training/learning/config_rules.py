@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 
 from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, TaskSpec, task_spec
@@ -130,6 +131,8 @@ def require_allowed(config: ConfigFields) -> None:
             raise ValueError(f'{name} {value!r}; allowed: {", ".join(allowed)}')
     for name, lowest, highest in RANGES:
         value = getattr(config, name)
+        if not math.isfinite(value):
+            raise ValueError(f'{name} {value} is no finite number')
         if not lowest <= value <= highest:
             raise ValueError(f'{name} {value}; allowed: {_number(lowest)} ... {_number(highest)}')
     goal_features(config.goal_features, spec)

@@ -36,6 +36,8 @@ def parse_value(name: str, text: str) -> Any:
     try:
         return _parse(text, kind)
     except ValueError:
+        if isinstance(kind, types.GenericAlias):
+            raise ValueError(f'{name} {text!r} is not whole numbers with commas: N,N,...') from None
         kind = getattr(kind, '__name__', str(kind))
         raise ValueError(f'{name} {text!r} is not of type {kind}') from None
 

@@ -93,7 +93,10 @@ def train_run(
             leave_workers(workers)
         if workers.is_first:
             title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
-            draw_curve(read_progress(output / 'progress.csv'), title, output / 'curve.png')
+            try:
+                draw_curve(read_progress(output / 'progress.csv'), title, output / 'curve.png')
+            except OSError as error:
+                complain(NAME, f'no curve, the run itself is saved: {error}')
         return ending
 
 

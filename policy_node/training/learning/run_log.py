@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -157,7 +158,8 @@ def _numbers(row: dict[str, str]) -> dict[str, float] | None:
         numbers = {name: float(text) for name, text in row.items() if text != ''}
     except (TypeError, ValueError):
         return None
-    return numbers if 'env_steps' in numbers else None
+    whole = 'env_steps' in numbers and all(map(math.isfinite, numbers.values()))
+    return numbers if whole else None
 
 
 def _tensorboard(output: Path, resumed_steps: int) -> Any:

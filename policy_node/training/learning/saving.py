@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from typing import Any
 
 from msgs_spec.command_line import complain
 from policy_node.policies import checkpoint
@@ -14,6 +16,7 @@ from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.experience import Experience
 from policy_node.training.learning.replay_file import save_replay
 from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE, RunFolder
+from policy_node.training.learning.state_checks import is_finite
 from policy_node.training.learning.training_state import Counters
 
 NAME = 'train_her'
@@ -67,11 +70,20 @@ class Saver:
                 complain(NAME, f'{error}; the best actor is looked for anew')
             counters.best_success, counters.best_return = Counters().best_success, -1e9
             return
-        enough = found.get('episodes', 0) >= self._config.evaluation_episodes
-        if enough and found.get('rule') == self._config.success_rule and 'mean_return' in found:
-            best = float(found['last_step']), float(found['mean_return'])
+        best = self._decided_by(found)
+        if best is not None:
             known = counters.best_success, counters.best_return
             counters.best_success, counters.best_return = max(known, best)
+
+    def _decided_by(self, found: Mapping[str, Any]) -> tuple[float, float] | None:
+        """Success and return of an evaluation as those of this run; None if it was none."""
+        names = 'episodes', 'last_step', 'mean_return'
+        numbers = [float(found[name]) for name in names if is_finite(found.get(name))]
+        if found.get('rule') != self._config.success_rule or len(numbers) < len(names):
+            return None
+        episodes, success, mean_return = numbers
+        enough = episodes >= self._config.evaluation_episodes
+        return (success, mean_return) if enough and 0.0 <= success <= 1.0 else None
 
     def save_when_due(
         self, learner: ActorCritic, experience: Experience, counters: Counters

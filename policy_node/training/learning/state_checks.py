@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor
@@ -13,6 +13,11 @@ from torch import Tensor
 _LARGEST_COUNT = 2**53
 # What Adam keeps of each parameter once it has moved it.
 _OF_ADAM = {'step', 'exp_avg', 'exp_avg_sq'}
+
+
+def is_finite(value: object) -> TypeGuard[int | float]:
+    """Whether a value from a file is a finite number; True and False are none."""
+    return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)
 
 
 def require_counters(values: object, defaults: Mapping[str, int | float]) -> dict[str, Any]:
@@ -36,7 +41,7 @@ def require_counters(values: object, defaults: Mapping[str, int | float]) -> dic
         if isinstance(defaults[name], int):
             if type(value) is not int or not 0 <= value <= _LARGEST_COUNT:
                 raise ValueError(f'counter {name} is {value!r:.80}; allowed: 0 ... 2**53')
-        elif type(value) not in (int, float) or not math.isfinite(value):
+        elif not is_finite(value):
             raise ValueError(f'counter {name} is {value!r:.80}; allowed: a finite number')
     return values
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import pytest
 import torch
 
+from policy_node.policies.files import write_files
+from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.command import main
 from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.benchmark.stored_runs import StoredRuns, read_rows
+from support.full_disk import files_at_most
 
 torch.set_num_threads(1)
 
@@ -29,7 +33,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     stored = StoredRuns.read(folder / 'told')
     for row in (*stored.runs, *stored.curves):
         row['seed'] = 1
-    stored.write(STUDIES['values'])
+    write_files(stored.files(STUDIES['values']))
     return folder
 
 
@@ -43,7 +47,14 @@ def again(study: Path, report: str = 'told') -> int:
     return main([*STUDY, '--output', str(study / 'runs'), '--report', str(study / report)])
 
 
-@pytest.mark.parametrize('content', ['{', '[]', '{"episodes": 2}'])
+@pytest.mark.parametrize(
+    'content',
+    [
+        '{',
+        '[]',
+        *(f'{{"success": {value}, "episodes": 2}}' for value in ('"abc"', 'null', 'NaN', 2)),
+    ],
+)
 def test_a_damaged_measure_is_taken_again(study: Path, content: str) -> None:
     final = study / 'runs' / 'FetchReach' / 'none' / 'seed0' / 'final.json'
     before = final.read_text()
@@ -90,3 +101,82 @@ def test_a_report_with_no_place_is_refused_before_anything_runs(
     error = capsys.readouterr().err
     assert error == f'benchmark: {tmp_path / "file"} cannot hold a report: File exists\n'
     assert not list((tmp_path / 'runs').iterdir())
+
+
+def test_a_full_disk_leaves_the_report_as_it_was(
+    study: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = study / 'told' / 'README.md'
+    page.write_text(f'{page.read_text()}{"words " * 20_000}')
+    before = {path.name: path.read_bytes() for path in (study / 'told').iterdir()}
+    with files_at_most(100_000):
+        assert again(study) == 1
+    error = capsys.readouterr().err
+    assert f'no report in {study / "told"}: ' in error and str(page) in error
+    assert {path.name: path.read_bytes() for path in (study / 'told').iterdir()} == before
+    assert again(study) == 0
+    assert page.read_text().endswith('words ')
+
+
+@pytest.mark.parametrize(
+    ('name', 'column', 'cell', 'message'),
+    [
+        ('runs.csv', 'area', 'abc', "runs.csv, line 2: area 'abc' is no number"),
+        ('runs.csv', 'final_success', '', "runs.csv, line 2: final_success '' is no number"),
+        ('runs.csv', 'seed', 'x', "runs.csv, line 2: seed 'x' is no number"),
+        ('runs.csv', 'seed', '1.5', 'runs.csv, line 2: seed 1.5 is no whole number'),
+        ('runs.csv', 'seed', '1,1', 'runs.csv, line 2, has more cells than there are columns'),
+        ('curves.csv', 'success', 'nan', 'curves.csv, line 2: success nan is no number'),
+    ],
+)
+def test_a_damaged_table_is_named_before_anything_runs(
+    study: Path,
+    name: str,
+    column: str,
+    cell: str,
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    file = study / 'told' / name
+    head, first, *others = file.read_text().splitlines()
+    # The last columns, where a machine has a comma in its name, are not looked at.
+    cells = first.split(',')
+    cells[head.split(',').index(column)] = cell
+    file.write_text('\n'.join([head, ','.join(cells), *others]))
+    assert again(study) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    ('name', 'before', 'message'),
+    [
+        ('runs.csv', 'final_episodes', "runs.csv has no column 'final_episodes'"),
+        ('study.json', '"gamma"', 'study.json, FetchReach/none: unknown configuration fields'),
+    ],
+)
+def test_a_damaged_name_is_named_before_anything_runs(
+    study: Path, name: str, before: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = study / 'told' / name
+    file.write_text(file.read_text().replace(before, f'{before[:-1]}x{before[-1]}'))
+    assert again(study) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
+
+
+def test_a_run_whose_actor_is_damaged_before_it_is_measured_fails_alone(
+    study: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = study / 'runs' / 'FetchReach' / 'none' / 'seed0'
+    (folder / 'final.json').unlink()
+    (folder / 'latest.safetensors').write_bytes(b'cut')
+    assert again(study) == 1
+    error = capsys.readouterr().err
+    assert 'benchmark: FetchReach/none/seed0: ' in error and error.count('\n') == 1
+
+
+def test_a_damaged_evaluation_among_actors_is_named(tmp_path: Path) -> None:
+    (tmp_path / 'FetchPush.json').write_text(json.dumps({'success_gymnasium': 'good'}))
+    with pytest.raises(ValueError, match=r'FetchPush\.json is no evaluation of an actor'):
+        actors_table(tmp_path)

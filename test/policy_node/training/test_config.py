@@ -25,6 +25,7 @@ from policy_node.training.learning.config_rules import FROM_NOTHING
 from policy_node.training.learning.config_values import config_from_dict, parse_assignment
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.threads import split_threads
+from policy_node.training.train_her import config_from_arguments, parse_arguments
 from support import ROOT
 
 
@@ -104,7 +105,7 @@ def test_assignments_take_the_type_of_the_field(text: str, expected: tuple[str, 
         ('gamma=high', "gamma 'high' is not of type float"),
         ('layer_norm=maybe', "layer_norm 'maybe' is not of type bool"),
         ('num_envs=1.5', "num_envs '1.5' is not of type int"),
-        ('hidden_sizes=wide', "hidden_sizes 'wide' is not of type"),
+        ('hidden_sizes=wide', "hidden_sizes 'wide' is not whole numbers with commas"),
     ],
 )
 def test_bad_assignments_are_refused(text: str, match: str) -> None:
@@ -119,6 +120,7 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ({'strategy': 'past'}, "strategy 'past'; allowed: final, future"),
         ({'gamma': 1.0}, 'gamma 1.0; allowed: 0 ... 0.999999'),
         ({'batch_size': 0}, 'batch_size 0; allowed: 1'),
+        ({'noise_std': float('inf')}, 'noise_std inf is no finite number'),
         ({'hidden_sizes': ()}, 'hidden_sizes'),
         ({'goals': 'past=1'}, 'past'),
         ({'goals': 'future=.5', 'strategy': 'none'}, 'excludes strategy none'),
@@ -163,6 +165,17 @@ def options_of(*arguments: str) -> dict[str, object]:
     return given_fields(parser.parse_args(arguments), without=('task', 'recipe'))
 
 
+def test_task_and_recipe_may_be_set_like_any_field() -> None:
+    def config(*arguments: str) -> TrainConfig:
+        return config_from_arguments(parse_arguments(arguments))
+
+    assert config('--set', 'task=FetchPush').task == 'FetchPush'
+    paper = config('--task', 'FetchReach', '--set', 'recipe=paper', '--set', 'task=FetchReach')
+    assert (paper.task, paper.recipe) == ('FetchReach', 'paper')
+    with pytest.raises(ValueError, match='--task FetchReach excludes --set task=FetchPush'):
+        config('--task', 'FetchReach', '--set', 'task=FetchPush')
+
+
 def test_every_field_is_an_option_that_says_what_it_means(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -199,6 +212,7 @@ def test_options_become_fields_of_their_types_and_nothing_else_is_set() -> None:
     [
         (['--learning-rte', '1'], "--learning-rte 1; did you mean '--learning-rate'?"),
         (['--gamma', 'high'], "gamma 'high' is not of type float"),
+        (['--hidden-sizes', 'abc'], "hidden_sizes 'abc' is not whole numbers with commas"),
         (['--nosuchthing'], 'unrecognized arguments: --nosuchthing'),
     ],
 )

@@ -196,6 +196,34 @@ def test_a_best_actor_that_is_lost_is_looked_for_anew(
 
 
 @pytest.mark.parametrize(
+    'success',
+    [
+        {'episodes': 'many', 'rule': 'gymnasium', 'mean_return': 1, 'last_step': 1},
+        {'episodes': 1000, 'rule': 'gymnasium', 'mean_return': 1},
+        {'episodes': 1000, 'rule': 'gymnasium', 'mean_return': 1, 'last_step': 5},
+        {'episodes': 1000, 'rule': 'gymnasium', 'mean_return': None, 'last_step': 0.5},
+    ],
+)
+def test_a_best_actor_whose_evaluation_is_none_decides_nothing(
+    run: Path, success: dict[str, object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    tensors, metadata = read_tensors(run / BEST)
+    write_tensors(run / BEST, tensors, metadata | {'success': json.dumps(success)})
+    assert main(['--resume', str(run), '--steps', '1600']) == 0
+    said = capsys.readouterr()
+    assert 'Traceback' not in said.err and 'best success 5' not in said.out
+
+
+def test_a_curve_with_no_place_does_not_fail_the_run(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / 'curve.png').unlink(missing_ok=True)
+    (run / 'curve.png').mkdir()
+    assert main(['--resume', str(run), '--steps', '1600']) == 0
+    assert 'no curve, the run itself is saved: ' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ('options', 'message'),
     [
         (['--hidden-sizes', '8,8'], 'has networks of hidden_sizes (16, 16), which stay; not (8, 8'),

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from policy_node.policies.files import write_files
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.final import FINAL_FILE
 from policy_node.training.benchmark.jobs import Job
@@ -138,7 +139,7 @@ def test_a_study_runs_measures_and_gives_the_same_bits_again(
         rows[:] = [row for row in rows if row['task'] == 'FetchPush']
     del stored.tasks['FetchReach']
     kept = list(stored.runs)
-    dataclasses.replace(stored, folder=report).write(STUDIES['unbiased'])
+    write_files(dataclasses.replace(stored, folder=report).files(STUDIES['unbiased']))
     (report / 'README.md').write_text(f'# Before\n{BEGIN}\nold\n{END}\nafter\n')
     arguments = [*SMALL, '--arms', 'future', 'weighted', '--report', str(report)]
     assert main([*arguments, '--output', str(tmp_path / 'first')]) == 0
@@ -221,7 +222,7 @@ def test_a_seed_of_another_day_stands_beside_those_that_are_there(
     today = tmp_path / 'today'
     capsys.readouterr()
     assert main([*arguments, str(today), '--seeds', '0', '1']) == 0
-    assert f'1 of 2 runs are in {report}; with another --report' in capsys.readouterr().out
+    assert f'1 of 2 runs are in {report}; with other --report' in capsys.readouterr().out
     assert not list(today.glob('*/*/seed0')) and list(today.glob('*/*/seed1'))
     runs = read_rows(report / 'runs.csv')
     assert runs[0] == first[0] and [run['seed'] for run in runs] == [0, 1]
@@ -253,7 +254,7 @@ def stored_runs(folder: Path, jobs: list[Job], machine: str = 'A', seconds: floa
         }
         curve = [{'env_steps': 200, 'success': '0.5'}, {'env_steps': 400, 'success': '0.5'}]
         stored.put(job, run, [dict(point) for point in curve], 'a command')
-    stored.write(STUDIES['returns'])
+    write_files(stored.files(STUDIES['returns']))
 
 
 def jobs_of(study: str, *more: str, task: str = 'FetchPush') -> list[Job]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -29,6 +27,7 @@ from policy_node.training.learning.run import lock_run
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.trainer import Trainer
 from policy_node.training.train_her import main
+from support.full_disk import files_at_most
 
 torch.set_num_threads(1)
 
@@ -307,17 +306,6 @@ def test_a_damaged_state_is_one_line(
     assert main(['--resume', str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1
-
-
-@contextlib.contextmanager
-def files_at_most(size: int) -> Iterator[None]:
-    """Lets every write beyond `size` bytes of a file fail, as on a full disk."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_a_full_disk_leaves_no_partial_file_and_the_checkpoint_before(

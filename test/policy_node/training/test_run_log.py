@@ -41,7 +41,7 @@ def test_a_run_from_before_a_column_was_added_goes_on(tmp_path: Path) -> None:
     assert rows[2]['env_steps'] == 300 and rows[2]['eval_stay'] == 0.9
 
 
-@pytest.mark.parametrize('cut', ['1,200,1', '1,200,1,,0.5,-'])
+@pytest.mark.parametrize('cut', ['1,200,1', '1,200,1,,0.5,-', '1,inf,1,,0.5', '1,200,1,,nan'])
 def test_a_line_that_a_killed_run_cut_short_is_dropped(tmp_path: Path, cut: str) -> None:
     log = RunLog(tmp_path, 1000, 0)
     log.write(row(100, 0.5))

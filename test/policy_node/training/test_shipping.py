@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import RunLog
@@ -18,6 +19,9 @@ torch.set_num_threads(1)
 
 SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
 SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'total_steps': 800, 'evaluate_every': 400}
+
+
+TEXT = '{"success_gymnasium": 0.5, "mean_return": -1, "episodes": "9"}'
 
 
 @pytest.fixture
@@ -53,7 +57,9 @@ def test_what_was_done_is_said_and_a_few_episodes_replace_no_longer_evaluation(
     assert {file.name: file.read_bytes() for file in actors.iterdir()} == before
 
 
-@pytest.mark.parametrize('content', ['{', '[]', '{"episodes": 1}', '{"success_gymnasium": "x"}'])
+@pytest.mark.parametrize(
+    'content', ['{', '[]', '{"episodes": 1}', '{"success_gymnasium": "x"}', TEXT]
+)
 def test_an_evaluation_that_is_none_is_one_line(
     run: Path, tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -84,3 +90,13 @@ def test_json_and_actor_are_of_one_run(run: Path, tmp_path: Path) -> None:
     (run / 'progress.csv').write_text('env_steps,updates\n400,4\n')
     assert len(rows) > 1 and ship(run, tmp_path / 'actors', 2) == 0
     assert json.loads((tmp_path / 'actors' / 'FetchReach.json').read_text())['episodes'] == 2
+
+
+def test_an_actor_that_says_nothing_of_its_recipe_is_shipped_whole(
+    run: Path, tmp_path: Path
+) -> None:
+    tensors, metadata = read_tensors(run / 'best.safetensors')
+    write_tensors(run / 'best.safetensors', tensors, metadata | {'config': '{}'})
+    assert ship(run, tmp_path / 'actors', 2) == 0
+    suffixes = {file.name.partition('.')[2] for file in (tmp_path / 'actors').iterdir()}
+    assert suffixes == {'safetensors', 'training.safetensors', 'json', 'png'}
