@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
+from numbers import Real
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -286,6 +287,8 @@ def substeps_per_tick(control_hz: float, timestep: float = PHYSICS_TIMESTEP) -> 
         ValueError: If the period is not a whole number of substeps; the message names the nearest
             valid rates.
     """
+    if not isinstance(control_hz, Real):
+        raise ValueError(f'control_hz {control_hz!r} is no number; allowed: 12.5 ... 500')
     smallest, largest = 1, 40
     period = 1.0 / (control_hz * timestep) if control_hz > 0 else float('inf')
     substeps = round(period) if period < 1e9 else 10**9

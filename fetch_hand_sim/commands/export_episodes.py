@@ -15,8 +15,8 @@ from fetch_hand_sim.episode_log import (
     EpisodeArrays,
     EpisodeReadError,
     expand_episodes,
-    load_episodes,
 )
+from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.episodes.export import export_minari, export_parquet
 from msgs_spec.command_line import (
     EXIT_FAILURE,
@@ -59,7 +59,10 @@ def _run(options: argparse.Namespace) -> int:
         paths = expand_episodes(options.path)
         with progress('episodes', len(paths)) as advance:
             for path in paths:
-                episodes += load_episodes(path, on_skip=skipped.append)
+                try:
+                    episodes.append(load_episode(path))
+                except EpisodeReadError as error:
+                    skipped.append(error)
                 advance(1)
     except EpisodeReadError as error:
         raise UsageError(str(error)) from None

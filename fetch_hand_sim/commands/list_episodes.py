@@ -41,6 +41,7 @@ _COLUMNS = ('episode', 'task', 'seed', 'steps', 'return', 'success', 'seconds', 
 _NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB'})
 # A pipe has no width to fit into; this one fits every column.
 _PIPE_WIDTH = 200
+_LONGEST_CELL = 60
 
 
 def read_summaries(directory: Path) -> tuple[list[EpisodeSummary], list[EpisodeReadError]]:
@@ -64,7 +65,7 @@ def make_table(episodes: Sequence[EpisodeSummary]) -> Table:
     for name in _COLUMNS:
         table.add_column(name, justify='right' if name in _NUMBERS else 'left', no_wrap=True)
     for episode in episodes:
-        table.add_row(*(Text(printable(cell)) for cell in _cells(episode)))
+        table.add_row(*(Text(_shown(cell)) for cell in _cells(episode)))
     return table
 
 
@@ -74,7 +75,7 @@ def _cells(episode: EpisodeSummary) -> list[str]:
     return [
         episode.path.stem.removesuffix('_0'),
         metadata.get('task', '?'),
-        metadata.get('seed', '?'),
+        _known(integer_or_none(metadata, 'seed')),
         _known(outcome.steps),
         _known(outcome.episode_return),
         success[outcome.is_success],
@@ -84,8 +85,14 @@ def _cells(episode: EpisodeSummary) -> list[str]:
     ]
 
 
-def _known(number: float | None) -> str:
-    return '?' if number is None else f'{number:g}'
+def _known(number: int | float | None) -> str:
+    return '?' if number is None else f'{number:g}' if isinstance(number, float) else str(number)
+
+
+def _shown(cell: str) -> str:
+    """What a file says, so that it leaves room for what others say."""
+    text = printable(cell)
+    return text if len(text) <= _LONGEST_CELL else f'{text[: _LONGEST_CELL - 3]}...'
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -53,9 +53,12 @@ def _run(options: argparse.Namespace) -> int:
     failures = 0
     with progress('unfinished episodes', len(leftovers)) as advance:
         for leftover in leftovers:
-            say(str(leftover))
-            if not options.dry_run:
-                failures += not _recover(leftover.path)
+            if leftover.problem:
+                complain(_NAME, leftover)
+                failures += 1
+            else:
+                say(str(leftover))
+                failures += not (options.dry_run or _recover(leftover.path))
             advance(1)
     if not leftovers:
         say(f'{options.directory}: no unfinished episode')

@@ -214,10 +214,11 @@ def _result_difference(
 ) -> Difference | None:
     """Whether the record `episode_result` says something else than the last tick."""
     expected = episode_result(status)
-    # All ticks of an episode may be there although its end was cut off.
     expected['complete'] = 'false'
     if runner.is_between_episodes:
-        del expected['complete']
+        # All ticks of an episode may be there although its end was cut off.
+        recorded = episode.result.get('complete')
+        expected['complete'] = 'false' if recorded == 'false' else 'true'
     for name, simulated in expected.items():
         recorded = episode.result.get(name, simulated)
         if recorded != simulated:

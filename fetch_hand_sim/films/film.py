@@ -40,6 +40,8 @@ def check_kind(path: Path) -> None:
     kind = path.suffix.lower()
     if kind not in (*MOVING, *STILL):
         raise UsageError(f'--out {path}; allowed: {", ".join((*MOVING, *STILL))}')
+    if path.is_dir():
+        raise UsageError(f'--out {path} is a directory; a file is allowed')
     if not path.absolute().parent.is_dir():
         raise UsageError(f'--out {path}: {path.absolute().parent} is no directory')
     if kind == '.mp4':

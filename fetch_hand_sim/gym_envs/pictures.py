@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.arguments import require_whole
 from fetch_hand_sim.simulation.rendering import (
     HEIGHT,
     WIDTH,
     SceneRenderer,
     make_camera,
     make_options,
+    set_attributes,
     simulation_frame,
 )
 from fetch_hand_sim.simulation.scene import Frame, Scene
@@ -48,6 +50,7 @@ class Pictures:
         camera: Mapping[str, Any] | None = None,
     ) -> None:
         for name, side in (('width', width), ('height', height)):
+            require_whole(name, side)
             if side < 1:
                 raise ValueError(f'{name} must be at least 1 pixel, not {side}')
         known = [name for name in dir(mujoco.MjvCamera) if not name.startswith('_')]
@@ -57,6 +60,7 @@ class Pictures:
                 raise ValueError(
                     f'default_camera_config: {name!r} is not known; allowed: {allowed}'
                 )
+        set_attributes(mujoco.MjvCamera(), camera or {})
         self._simulation = simulation
         self._size = (width, height)
         self._camera = dict(camera or {})

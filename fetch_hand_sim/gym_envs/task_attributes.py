@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -87,7 +88,7 @@ class TaskAttributes:
             self.rotation_threshold = rotation
 
     def _set_threshold(self, name: str, value: float) -> None:
-        if not (np.isfinite(value) and value >= 0.0):
+        if not (isinstance(value, Real) and np.isfinite(value) and value >= 0.0):
             raise ValueError(f'{name} must be a number of at least 0, not {value!r}')
         metric = self.simulation.metric
         changed: dict[str, Any] = {name: float(value)}

@@ -17,6 +17,7 @@ from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures, check_rende
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
 from fetch_hand_sim.simulation import Observation, Simulation
+from fetch_hand_sim.simulation.arguments import require_whole
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
@@ -80,8 +81,10 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         distance_threshold: float | None = None,
         rotation_threshold: float | None = None,
     ) -> None:
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f'max_episode_steps must be at least 1, not {max_episode_steps}')
+        if max_episode_steps is not None:
+            require_whole('max_episode_steps', max_episode_steps)
+            if max_episode_steps < 1:
+                raise ValueError(f'max_episode_steps must be at least 1, not {max_episode_steps}')
         check_render_mode(render_mode, _RENDER_MODES)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.simulation = Simulation(

@@ -110,11 +110,7 @@ def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.Mj
     camera = mujoco.MjvCamera()
     if name is None or isinstance(name, Mapping):
         scene.view.apply(camera)
-        for attribute, value in (name or {}).items():
-            if np.ndim(value):
-                getattr(camera, attribute)[:] = value
-            else:
-                setattr(camera, attribute, value)
+        set_attributes(camera, name or {})
         return camera
     names = [scene.model.camera(index).name for index in range(scene.model.ncam)]
     if name not in names:
@@ -122,6 +118,25 @@ def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.Mj
     camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
     camera.fixedcamid = names.index(name)
     return camera
+
+
+def set_attributes(camera: mujoco.MjvCamera, attributes: Mapping[str, Any]) -> None:
+    """Sets attributes of a camera that it has.
+
+    Raises:
+        ValueError: If a value is of another type or length.
+    """
+    for name, value in attributes.items():
+        try:
+            if np.ndim(value):
+                getattr(camera, name)[:] = value
+            else:
+                setattr(camera, name, value)
+        except (TypeError, ValueError):
+            allowed = f'as {getattr(camera, name)!r}'
+            raise ValueError(
+                f'default_camera_config: {name} {value!r}; allowed: {allowed}'
+            ) from None
 
 
 def simulation_frame(simulation: Simulation, index: int = 0) -> Frame:

@@ -20,6 +20,7 @@ from mujoco import mjtWarning
 from mujoco.batch import SimulationError
 from numpy.typing import ArrayLike, NDArray
 
+from fetch_hand_sim.simulation.arguments import require_whole
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.actions import command_from_action
@@ -106,6 +107,8 @@ class Simulation:
         keeps_data: bool = False,
         timing: Timing = 'seconds',
     ) -> None:
+        require_whole('num_envs', num_envs)
+        require_whole('num_threads', num_threads)
         if num_envs < 1:
             raise ValueError(f'num_envs must be at least 1, not {num_envs}')
         if timing not in TIMINGS:

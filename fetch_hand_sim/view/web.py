@@ -209,6 +209,7 @@ def is_no_farewell(record: logging.LogRecord) -> bool:
 
 
 def _bind(host: str, port: int) -> socket.socket:
+    _require_own(host)
     try:
         listening: socket.socket = _bind_public_socket(host, port)
         # At once, so that nobody else can take the port before the server is up.
@@ -217,6 +218,22 @@ def _bind(host: str, port: int) -> socket.socket:
         line = str(error).split('.')[0]
         raise CannotServe(f'cannot listen on {host} port {port or "8080 ..."}: {line}') from None
     return listening
+
+
+def _require_own(host: str) -> None:
+    """Refuses what is no address of this machine; the viewer's helper calls every failure a port.
+
+    Raises:
+        CannotServe: If nothing can be bound to it.
+    """
+    try:
+        family, kind, _, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(place)
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, 'strerror', None) or error
+        line = f'cannot listen on {host}: no address of this machine ({why})'
+        raise CannotServe(line) from None
 
 
 def _check_guarded(address: Address) -> None:

@@ -79,6 +79,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    last = options.first_seed + options.episodes - 1
+    if last > LARGEST_SEED:
+        raise UsageError(f'the last seed would be {last}; allowed: 0 ... {LARGEST_SEED}')
     try:
         generator, simulation = make_generator(options)
     except ValueError as error:

@@ -306,3 +306,32 @@ def test_a_dataset_keeps_the_name_it_is_given(finished, tmp_path, name, id, monk
     assert f'Minari dataset FetchReach/{id} in' in capsys.readouterr().out
     dataset = minari.load_dataset(f'FetchReach/{id}')
     assert dataset.spec.dataset_id == f'FetchReach/{id}' and dataset.total_steps == 50
+
+
+def test_an_export_has_the_episodes_that_a_list_has(finished, tmp_path, capsys):
+    """A link that leads nowhere and a folder of several files are named; nothing comes twice."""
+    directory = tmp_path / 'episodes'
+    shutil.copytree(finished, directory / NAME)
+    (directory / 'dangling.mcap').symlink_to(tmp_path / 'nothing')
+    (directory / 'several').mkdir()
+    for name in ('a.mcap', 'b.mcap'):
+        shutil.copy(finished / f'{NAME}_0.mcap', directory / 'several' / name)
+    assert list_episodes.main([str(directory)]) == 1
+    listed = capsys.readouterr()
+    output = ['--to', 'parquet', '--output', str(tmp_path / 'data')]
+    assert export_episodes.main([str(directory), *output]) == 1
+    exported = capsys.readouterr()
+    assert '1 episodes' in listed.out and '1 episodes of FetchReach' in exported.out
+    for text in (listed.err, exported.err):
+        assert 'dangling.mcap' in text and 'several holds 2 MCAP files' in text
+        assert_one_line_each(text, 2)
+
+
+def test_a_dry_run_says_by_its_code_what_cannot_be_recovered(directory, capsys):
+    leave(directory, 'strange', b'').joinpath('notes.txt').write_text('hi')
+    for options in (['--dry-run'], []):
+        assert recover_episodes.main([str(directory), *options]) == 1
+        output = capsys.readouterr()
+        assert 'no episode of a robot' in output.err and 'strange' in output.err
+        assert_one_line_each(output.err, 1)
+        assert 'strange' not in output.out

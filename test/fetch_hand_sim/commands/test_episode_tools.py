@@ -19,6 +19,7 @@ from fetch_hand_sim.episode_log import (
     read_summary,
 )
 from fetch_hand_sim.episode_log.ticks import split_ticks
+from fetch_hand_sim.episodes import checker
 from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
@@ -193,6 +194,16 @@ def test_check_notices_a_result_that_is_not_true(reach, tmp_path):
     path = rewrite(min(reach.iterdir()), tmp_path, result={'return': '0.0'})
     difference = EpisodeChecker().check(path).difference
     assert difference is not None and difference.field == 'episode_result return'
+
+
+@pytest.mark.parametrize('complete', ['maybe', 'True', ''])
+def test_check_notices_an_end_that_is_neither(reach, complete, monkeypatch):
+    episode = read_episode(min(reach.iterdir()))
+    # What this project writes says one or the other.
+    said = dataclasses.replace(episode, result={**episode.result, 'complete': complete})
+    monkeypatch.setattr(checker, 'read_episode', lambda path: said)
+    difference = EpisodeChecker().check(episode.path).difference
+    assert difference is not None and difference.field == 'episode_result complete'
 
 
 def test_check_accepts_an_interrupted_episode(reach, tmp_path):
@@ -398,7 +409,7 @@ def test_list_names_and_skips_what_it_cannot_read(reach, tmp_path, capsys):
 
 
 def test_list_shows_no_control_characters_of_a_file(tmp_path, capsys):
-    writer = EpisodeWriter(tmp_path, 'x', {'task': '\x1b]0;owned\x07', 'seed': '[red]1[/red]'})
+    writer = EpisodeWriter(tmp_path, 'x', {'task': '\x1b]0;owned\x07[red]1[/red]', 'seed': '\x1b'})
     spec = topic(task_spec('FetchReach'), '/clock')
     writer.write(spec, TopicCodec(spec).encode(0, []), 1)
     writer.finish({'success': '\x9b', 'return': 'nan', 'steps': '\n'})
@@ -406,6 +417,19 @@ def test_list_shows_no_control_characters_of_a_file(tmp_path, capsys):
     output = capsys.readouterr().out
     assert '[red]1[/red]' in output
     assert output.isascii() and all(c.isprintable() or c == '\n' for c in output)
+
+
+def test_what_one_file_says_at_length_leaves_room_for_the_others(reach, tmp_path, capsys):
+    directory = copy_of(reach, tmp_path)
+    metadata = read_episode(min(reach.iterdir())).metadata
+    writer = EpisodeWriter(directory, 'x', {**metadata, 'seed': '1' * 400, 'task': 'y' * 400})
+    spec = topic(task_spec('FetchReach'), '/clock')
+    writer.write(spec, TopicCodec(spec).encode(0, []), 1)
+    writer.finish({'complete': 'false', 'reason': 'z' * 400})
+    assert list_episodes.main([str(directory)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    names = {path.name for path in reach.iterdir()}
+    assert names <= {line.split()[0] for line in lines}
 
 
 def test_usage_errors_exit_with_2(tmp_path, capsys):

@@ -111,6 +111,9 @@ def check_path(text):
 def test_what_cannot_be_written_is_said_before_drawing(out, tmp_path):
     with pytest.raises(UsageError):
         check_kind(tmp_path / out)
+    (tmp_path / 'film.webp').mkdir()
+    with pytest.raises(UsageError, match=r'film\.webp is a directory'):
+        check_kind(tmp_path / 'film.webp')
 
 
 def test_tiles_lie_in_rows():

@@ -172,6 +172,12 @@ def test_importing_the_package_registers_without_mujoco():
     [
         ({'render_mode': 'ansi'}, "'ansi' is not known; allowed: None, human, rgb_array, depth_"),
         ({'height': 0}, 'height must be at least 1 pixel, not 0'),
+        ({'width': 1.5}, 'width must be a whole number, not 1.5'),
+        ({'width': 'a'}, "width must be a whole number, not 'a'"),
+        ({'default_camera_config': {'distance': 'a'}}, r"distance 'a'; allowed: as \d"),
+        ({'default_camera_config': {'lookat': [1, 2]}}, r'lookat \[1, 2\]; allowed: as array'),
+        ({'distance_threshold': 'a'}, "must be a number of at least 0, not 'a'"),
+        ({'control_hz': '25'}, "control_hz '25' is no number"),
         ({'default_camera_config': {'zoom': 2}}, "'zoom' is not known; allowed: azimuth,"),
         ({'distance_threshold': float('nan')}, 'must be a number of at least 0, not nan'),
     ],

@@ -263,6 +263,9 @@ def test_an_episode_has_at_least_one_step():
             "'Never' is not known; allowed: NextStep, SameStep, D",
         ),
         ({'render_mode': 'human'}, "'human' is not known; allowed: None, rgb_array, depth_array"),
+        ({'max_episode_steps': 1.5}, 'max_episode_steps must be a whole number, not 1.5'),
+        ({'num_threads': 1.5}, 'num_threads must be a whole number, not 1.5'),
+        ({'num_threads': True}, 'num_threads must be a whole number, not True'),
         ({'distance_threshold': -1}, 'distance_threshold must be a number of at least 0, not -1'),
     ],
 )

@@ -194,5 +194,5 @@ def test_a_taken_port_is_one_line(address):
 
 
 def test_a_foreign_address_is_one_line():
-    with pytest.raises(CannotServe, match=r'cannot listen on 203\.0\.113\.1'):
+    with pytest.raises(CannotServe, match=r'cannot listen on 203\.0\.113\.1: no address of this'):
         open_page('203.0.113.1', 0, [Page()])
