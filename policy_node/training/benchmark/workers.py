@@ -104,15 +104,27 @@ def attempt(job: Job, command: str) -> Outcome:
                 return Outcome.STOPPED
             if not job.is_trained:
                 raise CommandError(f'it ended before its steps were done: {ending.reason}')
-        if job.final_episodes:
-            measure_final(job.config, job.folder, job.final_episodes)
+        _measure(job)
     except RunTakenError:
         print(f'{job.name} is being run by another process', flush=True)
         return Outcome.TAKEN
-    except (CommandError, ValueError, OSError) as error:
+    except CommandError as error:
         complain('benchmark', f'{job.name}: {error}')
         return Outcome.FAILED
     return Outcome.FINISHED
+
+
+def _measure(job: Job) -> None:
+    """Measures the end of a job, where that is asked for.
+
+    Raises:
+        CommandError: If its actor is damaged, or there is no room for the result.
+    """
+    if job.final_episodes:
+        try:
+            measure_final(job.config, job.folder, job.final_episodes)
+        except (OSError, ValueError) as error:
+            raise CommandError(str(error)) from None
 
 
 class ThisProcess:
