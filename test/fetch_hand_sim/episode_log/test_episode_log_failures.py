@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -37,6 +36,7 @@ from fetch_hand_sim.episode_log import (
 from msgs_spec.schemas import deserialize
 from support import SUPPORT, script_environment
 from support.episode_recorder import Recorder
+from support.full_disk import files_at_most
 
 RECORDER_SCRIPT = SUPPORT / 'episode_recorder.py'
 NOBODY = 65534
@@ -58,17 +58,6 @@ def ticks(recorder):
 @pytest.fixture(scope='module')
 def finished(recorder, tmp_path_factory):
     return recorder.record(EpisodeDirectory(tmp_path_factory.mktemp('finished')))
-
-
-@contextmanager
-def file_size_limit(size):
-    """The operating system refuses to write files beyond `size` bytes (EFBIG)."""
-    old = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, old)
 
 
 def first_error(writer, recorder, ticks):
@@ -287,7 +276,7 @@ def test_a_recovery_that_fails_changes_nothing(killed, tmp_path):
     directory = tmp_path / 'copy'
     shutil.copytree(killed[0], directory)
     (leftover,) = find_leftovers(directory)
-    with file_size_limit(5000), pytest.raises(EpisodeLogError, match='File too large') as caught:
+    with files_at_most(5000), pytest.raises(EpisodeLogError, match='File too large') as caught:
         recover_episode(leftover.path)
     assert_one_line(caught.value)
     (file,) = leftover.path.iterdir()
@@ -300,7 +289,7 @@ def test_leftovers_of_a_directory_that_does_not_exist(tmp_path):
 
 def test_an_error_of_the_disk_is_raised_once_and_stops_the_log(tmp_path, recorder, ticks):
     writer = EpisodeWriter(tmp_path, 'episode', {}, settings=EAGER)
-    with file_size_limit(20_000):
+    with files_at_most(20_000):
         error, taken = first_error(writer, recorder, ticks)
         assert_one_line(error)
         assert '.episode.active/episode_0.mcap: File too large' in str(error)
@@ -318,14 +307,14 @@ def test_an_error_of_the_disk_is_raised_once_and_stops_the_log(tmp_path, recorde
 def test_an_error_at_the_end_never_shows_a_finished_episode(tmp_path, recorder, ticks):
     writer = EpisodeWriter(tmp_path, 'episode', {}, settings=LogSettings(flush_period_ns=10**12))
     recorder.write(writer, ticks)
-    with file_size_limit(4000), pytest.raises(EpisodeLogError, match='File too large') as caught:
+    with files_at_most(4000), pytest.raises(EpisodeLogError, match='File too large') as caught:
         writer.finish({'success': 'true'})
     assert_one_line(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ['.episode.active']
 
 
 def test_an_episode_that_cannot_be_begun_leaves_nothing(tmp_path, recorder):
-    with file_size_limit(100), pytest.raises(EpisodeLogError, match='File too large') as caught:
+    with files_at_most(100), pytest.raises(EpisodeLogError, match='File too large') as caught:
         EpisodeWriter(tmp_path, 'episode', recorder.metadata())
     assert_one_line(caught.value)
     assert list(tmp_path.iterdir()) == []
@@ -334,7 +323,7 @@ def test_an_episode_that_cannot_be_begun_leaves_nothing(tmp_path, recorder):
 def test_the_next_episode_is_logged_again(tmp_path, ticks):
     recorder, directory = Recorder('FetchReach'), EpisodeDirectory(tmp_path)
     writer = directory.begin('FetchReach', 0, {})
-    with file_size_limit(4000), pytest.raises(EpisodeLogError):
+    with files_at_most(4000), pytest.raises(EpisodeLogError):
         recorder.write(writer, ticks)
     assert recorder.record(directory).name == 'FetchReach_000001_seed0'
 
