@@ -42,13 +42,14 @@ from policy_node.policies.files import write_file
 from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.jobs import ARMS, Job
 from policy_node.training.benchmark.reporting import report, require_readable, ship_all
-from policy_node.training.benchmark.research import FINAL_EPISODES, STUDIES, Study, research_jobs
+from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.benchmark.shared_runs import (
     take_from_other_reports,
     take_from_other_studies,
 )
 from policy_node.training.benchmark.stored_runs import StoredRuns
 from policy_node.training.benchmark.studies import PAPER, best_jobs, paper_jobs, reduced_budget
+from policy_node.training.benchmark.study import FINAL_EPISODES, Study, research_jobs
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
 from policy_node.training.learning.config_rules import FROM_NOTHING
 from policy_node.training.learning.config_values import parse_assignment

@@ -9,10 +9,10 @@ from msgs_spec.command_line import CommandError, complain
 from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import curve_of, measure_run
-from policy_node.training.benchmark.research import Study
 from policy_node.training.benchmark.research_report import write_study
 from policy_node.training.benchmark.results import write_report
 from policy_node.training.benchmark.stored_runs import RUNS
+from policy_node.training.benchmark.study import Study
 from policy_node.training.evaluation.shipping import ship
 from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE
 

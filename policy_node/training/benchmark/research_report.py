@@ -19,9 +19,9 @@ from policy_node.training.benchmark.measures import (
     area_in_time,
     sum_up,
 )
-from policy_node.training.benchmark.research import Study
 from policy_node.training.benchmark.results import Band, Curve, aggregate, draw, to_csv
 from policy_node.training.benchmark.stored_runs import RUN, Rows, StoredRuns, locked, run_of
+from policy_node.training.benchmark.study import Study
 
 # The page of a study keeps its table between these lines.
 BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'

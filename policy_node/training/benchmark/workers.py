@@ -97,6 +97,9 @@ def attempt(job: Job, command: str) -> Outcome:
         command: Command line of the benchmark, for the record.
     """
     try:
+        # By another process, since this one looked.
+        if job.is_finished:
+            return Outcome.FINISHED
         if not job.is_trained:
             resume = job.has_checkpoint
             ending = train_run(job.config, job.folder, resume=resume, command=command)

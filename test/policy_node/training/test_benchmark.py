@@ -23,9 +23,9 @@ from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark import published
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.jobs import ARMS
-from policy_node.training.benchmark.research import REPEATABLE
 from policy_node.training.benchmark.results import Curve, aggregate, read_curve, summarize
 from policy_node.training.benchmark.studies import paper_jobs, reduced_budget
+from policy_node.training.benchmark.study import REPEATABLE
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.run_folder import LOCK_FILE
 from policy_node.training.learning.run_log import COLUMNS

@@ -16,7 +16,7 @@ from policy_node.training.benchmark.command import jobs_from_arguments, main, pa
 from policy_node.training.benchmark.final import FINAL_FILE
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import are_apart, area_in_time, area_under, sum_up
-from policy_node.training.benchmark.research import STUDIES, Study, research_jobs
+from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.benchmark.research_report import BEGIN, END, format_table, sum_up_arms
 from policy_node.training.benchmark.results import Curve
 from policy_node.training.benchmark.shared_runs import (
@@ -25,6 +25,8 @@ from policy_node.training.benchmark.shared_runs import (
 )
 from policy_node.training.benchmark.stored_runs import StoredRuns, locked, own_fields, read_rows
 from policy_node.training.benchmark.studies import PAPER
+from policy_node.training.benchmark.study import Study, research_jobs
+from policy_node.training.benchmark.workers import Outcome, attempt
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.training_state import Counters, TrainingState, write_state
@@ -178,6 +180,8 @@ def test_a_run_that_was_measured_on_other_episodes_is_measured_again(tmp_path: P
     for episodes in (4, 50):
         (job.folder / FINAL_FILE).write_text(json.dumps({'success': 0.5, 'episodes': episodes}))
         assert job.is_finished is (episodes == 50)
+    # There is no actor here that could be measured once more.
+    assert attempt(job, '') is Outcome.FINISHED
 
 
 def test_a_run_that_another_study_has_is_taken_from_there(
