@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 BEAT = 0.1
 # Seconds for what was said last to be heard.
 _LAST_WORDS_SECONDS = 1.0
+# In which who is there is found for sure.
+DISCOVERY_TIME = 2.0
 # Enough for any node on a busy machine: 0.3 s are usual.
 _DESTROY_SECONDS = 10.0
 

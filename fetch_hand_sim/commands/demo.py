@@ -32,6 +32,7 @@ from msgs_spec.codecs import decode_status
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
+    CommandError,
     CommandParser,
     FormerOption,
     complain,
@@ -41,7 +42,14 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
-from msgs_spec.ros import StopSignals, destroy, rclpy_profile, ros_message_class
+from msgs_spec.ros import (
+    DISCOVERY_TIME,
+    StopSignals,
+    count_publishers,
+    destroy,
+    rclpy_profile,
+    ros_message_class,
+)
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
@@ -75,6 +83,15 @@ class Watcher:
             self._node.create_subscription(
                 ros_message_class(source.type_name), name, callback, rclpy_profile(source.qos)
             )
+
+    def others(self) -> str:
+        """Who would take part in what this demo starts, in words; '' for nobody."""
+        if count_publishers(self._node, 'episode_status'):
+            return 'a robot'
+        # One that waits for a robot publishes nothing yet.
+        if ('policy_node', '/') in self._node.get_node_names_and_namespaces():
+            return 'policy_node'
+        return 'who publishes commands' if count_publishers(self._node, 'commands') else ''
 
     def spin(self) -> None:
         """Serves callbacks for a moment."""
@@ -115,7 +132,10 @@ class Demo:
         commander, exit_code = self._policy(), EXIT_FAILURE
         watcher = Watcher(self._spec)
         try:
-            exit_code = self._play(commander, watcher, stop)
+            _require_to_be_alone(watcher, stop)
+            exit_code = EXIT_SUCCESS if stop else self._play(commander, watcher, stop)
+            if exit_code == EXIT_SUCCESS and stop.received:
+                exit_code = _SIGNALLED + signal.Signals[stop.received]
             return exit_code
         finally:
             watcher.close(exit_code)
@@ -125,7 +145,7 @@ class Demo:
         began = time.monotonic()
         # What the nodes print is shown if something goes wrong.
         with tempfile.NamedTemporaryFile('w+', prefix='demo_', suffix='.log') as logs:
-            policy = start_node('policy_node', [f'policy:={commander}'], logs)
+            policy = start_node('policy_node', {'policy': commander}, logs)
             sim = start_node('sim_node', self._sim_parameters(), logs)
             try:
                 self._watch(watcher, sim, policy, stop)
@@ -139,7 +159,7 @@ class Demo:
                 self._console.print(f'the nodes ended with exit codes {codes}')
                 return EXIT_FAILURE
         self._print_summary(time.monotonic() - began)
-        return _SIGNALLED + signal.Signals[stop.received] if stop.received else EXIT_SUCCESS
+        return EXIT_SUCCESS
 
     def _policy(self) -> str:
         if self._options.policy:
@@ -149,14 +169,14 @@ class Demo:
         self._console.print(f'No actor is shipped for {self._spec.name} yet: commands are random.')
         return 'random'
 
-    def _sim_parameters(self) -> list[str]:
-        return [
-            f'task:={self._spec.name}',
-            f'episodes:={self._options.episodes}',
-            f'seed:={self._options.seed}',
-            f'episode_dir:={self._directory}',
-            'wait_for_commands:=true',
-        ]
+    def _sim_parameters(self) -> dict[str, object]:
+        return {
+            'task': self._spec.name,
+            'episodes': self._options.episodes,
+            'seed': self._options.seed,
+            'episode_dir': str(self._directory),
+            'wait_for_commands': True,
+        }
 
     def _watch(
         self,
@@ -208,6 +228,22 @@ class Demo:
             highlight=False,
             soft_wrap=True,
         )
+
+
+def _require_to_be_alone(watcher: Watcher, stop: StopSignals) -> None:
+    """Refuses to start nodes beside those of others, who would play with them or against them.
+
+    Raises:
+        CommandError: If there are some.
+    """
+    end = time.monotonic() + DISCOVERY_TIME
+    while not stop and time.monotonic() < end:
+        watcher.spin()
+        if found := watcher.others():
+            raise CommandError(
+                f'{found} in / runs already and would take part: end that first, or choose '
+                'another ROS_DOMAIN_ID'
+            )
 
 
 def _row(episode: Episode, path: Path) -> str:

@@ -60,7 +60,7 @@ def _run(options: argparse.Namespace) -> int:
         with progress('episodes', len(paths)) as advance:
             for path in paths:
                 try:
-                    episodes.append(load_episode(path))
+                    episodes.append(_load(path, options.to))
                 except EpisodeReadError as error:
                     skipped.append(error)
                 advance(1)
@@ -79,6 +79,18 @@ def _run(options: argparse.Namespace) -> int:
         done = f'{len(group)} episodes of {task}: {_export(options, group)}'
         say(done)
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
+
+
+def _load(path: Path, to: str) -> EpisodeArrays:
+    """Reads an episode.
+
+    Raises:
+        EpisodeReadError: If it cannot be read, or a dataset of this kind cannot hold it.
+    """
+    episode = load_episode(path)
+    if to == 'minari' and len(episode) == 0:
+        raise EpisodeReadError(f'{path}: no step was taken, and Minari needs one')
+    return episode
 
 
 def _export(options: argparse.Namespace, episodes: Sequence[EpisodeArrays]) -> str:

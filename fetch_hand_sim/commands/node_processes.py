@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import IO
 
 from fetch_hand_sim.commands.executables import executable
@@ -15,7 +16,7 @@ _SHUTDOWN_TIMEOUT = 10.0
 
 
 def start_node(
-    name: str, parameters: Sequence[str], output: IO[str], namespace: str = ''
+    name: str, parameters: Mapping[str, object], output: IO[str], namespace: str = ''
 ) -> subprocess.Popen[str]:
     """Starts a node in a process group of its own: Ctrl-C reaches only who started it.
 
@@ -23,14 +24,17 @@ def start_node(
 
     Args:
         name: Of the executable.
-        parameters: `name:=value` each.
+        parameters: Values by name: text, numbers or truth values.
         output: Gets what the node prints.
         namespace: Of the node.
 
     Raises:
         UnknownExecutableError: If there is none of that name.
     """
-    words = [word for parameter in parameters for word in ('-p', parameter)]
+    words = []
+    for parameter, value in parameters.items():
+        # Read as YAML: text without quotes may be a date, a number or a comment.
+        words += ['-p', f'{parameter}:={json.dumps(value, ensure_ascii=False)}']
     if namespace:
         words += ['-r', f'__ns:=/{namespace.strip("/")}']
     return subprocess.Popen(

@@ -83,7 +83,7 @@ class SimNode(Node):
         self._said: set[str] = set()
         self._has_said_far_out = False
         self._commanders: list[str] = []
-        self._has_introduction = False
+        self._has_introduction = self._was_introduced = False
         self._beat_due = self._ticked_at = now
         self._report_due = now + REPORT_PERIOD
         self.add_on_set_parameters_callback(set_callback(SIM_NODE, makes_time=True))
@@ -221,6 +221,8 @@ class SimNode(Node):
         while not (stop or runner.is_done or (watch.commanders.names and watch.is_heard())):
             loop.wait(BEAT)
             watch.update()
+            if self._robot.is_reset_due:
+                self._robot.tick_when_due()
             self._beat_when_due()
         # Latched, so it comes a little after its publisher is seen; the log names who commands.
         end = time.monotonic() + _INTRODUCTION_TIME
@@ -280,6 +282,8 @@ class SimNode(Node):
             self._watch.has_newcomer = False
         self._publish(messages)
         self._latest_tick.take(tick, messages)
+        if tick.status.phase == 'reset':
+            self._forget_who_left()
         if self._recorder is not None:
             self._recorder.record(tick, messages)
         if tick.status.phase == 'finished':
@@ -310,6 +314,7 @@ class SimNode(Node):
 
     def _report(self, now: float) -> None:
         self._watch.update()
+        self._forget_who_left()
         surroundings = self._surroundings()
         report = self._health.report(surroundings, now)
         self._say_news(surroundings)
@@ -360,6 +365,13 @@ class SimNode(Node):
         self._has_introduction = True
         if self._recording_context is not None:
             self._recording_context.checkpoint_sha256 = checkpoint_sha256
+
+    def _forget_who_left(self) -> None:
+        """Whoever commands after an actor has left gives actions of its own."""
+        is_introduced = self._watch.will_introduce()
+        if self._was_introduced and not is_introduced:
+            self._on_commander(None)
+        self._was_introduced = is_introduced
 
     def _apply_changes(self, changes: list[Any]) -> None:
         for change in changes:

@@ -110,6 +110,11 @@ class Robot:
         return self.schedule.is_paused or waits
 
     @property
+    def is_reset_due(self) -> bool:
+        """Whether a tick of its own is due that begins the episode which was asked for."""
+        return self._reset_due is not None and self._reset_due <= self._clock()
+
+    @property
     def misses_commands(self) -> bool:
         """Whether a second or more has passed without a command that is due.
 

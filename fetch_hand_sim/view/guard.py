@@ -11,6 +11,7 @@ import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
+from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -18,7 +19,6 @@ from websockets.asyncio.server import serve
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-_LOOPBACK = frozenset({'localhost', '127.0.0.1', '::1'})
 _SOCKETS = frozenset({'/ui', '/state'})
 # Carries the token after the first request. Browsers give all ports of a host the same cookies, so
 # that the port is in the name.
@@ -38,7 +38,11 @@ _CLOSING_HEADERS = {
 
 def is_loopback(host: str) -> bool:
     """Whether a host name or address is this machine's own, reachable from nowhere else."""
-    return host in _LOOPBACK or host.startswith('127.')
+    try:
+        return host == 'localhost' or ip_address(host).is_loopback
+    except ValueError:
+        # A name, also one that begins like such an address.
+        return False
 
 
 def new_token() -> str:

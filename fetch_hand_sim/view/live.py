@@ -92,7 +92,11 @@ class LiveRobot:
             self._update_facts(notice='this page may only watch (--read-only)')
             return
         self._requests.perform(request)
-        if isinstance(request, SetGoal) and not self._facts.is_replay:
+        if (
+            isinstance(request, SetGoal)
+            and not self._facts.is_replay
+            and self._requests.fits(request)
+        ):
             self._show_goal(request.values)
 
     def _on_status(self, status: EpisodeStatus) -> None:

@@ -23,6 +23,7 @@ from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import announce, open_page
 from msgs_spec.ros import (
+    DISCOVERY_TIME,
     EventLoop,
     NodeFailure,
     StopSignals,
@@ -36,8 +37,6 @@ from msgs_spec.tasks import TaskSpec
 NODE_NAME = 'view'
 _FRAME_TIME = 1.0 / 60.0
 _SERVED_FIRST = 200
-# Seconds in which a robot that runs is found for sure.
-_DISCOVERY_TIME = 2.0
 # The page never takes a processor that the robot wants.
 _NICENESS = 10
 _LAST_LINES = 5
@@ -77,7 +76,7 @@ def _nodes(
     stop: StopSignals,
 ) -> Iterator[list[subprocess.Popen[str]]]:
     """Finds a robot, or starts one with its actor and ends both afterwards."""
-    patience = _DISCOVERY_TIME if options.task else options.wait
+    patience = DISCOVERY_TIME if options.task else options.wait
     _wait_for_robot(robot, loop, stop, patience)
     if robot.spec is not None:
         _check_is_wanted(options, robot.spec, node.get_namespace())
@@ -133,17 +132,17 @@ def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> list[subpro
     if not options.policy and not is_actor_shipped(options.task):
         print(f'No actor is shipped for {options.task} yet: commands are random.', flush=True)
         policy = 'random'
-    settings = [f'task:={options.task}', 'wait_for_commands:=true']
+    settings: dict[str, object] = {'task': options.task, 'wait_for_commands': True}
     if options.episode_dir:
-        settings.append(f'episode_dir:={Path(options.episode_dir)}')
+        settings['episode_dir'] = str(Path(options.episode_dir))
     # While a robot was looked for, everybody else was found too.
     if count_publishers(node, _CLOCK):
         print('/clock comes from another robot: this one does not publish it.', flush=True)
-        settings.append('publish_clock:=false')
+        settings['publish_clock'] = False
     # Of `--robot` or of `--ros-args`.
     namespace = node.get_namespace()
     return [
-        start_node('policy_node', [f'policy:={policy}'], log, namespace),
+        start_node('policy_node', {'policy': str(policy)}, log, namespace),
         start_node('sim_node', settings, log, namespace),
     ]
 

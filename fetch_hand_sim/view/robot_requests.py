@@ -84,9 +84,14 @@ class RobotRequests:
         return self._policy.is_there()
 
     def take_task(self, spec: TaskSpec) -> None:
-        """Takes the task of the robot; a goal of another one is forgotten."""
+        """Takes the task of the robot; what was asked of another one is forgotten."""
         if self._spec is not None and self._spec.name != spec.name:
-            self._kept_goal = None
+            self._kept_goal = self._asked_goal = None
+            # Goals of another task may have another type.
+            for name in list(self._publishers):
+                self._withdraw(name)
+            self._is_commanding = False
+            self._tell(is_commanding=False)
         self._spec = spec
 
     def take_replay(self, replay: Replay | None) -> None:
@@ -114,12 +119,19 @@ class RobotRequests:
     def perform(self, request: Request | LatestRequest) -> None:
         """Does what the page asks for; what only files understand is nothing to a robot."""
         action = self._actions.get(type(request))
-        if action is None or self._spec is None:
+        if action is None or self._spec is None or not self.fits(request):
             return
         if self._replay is not None and not isinstance(request, _OF_A_REPLAY):
             self._notice('a replay stops, goes on and changes its speed, no more')
             return
         action(request)
+
+    def fits(self, request: Request | LatestRequest) -> bool:
+        """Whether it is meant for the robot of now, not for one of another task before it."""
+        if self._spec is None or not isinstance(request, SetGoal | SetCommand):
+            return True
+        name = 'set_goal' if isinstance(request, SetGoal) else 'commands'
+        return request.values.size == topic(self._spec, name).size
 
     def shown_goal(self, goal: Array) -> Array:
         """The goal (goal size,) the page asked for a moment ago, or the robot's."""

@@ -11,6 +11,7 @@ import pytest
 
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import read_summary
+from support.graph import POLICY_NODE, SIM_NODE, finish, ros_args
 
 
 @pytest.mark.parametrize(
@@ -23,7 +24,10 @@ from fetch_hand_sim.episode_log import read_summary
 )
 def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, tmp_path):
     command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting']
-    demo = start_process(*command, '--episodes', '100', cwd=tmp_path)
+    # Which a parameter file would have as a number and a comment.
+    directory = '20261125 #1'
+    options = ('--episodes', '100', '--episode-dir', directory)
+    demo = start_process(*command, *options, cwd=tmp_path)
     assert demo.stdout.readline().split() == [
         'episode',
         'seed',
@@ -38,16 +42,40 @@ def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, 
     output, errors = demo.communicate(timeout=30)
     assert (demo.returncode, errors) == (code, 'demo: stopping\n')
     assert 'FetchReach: ' in output and 'episodes succeeded' in output
-    paths = sorted((tmp_path / 'episodes').iterdir())
+    paths = sorted((tmp_path / directory).iterdir())
     assert read_summary(paths[0]).is_complete
     # The robot had time to close what it was logging.
     assert not [path for path in paths if path.name.startswith('.')]
 
 
+@pytest.mark.parametrize(
+    ('node', 'who'),
+    [
+        ([*SIM_NODE, *ros_args(task='HandReach')], 'a robot'),
+        (POLICY_NODE, 'policy_node'),
+    ],
+)
+def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path):
+    """Robots of one name take each other's commands, and the log would name the actor for it."""
+    start_process(*node)
+    command = (sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting')
+    deadline = time.monotonic() + 60.0
+    code, errors = 0, ''
+    # Until the other one is loaded there is nobody.
+    while code != 1 and time.monotonic() < deadline:
+        demo = start_process(*command, '--episodes', '1', cwd=tmp_path)
+        code, errors = finish(demo, timeout=60.0)
+    assert code == 1
+    assert errors == (
+        f'demo: {who} in / runs already and would take part: end that first, or choose another '
+        'ROS_DOMAIN_ID\n'
+    )
+
+
 @pytest.mark.parametrize('seconds', [0.0, 0.1, 0.4])
 def test_a_node_that_is_still_loaded_ends_quietly(seconds):
     with tempfile.TemporaryFile('w+') as log:
-        process = start_node('sim_node', ['task:=FetchReach'], log)
+        process = start_node('sim_node', {'task': 'FetchReach'}, log)
         time.sleep(seconds)
         assert stop_node(process) == 0
         log.seek(0)

@@ -289,6 +289,24 @@ def test_pause_step_and_reset(start_process: Start) -> None:
         assert robot.statuses()[-1].tick == 0
 
 
+@pytest.mark.parametrize('mode', ['lockstep', pytest.param('realtime', marks=pytest.mark.release)])
+def test_a_robot_that_was_stepped_begins_an_episode_before_anybody_commands(
+    start_process: Start, mode: str
+) -> None:
+    start_process(*SIM_NODE, *ros_args(mode=mode, wait_for_commands=True))
+    with client(REACH) as robot:
+        robot.subscribe('episode_status')
+        assert robot.call(SetBool, 'sim_node/pause', data=True).success
+        for _ in range(3):
+            assert robot.call(Trigger, 'sim_node/step').success
+        answer = robot.call(Trigger, 'sim_node/reset')
+        assert 'a tick of its own starts episode 1' in answer.message
+        robot.spin_until(
+            lambda: (robot.statuses()[-1].episode, robot.statuses()[-1].phase) == (1, 'reset'),
+            'the next episode',
+        )
+
+
 def test_steps_may_be_all_there_is_of_a_run_that_waits_for_commands(start_process: Start) -> None:
     arguments = ros_args(episodes=1, mode='lockstep', wait_for_commands=True)
     sim = start_process(*SIM_NODE, *arguments)

@@ -40,6 +40,25 @@ def test_a_policy_that_is_killed_is_missed_in_real_time(start_process: Start) ->
     end(successor)
 
 
+def test_episodes_after_an_actor_has_left_do_not_bear_its_name(
+    start_process: Start, tmp_path: Path
+) -> None:
+    arguments = ros_args(wait_for_commands=True, real_time_factor=8.0, episode_dir=tmp_path)
+    sim = start_process(*SIM_NODE, *arguments)
+    policy = start_process(*POLICY_NODE)
+    with client(REACH) as robot:
+        robot.subscribe('episode_status')
+        robot.spin_until(lambda: robot.statuses()[-1:] and robot.statuses()[-1].episode > 1, 'two')
+        end(policy)
+        last = robot.statuses()[-1].episode
+        robot.spin_until(lambda: robot.statuses()[-1].episode > last + 2, 'others')
+    end(sim)
+    named = ['checkpoint_sha256' in each.metadata for each in episodes_in(tmp_path)]
+    assert named[0] and named == sorted(named, reverse=True)
+    # The one that ran was begun by the actor.
+    assert not any(named[last + 2 :])
+
+
 def test_a_robot_without_a_log_says_what_it_is_and_how_episodes_end(start_process: Start) -> None:
     arguments = ros_args(real_time_factor=0.0, episodes=2, seed=5, use_sim_time=True)
     sim = start_process(*SIM_NODE, *arguments, '-r', '__ns:=/arm1')

@@ -609,10 +609,11 @@ def test_another_robot_in_the_same_place_is_followed(
 
 
 def test_a_viewer_sees_another_robot_in_the_same_place(start_process: Start) -> None:
-    """Served as the page is."""
+    """Served as the page is; what it asks for goes to the robot of now, or nowhere."""
     rclpy.init()
     node = rclpy.create_node('viewer')
     viewer, loop = LiveRobot(node, may_command=True), EventLoop(node)
+    asked = np.zeros(0)
     try:
         for task, size in (('HandReach', 15), ('FetchPush', 3), ('HandManipulateEggFull', 7)):
             robot = start_process(*SIM_NODE, *ros_args(task=task))
@@ -624,7 +625,23 @@ def test_a_viewer_sees_another_robot_in_the_same_place(start_process: Start) -> 
                 picture = viewer.picture()
                 if picture is not None and picture.frame is not None:
                     goal = picture.frame.desired_goal
-            viewer.perform(SetGoal(goal))
+            # Made for the robot before.
+            viewer.perform(SetGoal(asked))
+            viewer.perform(SetCommand(np.zeros(1)))
+            asked = goal + np.eye(1, size)[0] * 0.01
+            # Shown at once, but this time it is said by the robot.
+            end_of_patience = time.monotonic() + 1.0
+            goal = np.zeros(size)
+            while time.monotonic() < end_of_patience or not np.allclose(goal, asked):
+                assert time.monotonic() < deadline, f'{task} does not get the goal'
+                viewer.perform(SetCommanding(True))
+                viewer.perform(SetCommand(np.zeros(task_spec(task).robot.action_size)))
+                if time.monotonic() < end_of_patience - 0.9:
+                    viewer.perform(SetGoal(asked))
+                loop.wait(0.05)
+                picture = viewer.picture()
+                if picture is not None and picture.frame is not None:
+                    goal = picture.frame.desired_goal
             end(robot)
     finally:
         loop.close()

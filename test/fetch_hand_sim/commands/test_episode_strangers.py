@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -306,6 +307,22 @@ def test_a_dataset_keeps_the_name_it_is_given(finished, tmp_path, name, id, monk
     assert f'Minari dataset FetchReach/{id} in' in capsys.readouterr().out
     dataset = minari.load_dataset(f'FetchReach/{id}')
     assert dataset.spec.dataset_id == f'FetchReach/{id}' and dataset.total_steps == 50
+
+
+def test_an_episode_without_a_step_is_left_out_of_a_dataset_by_name(tmp_path, capsys):
+    """Such as that of a robot in lockstep that nobody commanded."""
+    pytest.importorskip('minari')
+    recorder, episodes = Recorder('FetchReach'), EpisodeDirectory(tmp_path / 'episodes')
+    recorder.record(episodes)
+    writer = episodes.begin('FetchReach', recorder.runner.seed, recorder.metadata())
+    recorder.write(writer, [replace(recorder.ticks()[0], command=None)])
+    assert writer.finish({'success': 'false', 'return': '0.0'}) is not None
+    arguments = [str(episodes.path), '--to', 'minari', '--output', str(tmp_path / 'data')]
+    assert export_episodes.main(arguments) == 1
+    printed = capsys.readouterr()
+    assert '1 episodes of FetchReach: Minari dataset FetchReach/logged-v0' in printed.out
+    assert 'seed1: no step was taken, and Minari needs one' in printed.err
+    assert_one_line_each(printed.err, 1)
 
 
 def test_an_export_has_the_episodes_that_a_list_has(finished, tmp_path, capsys):

@@ -141,6 +141,8 @@ def test_the_address_is_one_by_which_others_come(monkeypatch, name, addresses, r
 
 def test_loopback_is_told_from_the_rest():
     assert is_loopback('127.0.0.1') and is_loopback('127.9.9.9') and is_loopback('localhost')
+    for name in ('127.evil.example', '127.0.0.1.evil.example', '127.1.evil', ''):
+        assert not is_loopback(name)
     assert not is_loopback('0.0.0.0') and not is_loopback('::') and not is_loopback('10.0.0.1')
 
 
