@@ -36,8 +36,8 @@ else:
 
 
 # Pixels, and the cameras of `fetch_env.py` and `hand_env.py`.
-_SIZE = 480
-_CAMERAS: dict[str, dict[str, Any]] = {
+SIZE = 480
+CAMERAS: dict[str, dict[str, Any]] = {
     'fetch': {
         'distance': 2.5,
         'azimuth': 132.0,
@@ -71,13 +71,13 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         task: str,
         reward_type: RewardType = 'sparse',
         render_mode: str | None = None,
-        width: int = _SIZE,
-        height: int = _SIZE,
+        width: int = SIZE,
+        height: int = SIZE,
         default_camera_config: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
         """Compiles the model; arguments as `FetchHandEnv` has them."""
-        self._camera = {**_CAMERAS[task_spec(task).robot.name], **(default_camera_config or {})}
+        self._camera = {**CAMERAS[task_spec(task).robot.name], **(default_camera_config or {})}
         self._mujoco_renderer: Any = None
         super().__init__(
             task,
@@ -106,6 +106,12 @@ class RobotEnv(FetchHandEnv, GoalEnv):
                 'your own (docs/own_task.md)'
             )
         super().__setattr__(name, value)
+
+    @property
+    def stated(self) -> frozenset[str]:
+        """Names of the attributes that are facts about the task."""
+        own: frozenset[str] = self.__dict__['_stated']
+        return own | {'has_object'}
 
     def _state(self, **facts: Any) -> None:
         """Makes facts about the task attributes that cannot be changed."""
@@ -261,7 +267,7 @@ class ManipulateEnv(RobotEnv):
         target_rotation: str | None = None,
         **arguments: Any,
     ) -> None:
-        task = _task_with_goals(task, target_position, target_rotation)
+        task = task_with_goals(task, target_position, target_rotation)
         super().__init__(task, **arguments)
         physics = self.simulation.task
         assert isinstance(physics, HandManipulateTask)
@@ -301,7 +307,7 @@ def _goal_kind(task: str) -> tuple[str, str]:
     return position, MANIPULATE_CONFIGS[task].target_rotation
 
 
-def _task_with_goals(task: str, position: str | None, rotation: str | None) -> str:
+def task_with_goals(task: str, position: str | None, rotation: str | None) -> str:
     """The task of the same object with other goals."""
     own = _goal_kind(task)
     wanted = (position or own[0], rotation or own[1])

@@ -15,6 +15,7 @@ from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS, task_spec
 NAMESPACE = 'fetch_hand_sim'
 VERSION = 0
 _ENV = 'fetch_hand_sim.gym_envs.env:FetchHandEnv'
+_VECTOR_ENV = 'fetch_hand_sim.gym_envs.vector_env:FetchHandVectorEnv'
 
 
 def environment_id(task: str) -> str:
@@ -26,15 +27,15 @@ def register_environments() -> None:
     """Registers what is not registered yet; imports nothing that is slow, such as MuJoCo."""
     for task in TASKS:
         if environment_id(task) not in gymnasium.registry:
-            _register(environment_id(task), _ENV, task=task)
+            _register(environment_id(task), _ENV, _VECTOR_ENV, task=task)
 
 
-def _register(name: str, entry_point: str, **arguments: str) -> None:
+def _register(name: str, entry_point: str, vector_entry_point: str, **arguments: str) -> None:
     """Registers an environment of a task, single and as a batch, with arguments for both."""
     gymnasium.register(
         name,
         entry_point=entry_point,
-        vector_entry_point='fetch_hand_sim.gym_envs.vector_env:FetchHandVectorEnv',
+        vector_entry_point=vector_entry_point,
         max_episode_steps=TASKS[arguments['task']].episode_ticks,
         kwargs=arguments,
     )
@@ -114,6 +115,9 @@ def _wrapper_of_batches(wrapper: Any) -> Any:
 
 
 _REFERENCE_ENV = 'fetch_hand_sim.gym_envs.gymnasium_robotics_env:make_env'
+_REFERENCE_VECTOR_ENV = (
+    'fetch_hand_sim.gym_envs.gymnasium_robotics_vector_env:GymnasiumRoboticsVectorEnv'
+)
 _WITHOUT_TOUCH = 'fetch_hand_sim.gym_envs.registration:refuse_touch_sensors'
 _TOUCH_SENSORS = ('_BooleanTouchSensors', '_ContinuousTouchSensors')
 
@@ -143,7 +147,8 @@ def register_gymnasium_robotics(override: bool = False) -> None:
         )
     for name, (task, reward_type) in ids.items():
         gymnasium.registry.pop(name, None)
-        _register(name, _REFERENCE_ENV, task=task, reward_type=reward_type)
+        both = _REFERENCE_ENV, _REFERENCE_VECTOR_ENV
+        _register(name, *both, task=task, reward_type=reward_type)
     for name, without in _touch_ids(ids).items():
         if name not in gymnasium.registry:
             kwargs = {'name': name, 'without': without}

@@ -59,11 +59,10 @@ class FetchHandVecEnv(VecEnv):
         """Steps all environments."""
         assert self._actions is not None, 'step_async comes before step_wait'
         observation, reward, _, truncated, info = self.batch.step(self._actions)
-        success, ended = info['is_success'].tolist(), truncated.tolist()
-        infos: list[dict[str, Any]] = [
-            {'is_success': reached, 'TimeLimit.truncated': end}
-            for reached, end in zip(success, ended, strict=True)
-        ]
+        columns = {**info, 'TimeLimit.truncated': truncated}
+        names = ('is_success', 'diverged', 'TimeLimit.truncated')
+        rows = zip(*(columns[name].tolist() for name in names), strict=True)
+        infos: list[dict[str, Any]] = [dict(zip(names, row, strict=True)) for row in rows]
         for index in np.flatnonzero(truncated).tolist():
             infos[index]['terminal_observation'] = info['final_obs'][index]
         return observation, reward.astype(np.float32), truncated, infos

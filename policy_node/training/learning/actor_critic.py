@@ -15,6 +15,9 @@ from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.subgoals import Proposer
 from policy_node.training.learning.transitions import Transitions
 
+# What the names of its parts begin with, in a file that has both levels.
+HIGH_LEVEL = 'high_'
+
 
 @dataclass(frozen=True, slots=True)
 class Losses:

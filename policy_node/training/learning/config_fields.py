@@ -54,7 +54,8 @@ class ConfigFields:
     strategy: str = 'future'
     """Hindsight goals: final, future, episode, random, futureactual, or none (no hindsight)."""
     hindsight_k: int = 4
-    """Relabelled goals for each goal kept, so k/(k+1) of a batch is relabelled."""
+    """Relabelled goals for each goal kept, so k/(k+1) of a batch is relabelled; of `ppo` also where
+    `goals` says which: there its shares count among each other."""
     goals: str = ''
     """Goal sources as a mixture instead of `strategy`: `future=.4,actual=.3,near=.1`; what is left
     of 1 keeps the goal. Also `next` (what this step achieved), `near` (one of the next

@@ -241,6 +241,8 @@ def _contradictions_of_values(config: ConfigFields) -> Iterator[str]:
     truncates = config.aggregate == 'truncated' and config.quantiles > 1
     if config.aggregate != 'mean' and config.critics == 1 and not truncates:
         yield f'aggregate {config.aggregate} needs critics above 1'
+    if config.temporal_smoothness > 0 and (config.n_step > 1 or config.longest_hold > 1):
+        yield 'temporal_smoothness is of one tick: it excludes n_step and longest_hold above 1'
     if config.quantiles > 1 and config.aggregate == 'min':
         yield 'quantiles above 1 exclude aggregate min; allowed: mean, truncated'
     if config.quantiles > 1 and (config.norm == 'batch' or config.advantage):
@@ -277,6 +279,8 @@ def _contradictions_of_conditions(config: ConfigFields) -> Iterator[str]:
         yield f'condition {config.condition} excludes goal_choice and importance'
     if config.condition == 'horizon' and config.n_step > 1:
         yield 'condition horizon excludes n_step above 1'
+    if config.condition == 'horizon' and config.drop_is_lost:
+        yield 'condition horizon excludes drop_is_lost: that is the loss of all steps to come'
     if config.widest_threshold != DEFAULTS['widest_threshold'] and config.condition != 'threshold':
         yield 'widest_threshold needs condition threshold'
     if config.condition == 'threshold' and config.reward_type == 'dense':

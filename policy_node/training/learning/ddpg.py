@@ -308,8 +308,11 @@ class DDPG(ActorCritic):
 
     def modules(self) -> dict[str, nn.Module]:
         """What a training state holds, by name."""
-        targets = {'target_actor': self.target_actor, 'target_critic': self.target_critic}
-        modules = {**super().modules(), **targets}
+        modules = super().modules()
+        # Without targets these are actor and critic themselves.
+        if self.config.target != 'none':
+            targets = {'target_actor': self.target_actor, 'target_critic': self.target_critic}
+            modules = {**modules, **targets}
         return modules if self._ratio is None else {**modules, 'ratio': self._ratio}
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:

@@ -17,15 +17,13 @@ from torch import nn
 from msgs_spec.tasks import GoalKind, task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
-from policy_node.training.learning.actor_critic import Losses
+from policy_node.training.learning.actor_critic import HIGH_LEVEL, Losses
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.ddpg import DDPG, Known
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.hindsight_actions import HierarchicalTransitions
 from policy_node.training.learning.subgoals import Proposer
 from policy_node.training.learning.transitions import Transitions
-
-_PREFIX = 'high_'
 
 
 class HighLevel(DDPG):
@@ -48,8 +46,9 @@ class HighLevel(DDPG):
         actor: Actor,
     ) -> None:
         shape = replace(shape, action_size=shape.goal_size)
-        # A penalty of large actions would prefer goals in the middle of all.
-        super().__init__(shape, replace(config, action_l2=0.0), device, workers)
+        # A penalty of large actions would prefer goals in the middle of all; subgoals may jump.
+        config = replace(config, action_l2=0.0, temporal_smoothness=0.0)
+        super().__init__(shape, config, device, workers)
         self.actor.observation_normalizer = actor.observation_normalizer
         self.actor.goal_normalizer = actor.goal_normalizer
         self._is_pose = task_spec(config.task).goal is GoalKind.POSE
@@ -112,10 +111,10 @@ class HierarchicalDDPG(DDPG):
 
     def modules(self) -> dict[str, nn.Module]:
         """What a training state holds, by name."""
-        high = {f'{_PREFIX}{name}': module for name, module in self.high.modules().items()}
+        high = {f'{HIGH_LEVEL}{name}': module for name, module in self.high.modules().items()}
         return {**super().modules(), **high}
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:
         """The optimisers, by name."""
-        high = {f'{_PREFIX}{name}': value for name, value in self.high.optimizers().items()}
+        high = {f'{HIGH_LEVEL}{name}': value for name, value in self.high.optimizers().items()}
         return {**super().optimizers(), **high}

@@ -147,8 +147,10 @@ def _displaced(starts: Starts, generator: np.random.Generator) -> Array:
     """
     episodes, count = starts.episodes, len(starts.row)
     row = generator.integers(len(episodes), size=count)
+    last = replace(starts, row=row).last
     span = generator.integers(1, min(_NEAR_TICKS, episodes.ticks) + 1, size=count)
-    tick = generator.integers(episodes.ticks + 1 - span)
+    span = np.minimum(span, last)
+    tick = generator.integers(last + 1 - span)
     achieved = episodes.achieved_goal
     here = achieved[starts.row, starts.tick]
     return displace(here, achieved[row, tick], achieved[row, tick + span])

@@ -213,7 +213,7 @@ def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
     first, *_ = parts = [part.with_critics(most) for part in parts]
     shared = set.intersection(*(set(part.tensors) for part in parts))
     tensors = {
-        name: torch.stack([part.tensors[name] for part in parts]).mean(dim=0)
+        name: _mean([part.tensors[name] for part in parts])
         for name in first.tensors
         if name in shared
     }
@@ -226,6 +226,12 @@ def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
         'mean_of': [part.origin for part in parts],
     }
     return replace(first, tensors=tensors, origin=_said_once(origin, set()))
+
+
+def _mean(tensors: list[Tensor]) -> Tensor:
+    """Their mean; of counts, such as how many batches were normalised, the first."""
+    first = tensors[0]
+    return torch.stack(tensors).mean(dim=0) if first.is_floating_point() else first
 
 
 def _said_once(origin: dict[str, Any], said: set[tuple[Any, ...]]) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 The policy is the actor with Gaussian noise of `noise_std`, clipped to the range of actions as the
 collector does it. The density of a clipped action is that of the noise beyond the limit (Fujita &
-Maeda 2018, arXiv 1802.07564), so what is learnt from is exactly what was done.
+Maeda 2018, arXiv 1802.07564), so what is learnt from is what was done, but for how far the
+normalisers move with the new episodes; from the fourth cycle on that is next to nothing.
 """
 
 from __future__ import annotations

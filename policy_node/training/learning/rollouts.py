@@ -49,7 +49,9 @@ class RolloutTransitions(Transitions):
     """Transitions of the newest rollouts.
 
     Attributes:
-        log_probability: (batch,) of the action, by the actor that collected it.
+        log_probability: (batch,) of the action, by the actor before the first update that draws
+            from the rollouts. Its networks collected it; its normalisers have learnt from the
+            episodes since, which matters in the first cycles of a run.
         advantage: (batch,) of the action over what that actor gets, of deviation 1.
         value_target: (batch,) what the state is worth.
         weight: (batch,) of the transition in all losses.

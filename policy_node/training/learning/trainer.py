@@ -201,7 +201,10 @@ class Trainer:
                 clock.write(self.counters)
                 self._check(losses)
                 knows = self.counters.updates > 0 or bool(self.config.init_from)
-                if collected.evaluation is None and knows and self._limit():
+                # What was evaluated while the learner learned was the actor before it.
+                is_older = self.config.overlap or collected.evaluation is None
+                if is_older and knows and self._limit():
+                    self._keep_best(collected)
                     # Noise and learning rate have fallen, and nothing else would measure it.
                     last = self._actor_to_evaluate()
                     collected = submit(self._evaluate, collected, last).result()

@@ -17,7 +17,7 @@ from policy_node.policies.tensor_file import (
     read_tensors,
     write_tensors,
 )
-from policy_node.training.learning.actor_critic import ActorCritic
+from policy_node.training.learning.actor_critic import HIGH_LEVEL, ActorCritic
 from policy_node.training.learning.normalizer import RunningStatistics
 from policy_node.training.learning.state_checks import (
     require_adam,
@@ -212,13 +212,17 @@ def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
 
 def _with_copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Targets and average where a file has none: they start at actor and critic."""
-    actor, critic = part_of(tensors, 'actor.network'), part_of(tensors, 'critic')
-    sources = {'target_actor': actor, 'average_actor': actor, 'target_critic': critic}
+    sources = {
+        'target_actor': 'actor.network',
+        'average_actor': 'actor.network',
+        'target_critic': 'critic',
+    }
     copies = {
-        f'{part}.{name}': value
+        f'{level}{part}.{name}': value
+        for level in ('', HIGH_LEVEL)
         for part, source in sources.items()
-        if not part_of(tensors, part)
-        for name, value in source.items()
+        if not part_of(tensors, f'{level}{part}')
+        for name, value in part_of(tensors, f'{level}{source}').items()
     }
     return tensors | copies
 

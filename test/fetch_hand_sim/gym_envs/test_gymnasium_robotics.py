@@ -170,6 +170,33 @@ def test_goals_of_the_same_object_can_be_asked_for(make):
         make('HandManipulateEgg-v1', target_rotation='parallel')
 
 
+def test_a_batch_takes_and_gives_what_single_environments_do(make):
+    make('FetchReach-v4')
+    modes = ('sync', 'vector_entry_point')
+    asked = {'target_position': 'ignore', 'target_rotation': 'z'}
+    for mode in modes:
+        name = 'HandManipulateBlock-v1'
+        hand = gymnasium.make_vec(name, num_envs=1, vectorization_mode=mode, **asked)
+        assert hand.get_attr('target_rotation') == ('z',)
+    with pytest.raises(TypeError, match='FetchReach takes neither'):
+        gymnasium.make_vec('FetchReach-v4', target_rotation='z')
+    pair = [gymnasium.make_vec('FetchReach-v4', num_envs=2, vectorization_mode=m) for m in modes]
+    for env in pair:
+        env.reset(seed=3, options={'of nobody': 1})
+    for _ in range(51):
+        first, second = (env.step(np.ones((2, 4), np.float32)) for env in pair)
+        for key, values in first[0].items():
+            assert values.tobytes() == second[0][key].tobytes()
+        assert [each.dtype for each in first[1:4]] == [each.dtype for each in second[1:4]]
+        for key in first[4].keys() & {'is_success', '_is_success'}:
+            assert first[4][key].dtype == second[4][key].dtype
+    for name in ('initial_gripper_xpos', 'n_substeps', 'has_object', 'initial_qpos', 'width'):
+        for one, other in zip(*(env.get_attr(name) for env in pair), strict=True):
+            assert type(one) is type(other) and np.array_equal(one, other), name
+    with pytest.raises(AttributeError):
+        pair[1].get_attr('nothing')
+
+
 def test_what_is_fixed_cannot_be_changed_in_vain(make):
     with pytest.raises(AttributeError, match='obj_range of FetchPush is fixed'):
         make('FetchPush-v4').obj_range = 0.3

@@ -131,6 +131,17 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ({'reward_grades': '1,2', 'condition': 'threshold'}, 'reward_grades needs'),
         ({'reward_apart': 0.5}, 'reward_apart needs reward_grades'),
         ({'reward_apart': 0.5, 'reward_grades': '1,2'}, 'and goals of position and rotation'),
+        ({'temporal_smoothness': 0.1, 'n_step': 3}, 'temporal_smoothness is of one tick'),
+        ({'temporal_smoothness': 0.1, 'longest_hold': 3}, 'temporal_smoothness is of one tick'),
+        (
+            {
+                'task': 'HandManipulatePenRotate',
+                'ticks_after_drop': 3,
+                'drop_is_lost': True,
+                'condition': 'horizon',
+            },
+            'condition horizon excludes drop_is_lost',
+        ),
         ({'noise_spread': 1.5}, 'noise_spread 1.5; allowed: 0 ... 1'),
         ({'hidden_sizes': (0,)}, 'hidden_sizes'),
     ],

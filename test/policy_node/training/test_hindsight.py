@@ -142,6 +142,20 @@ def test_displaced_goals_are_near_the_state_and_know_nothing_of_the_step(
     assert (drawn[0] == drawn[1]).all(axis=1).mean() > 1 - 1 / COUNT
 
 
+def test_no_displacement_is_taken_from_after_an_end(episodes: Episodes) -> None:
+    """Such as that of an object which falls."""
+    valid = np.array([1, 2, 3, 4, 5, TICKS])
+    achieved = episodes.achieved_goal.copy()
+    for row, last in enumerate(valid):
+        achieved[row, last + 1 :] += 1_000.0
+    cut = dataclasses.replace(episodes, achieved_goal=achieved)
+    row, tick = np.full(5_000, COUNT - 1), np.zeros(5_000, np.int64)
+    starts = Starts(cut, row, tick, valid)
+    source = np.zeros(len(row), np.int64)
+    goal = goals_of(starts, source, ['displaced'], np.random.default_rng(5))
+    assert set(goal[:, 1].tolist()) == {float(span) for span in range(1, TICKS + 1)}
+
+
 def test_displaced_poses_are_turned_as_another_episode_turned() -> None:
     angle = np.linspace(0.0, 1.0, TICKS + 1)
     axes = np.eye(3)[:COUNT]

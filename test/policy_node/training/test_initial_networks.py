@@ -22,6 +22,7 @@ from policy_node.training.learning.initial_networks import (
 )
 from policy_node.training.learning.origins import steps_behind
 from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.learning.run_folder import STATE_FILE
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.trainer import Trainer
 from policy_node.training.learning.training_state import part_of
@@ -241,6 +242,34 @@ def test_a_critic_with_another_norm_starts_from_nothing(tmp_path: Path, block_ru
     on = read_initial_networks(str(run))
     assert on.fitted(config).has_critic and not on.fitted(tiny(task)).has_critic
     assert not read_initial_networks(f'{block_run},{run}').has_critic
+
+
+def test_the_mean_of_batch_norms_counts_no_batches(tmp_path: Path) -> None:
+    task, runs = 'HandManipulateBlockRotateXYZ', [tmp_path / name for name in 'ab']
+    for seed, run in enumerate(runs):
+        given = [*SET, '--set=norm=batch', '--set=target=none', '--seed', str(seed)]
+        assert main(['--task', task, '--steps', '200', *given, '--output', str(run)]) == 0
+    parts = [read_initial_networks(str(run)) for run in runs]
+    networks = read_initial_networks(','.join(map(str, runs)))
+    counts = [name for name in networks.tensors if name.endswith('num_batches_tracked')]
+    assert counts
+    for name in counts:
+        assert torch.equal(networks.tensors[name], parts[0].tensors[name])
+
+
+def test_without_targets_the_networks_themselves_go_on(tmp_path: Path, block_run: Path) -> None:
+    """Not their slow copies, which a file of a run with targets has beside them."""
+    task = 'HandManipulateBlockRotateXYZ'
+    networks = read_initial_networks(str(block_run))
+    before = {part: part_of(networks.tensors, part) for part in ('actor', 'critic')}
+    slow = part_of(networks.tensors, 'target_critic')
+    assert not same(before['critic'], slow)
+    started = Trainer(tiny(task, target='none'), tmp_path, Workers(), init_from=networks).learner
+    again = Trainer(tiny(task, target='none'), tmp_path, Workers())
+    again.resume(block_run / STATE_FILE)
+    for learner in (started, again.learner):
+        assert same(learner.actor.state_dict(), before['actor'])
+        assert same(learner.critic.state_dict(), before['critic'])
 
 
 def test_a_run_may_have_wider_networks_than_it_starts_from(tmp_path: Path, block_run: Path) -> None:

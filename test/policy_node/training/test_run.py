@@ -17,7 +17,9 @@ import pytest
 import torch
 
 from policy_node.policies import checkpoint
+from policy_node.policies.actor import Actor
 from policy_node.policies.tensor_file import read_tensors, write_tensors
+from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.recipes import recipe_config
@@ -156,6 +158,27 @@ def test_the_actor_that_a_run_ends_with_is_evaluated(tmp_path: Path) -> None:
     evaluated = [row['env_steps'] for row in log.rows if row.get('eval_success') is not None]
     assert evaluated == [800, 2_000], 'after the first updates, and at the end'
     assert trainer.counters.best_success == max(row.get('eval_success') or 0 for row in log.rows)
+
+
+@pytest.mark.parametrize('overlap', [True, False])
+def test_the_last_evaluation_is_of_the_last_actor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overlap: bool
+) -> None:
+    """With `overlap` one that is due in the last cycle is made while the learner goes on."""
+    due = small(total_steps=2_000, evaluate_every=400, overlap=overlap)
+    trainer = Trainer(due, tmp_path, Workers())
+    evaluated = []
+    measure = trainer._evaluator.evaluate
+
+    def evaluate(actor: Actor, best_success: float) -> EpisodeOutcomes:
+        evaluated.append(actor)
+        return measure(actor, best_success)
+
+    monkeypatch.setattr(trainer._evaluator, 'evaluate', evaluate)
+    trainer.train()
+    last, now = evaluated[-1].state_dict(), trainer.learner.evaluation_actor().state_dict()
+    assert all(torch.equal(value, now[name]) for name, value in last.items())
+    assert len(evaluated) == 5
 
 
 def test_a_run_that_is_stopped_does_not_wait_for_an_evaluation(tmp_path: Path) -> None:
