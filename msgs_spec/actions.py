@@ -22,8 +22,8 @@ def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
     """Maps actions in [-1, 1] to commands, clipping what lies outside.
 
     Fetch: the action itself; its floating type is kept, because Gymnasium-Robotics scales it in
-    that type. Hand: absolute joint positions through the middle and half width of each control
-    range (`hand_env.py`).
+    that type. Hand, and every robot with other limits: through the middle and half width of each
+    range, for the hand absolute joint positions (`hand_env.py`).
 
     Args:
         robot: The robot.
@@ -33,7 +33,7 @@ def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
         (..., action_size) in command units.
     """
     clipped = np.asarray(np.clip(np.asarray(action), -1.0, 1.0))
-    if robot.has_gripper_command:
+    if _is_normalised(robot):
         return clipped
     lower, upper = command_limits(robot)
     command = (upper + lower) / 2.0 + clipped * ((upper - lower) / 2.0)
@@ -43,10 +43,15 @@ def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
 def action_from_command(robot: RobotSpec, command: ArrayLike) -> NDArray[np.float64]:
     """Maps commands (..., action_size) to the actions in [-1, 1] that give them, clipped."""
     values = np.asarray(command, dtype=np.float64)
-    if not robot.has_gripper_command:
+    if not _is_normalised(robot):
         lower, upper = command_limits(robot)
         values = (values - (upper + lower) / 2.0) / ((upper - lower) / 2.0)
     return np.clip(values, -1.0, 1.0)
+
+
+def _is_normalised(robot: RobotSpec) -> bool:
+    """Whether commands are actions."""
+    return all(part.lower == -1.0 and part.upper == 1.0 for part in robot.command)
 
 
 def resting_command(robot: RobotSpec) -> NDArray[np.float64]:

@@ -52,7 +52,7 @@ from msgs_spec.ros import (
 )
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import topic
+from msgs_spec.topics import topic, topics
 from msgs_spec.transport import keep_discovery_local
 
 _NAME = 'demo'
@@ -75,6 +75,7 @@ class Watcher:
 
         self.status: EpisodeStatus | None = None
         self.ticks = 0
+        self._spec = spec
         self._node = rclpy.create_node('demo')
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
@@ -89,9 +90,15 @@ class Watcher:
         if count_publishers(self._node, 'episode_status'):
             return 'a robot'
         # One that waits for a robot publishes nothing yet.
-        if ('policy_node', '/') in self._node.get_node_names_and_namespaces():
+        nodes = self._node.get_node_names_and_namespaces()
+        if ('policy_node', '/') in nodes:
             return 'policy_node'
-        return 'who publishes commands' if count_publishers(self._node, 'commands') else ''
+        # Its nodes are still to come.
+        if nodes.count(('demo', '/')) > 1:
+            return 'another demo'
+        commands = [each.name for each in topics(self._spec) if each.name.endswith('commands')]
+        is_commanded = any(count_publishers(self._node, name) for name in commands)
+        return 'who publishes commands' if is_commanded else ''
 
     def spin(self) -> None:
         """Serves callbacks for a moment."""

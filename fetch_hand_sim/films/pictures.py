@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ _GAP = 2
 # Around a tile whose episode has reached its goal.
 _REACHED = np.array([40, 170, 70], dtype=np.uint8)
 _FRAME = 3
+# Seconds, and sheets, by which stamps may be early.
+_SAME_TIME = 1e-6
 
 
 class Studio:
@@ -87,23 +89,34 @@ def tile(pictures: Sequence[Picture], columns: int) -> Picture:
     return sheet
 
 
-def grid(studio: Studio, recordings: Sequence[Recording], columns: int) -> Iterator[Picture]:
-    """Yields all recordings side by side; the shorter ones wait at their last frame.
+def grid(
+    studio: Studio, recordings: Sequence[Recording], columns: int, hz: float
+) -> Iterator[Picture]:
+    """Yields all recordings side by side at the same time; those that are over wait at their end.
 
     A green frame says which of them are at their goal.
+
+    Args:
+        studio: Draws them.
+        recordings: Of any rates.
+        columns: How many are beside each other.
+        hz: Sheets per second of the episodes.
     """
-    last: list[Picture] = []
-    for pictures in zip_longest(*(_framed(studio, recording) for recording in recordings)):
-        last = [
-            before if picture is None else picture
-            for picture, before in zip(pictures, last or pictures, strict=True)
-        ]
-        yield tile(last, columns)
+    shown = [-1] * len(recordings)
+    pictures: list[Picture] = [np.zeros(0, np.uint8)] * len(recordings)
+    for count in range(sheets(recordings, hz)):
+        for number, recording in enumerate(recordings):
+            at = count / hz + _SAME_TIME
+            index = int(np.searchsorted(recording.times, at, side='right')) - 1
+            if index != shown[number]:
+                shown[number], pictures[number] = index, framed(studio, recording, index)
+        yield tile(pictures, columns)
 
 
-def _framed(studio: Studio, recording: Recording) -> Iterator[Picture]:
-    for index in range(len(recording.frames)):
-        yield framed(studio, recording, index)
+def sheets(recordings: Sequence[Recording], hz: float) -> int:
+    """How many sheets `grid` yields: to the end of the longest recording."""
+    longest = max(float(recording.times[-1]) for recording in recordings)
+    return 1 + math.ceil(longest * hz - _SAME_TIME)
 
 
 def framed(studio: Studio, recording: Recording, index: int) -> Picture:

@@ -14,7 +14,7 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
 from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.tasks import GoalKind, TaskSpec
+from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
 
 
@@ -76,8 +76,6 @@ def load_recording(path: Path) -> Recording:
 def _object_poses(messages: MessageFile, arrays: EpisodeArrays, ticks: int) -> Array | None:
     if not arrays.spec.has_object:
         return None
-    if arrays.spec.goal is GoalKind.POSE:
-        return arrays.observations['achieved_goal']
     return _vectors(messages, arrays.record.task, 'object_pose', ticks)
 
 

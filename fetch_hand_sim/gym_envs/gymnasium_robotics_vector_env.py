@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.gym_envs.gymnasium_robotics_env import (
     CAMERAS,
@@ -74,8 +74,10 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
         """Starts episodes; options but `reset_mask` are ignored, as the reference does."""
-        known = {name: value for name, value in (options or {}).items() if name == 'reset_mask'}
-        return super().reset(seed=seed, options=known or None)
+        known = None
+        if isinstance(options, dict) and 'reset_mask' in options:
+            known = {'reset_mask': options['reset_mask']}
+        return super().reset(seed=seed, options=known)
 
     def step(
         self, actions: NDArray[np.float32]
@@ -86,6 +88,11 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
             if 'is_success' in each:
                 each['is_success'] = each['is_success'].astype(np.float32)
         return observation, reward, terminated, truncated, info
+
+    def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
+        """Reward of goals of any batch shape: float32 if sparse, a number for a single goal."""
+        reward = super().compute_reward(achieved_goal, goal, info)[()]
+        return reward.astype(np.float32) if self.reward_type == 'sparse' else reward
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """As `FetchHandVectorEnv`; also what is stated of the task, such as `initial_qpos`."""
@@ -99,4 +106,4 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
     @cached_property
     def _single(self) -> RobotEnv:
         """One of them, which knows what they have in common; made when somebody asks."""
-        return make_env(self.spec_of_task.name)
+        return make_env(self.spec_of_task.name, control_hz=self.simulation.control_hz)

@@ -139,7 +139,8 @@ class CommandBuffer:
         """Keeps the pose: the gripper stops and keeps its grip, joints keep their targets."""
         if not self._robot.has_gripper_command:
             return command
-        return np.array([0.0, 0.0, 0.0, command[3]])
+        keeps = [part.name == 'gripper' for part in self._robot.command]
+        return np.where(keeps, command, self._resting)
 
     def _store(self, command: Array) -> None:
         finite = np.isfinite(command)

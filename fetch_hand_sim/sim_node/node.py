@@ -83,7 +83,7 @@ class SimNode(Node):
         self._said: set[str] = set()
         self._has_said_far_out = False
         self._commanders: list[str] = []
-        self._has_introduction = self._was_introduced = False
+        self._has_introduction = False
         self._beat_due = self._ticked_at = now
         self._report_due = now + REPORT_PERIOD
         self.add_on_set_parameters_callback(set_callback(SIM_NODE, makes_time=True))
@@ -368,10 +368,9 @@ class SimNode(Node):
 
     def _forget_who_left(self) -> None:
         """Whoever commands after an actor has left gives actions of its own."""
-        is_introduced = self._watch.will_introduce()
-        if self._was_introduced and not is_introduced:
-            self._on_commander(None)
-        self._was_introduced = is_introduced
+        context = self._recording_context
+        if context is not None and context.checkpoint_sha256 and not self._watch.will_introduce():
+            context.checkpoint_sha256 = None
 
     def _apply_changes(self, changes: list[Any]) -> None:
         for change in changes:

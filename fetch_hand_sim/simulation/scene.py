@@ -141,8 +141,11 @@ class Scene:
 
     @property
     def has_ghost(self) -> bool:
-        """Whether the goal is shown as a ghost of the object."""
-        return self.spec.goal is GoalKind.POSE and self.spec.has_object
+        """Whether the goal is shown as a ghost of the object, which the model then has."""
+        joint = mujoco.mj_name2id(
+            self.model, mujoco.mjtObj.mjOBJ_JOINT.value, _free_joint_of(GHOST)
+        )
+        return self.spec.goal is GoalKind.POSE and self.spec.has_object and joint >= 0
 
     def show(self, frame: Frame) -> None:
         """Poses robot, object and ghost."""
@@ -212,8 +215,12 @@ class Scene:
     def _free_joint(self, body: str | None) -> slice | None:
         if body is None:
             return None
-        start = int(self.model.joint(f'{body}:joint').qposadr[0])
+        start = int(self.model.joint(_free_joint_of(body)).qposadr[0])
         return slice(start, start + 7)
+
+
+def _free_joint_of(body: str) -> str:
+    return f'{body}:joint'
 
 
 def ghost_pose(spec: TaskSpec, goal: Array) -> Array:

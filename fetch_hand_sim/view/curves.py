@@ -33,6 +33,9 @@ class Curves:
         self._fingers = [
             index for index, name in enumerate(spec.robot.joints) if 'gripper_finger' in name
         ]
+        self._grippers = [
+            index for index, part in enumerate(spec.robot.command) if part.name == 'gripper'
+        ]
         self._commanded = [
             spec.robot.joints.index(part.name) if part.name in spec.robot.joints else None
             for part in spec.robot.command
@@ -69,9 +72,9 @@ class Curves:
         """What the commands move; the axes of a gripper's path are no joints and stay out."""
         joints = frame.joint_position
         positions = np.array([np.nan if i is None else joints[i] for i in self._commanded])
-        if self._spec.robot.has_gripper_command:
-            # From -1 to 1, as the last command closes and opens.
-            positions[-1] = 2.0 * np.mean(joints[self._fingers]) / _FINGER_RANGE - 1.0
+        for index in self._grippers:
+            # From -1 to 1, as the command closes and opens.
+            positions[index] = 2.0 * np.mean(joints[self._fingers]) / _FINGER_RANGE - 1.0
         return positions
 
     def _series(self, columns: int | slice) -> Series:

@@ -127,7 +127,7 @@ class RobotRequests:
         action(request)
 
     def fits(self, request: Request | LatestRequest) -> bool:
-        """Whether it is meant for the robot of now, not for one of another task before it."""
+        """Whether it has the size that the robot of now takes; there may have been another."""
         if self._spec is None or not isinstance(request, SetGoal | SetCommand):
             return True
         name = 'set_goal' if isinstance(request, SetGoal) else 'commands'

@@ -11,7 +11,8 @@ import pytest
 
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import read_summary
-from support.graph import POLICY_NODE, SIM_NODE, finish, ros_args
+from msgs_spec.tasks import task_spec
+from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
 
 
 @pytest.mark.parametrize(
@@ -58,15 +59,13 @@ def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, 
 def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path):
     """Robots of one name take each other's commands, and the log would name the actor for it."""
     start_process(*node)
+    with client(task_spec('FetchReach')) as connection:
+        names = connection.node.get_node_names
+        connection.spin_until(lambda: {'sim_node', 'policy_node'} & set(names()), 'the other')
     command = (sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting')
-    deadline = time.monotonic() + 60.0
-    code, errors = 0, ''
-    # Until the other one is loaded there is nobody.
-    while code != 1 and time.monotonic() < deadline:
-        demo = start_process(*command, '--episodes', '1', cwd=tmp_path)
-        code, errors = finish(demo, timeout=60.0)
+    code, output = finish(start_process(*command, '--episodes', '1', cwd=tmp_path), timeout=60.0)
     assert code == 1
-    assert errors == (
+    assert output == (
         f'demo: {who} in / runs already and would take part: end that first, or choose another '
         'ROS_DOMAIN_ID\n'
     )

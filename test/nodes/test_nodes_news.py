@@ -50,6 +50,7 @@ def test_episodes_after_an_actor_has_left_do_not_bear_its_name(
         robot.subscribe('episode_status')
         robot.spin_until(lambda: robot.statuses()[-1:] and robot.statuses()[-1].episode > 1, 'two')
         end(policy)
+        robot.spin(0.5)
         last = robot.statuses()[-1].episode
         robot.spin_until(lambda: robot.statuses()[-1].episode > last + 2, 'others')
     end(sim)

@@ -85,14 +85,21 @@ MANIPULATE_CONFIGS = {
 class HandManipulateTask(HandTask):
     """HandManipulateBlock*, HandManipulateEgg*, HandManipulatePen*.
 
+    Args:
+        spec: The task.
+        batch: How many simulations, and how they are stepped.
+        config: In what it differs; None for those of the thirteen.
+
     Attributes:
         config: In what they differ.
         parallel_quaternions: (24, 4) wxyz, the rotations that map a cube to itself.
     """
 
-    def __init__(self, spec: TaskSpec, batch: BatchConfig) -> None:
+    def __init__(
+        self, spec: TaskSpec, batch: BatchConfig, config: ManipulateConfig | None = None
+    ) -> None:
         """Keeps the fresh state, from which every episode starts."""
-        self.config = MANIPULATE_CONFIGS[spec.name]
+        self.config = config or MANIPULATE_CONFIGS[spec.name]
         model = load_hand_model(self.config.asset)
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)

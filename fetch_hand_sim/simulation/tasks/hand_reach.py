@@ -62,9 +62,11 @@ class HandReachTask(HandTask):
         palm: (3,) where the palm is, m, world.
     """
 
+    ASSET = REACH_ASSET
+
     def __init__(self, spec: TaskSpec, batch: BatchConfig) -> None:
         """Keeps the initial pose, its fingertips and the palm, from which goals are made."""
-        model = load_hand_model(REACH_ASSET)
+        model = load_hand_model(self.ASSET)
         data = mujoco.MjData(model)
         for joint, value in _INITIAL_QPOS.items():
             data.joint(joint).qpos = value
@@ -74,11 +76,6 @@ class HandReachTask(HandTask):
         self.palm = data.body('robot0:palm').xpos.copy()
         super().__init__(spec, model, batch)
         self.batch.state[:] = self.start_state
-
-    @property
-    def asset(self) -> str:
-        """The MJCF asset."""
-        return REACH_ASSET
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Restores the initial pose and samples goals."""

@@ -33,11 +33,14 @@ def make_task(
 
     Raises:
         ValueError: If the task is unknown, the rate is not a whole number of substeps, or the
-            package of a task that is none of the thirteen has no simulation of it.
+            package of a task that is none of the thirteen has no simulation of it, or one of
+            another model than it names.
     """
     spec = task_spec(name, control_hz=control_hz if timing == 'seconds' else DEFAULT_CONTROL_HZ)
     batch = BatchConfig(num_envs, num_threads, substeps_per_tick(control_hz), keeps_data, timing)
     task: Task = _family(spec)(spec, batch)
+    if task.asset != (named := task_asset(name)):
+        raise ValueError(f'{name} simulates {task.asset}; its ASSET, which is drawn, is {named}')
     return task
 
 
@@ -56,11 +59,16 @@ def task_asset(name: str) -> str:
     """Returns the MJCF asset of a task, for example `fetch/reach.xml`.
 
     Raises:
-        ValueError: If the task is unknown.
+        ValueError: If the task is unknown, or its package names none.
     """
     spec = task_spec(name)
     if spec.name in FETCH_CONFIGS:
         return FETCH_CONFIGS[spec.name].asset
     if spec.name in MANIPULATE_CONFIGS:
         return MANIPULATE_CONFIGS[spec.name].asset
-    return REACH_ASSET if spec.name == 'HandReach' else str(foreign_simulation(spec.name).ASSET)
+    if spec.name == 'HandReach':
+        return REACH_ASSET
+    named = getattr(foreign_simulation(spec.name), 'ASSET', None)
+    if named is None:
+        raise ValueError(f'the simulation of {spec.name} lacks ASSET, its MJCF file')
+    return str(named)

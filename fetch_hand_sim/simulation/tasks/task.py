@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -78,8 +79,10 @@ class Task(ABC):
         tick_duration: Simulated seconds per action.
         start_state: (state size,) `mjSTATE_INTEGRATION` in which episodes start, before anything
             is drawn.
+        ASSET: The MJCF asset, of a class whose tasks all have the same.
     """
 
+    ASSET: ClassVar[str]
     start_state: Array
 
     def __init__(
@@ -106,9 +109,9 @@ class Task(ABC):
         self._observed = observed_topics(spec)
 
     @property
-    @abstractmethod
     def asset(self) -> str:
         """The MJCF asset that the model was compiled from."""
+        return self.ASSET
 
     @abstractmethod
     def reset(self, ids: Ids, generators: Generators) -> Array:

@@ -8,12 +8,13 @@ from msgs_spec.robots import CommandPart, RobotSpec
 
 # Seconds in which a key that is held moves a slider from end to end.
 _SWEEP = 2.0
-_UNIT_OF_MOVES = 'x 0.05 m'
+# Such as 'x 0.05 m': so much in each tick.
+_MOVES = 'x '
 
 
 def is_move(part: CommandPart) -> bool:
     """Whether a command says how far to go in each tick, not where to: it rests at 0."""
-    return part.unit == _UNIT_OF_MOVES
+    return part.unit.startswith(_MOVES)
 
 
 class Teleoperation:

@@ -193,7 +193,10 @@ class Trainer:
             while True:
                 before = time.monotonic()
                 self._absorb(collected)
-                job = submit(self._collect, *self._request()) if self.config.overlap else None
+                job = None
+                if self.config.overlap:
+                    # At the end the actor after this cycle is evaluated, not the one before it.
+                    job = submit(self._collect, *self._request(may_evaluate=not self._limit()))
                 losses = self._learn()
                 if job is None:
                     job = submit(self._collect, *self._request())
@@ -201,10 +204,7 @@ class Trainer:
                 clock.write(self.counters)
                 self._check(losses)
                 knows = self.counters.updates > 0 or bool(self.config.init_from)
-                # What was evaluated while the learner learned was the actor before it.
-                is_older = self.config.overlap or collected.evaluation is None
-                if is_older and knows and self._limit():
-                    self._keep_best(collected)
+                if collected.evaluation is None and knows and self._limit():
                     # Noise and learning rate have fallen, and nothing else would measure it.
                     last = self._actor_to_evaluate()
                     collected = submit(self._evaluate, collected, last).result()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from PIL import Image
 from fetch_hand_sim.commands.render_episode import main as render_episode
 from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.films.film import check_kind, write_film, write_picture
-from fetch_hand_sim.films.pictures import Studio, grid, tile, with_frame
+from fetch_hand_sim.films.pictures import Studio, grid, sheets, tile, with_frame
 from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from msgs_spec.command_line import CommandError, UsageError
@@ -151,9 +152,28 @@ def test_pictures_show_what_was_logged(folder):
     assert first.shape == (48, 64, 3) and first.std() > 10
     assert (first != last).any()
     np.testing.assert_array_equal(studio.picture(recording, 0), first)
-    sheets = grid(studio, [recording, *others], columns=2)
-    assert next(sheets).shape == (98, 130, 3)
+    drawn = grid(studio, [recording, *others], columns=2, hz=25.0)
+    assert next(drawn).shape == (98, 130, 3)
     studio.close()
+
+
+def test_in_a_grid_all_episodes_have_the_same_time(folder, monkeypatch):
+    """A robot at 250 Hz beside one at 25 Hz: both take two seconds."""
+    slow, _ = load_recordings(folder, 2)
+    times = np.arange(10 * len(slow.frames) - 9) / 250.0
+    fast = replace(slow, times=times, frames=[slow.frames[0]] * len(times))
+    drawn = {id(slow): [], id(fast): []}
+
+    def draw(studio, recording, index):
+        drawn[id(recording)].append(index)
+        return np.zeros((4, 4, 3), np.uint8)
+
+    monkeypatch.setattr('fetch_hand_sim.films.pictures.framed', draw)
+    count = len(list(grid(Studio(4, 4), [slow, fast], columns=2, hz=250.0)))
+    assert count == sheets([slow, fast], 250.0) == len(times)
+    assert drawn[id(fast)] == list(range(len(times)))
+    assert drawn[id(slow)] == list(range(len(slow.frames)))
+    assert len(list(grid(Studio(4, 4), [slow], columns=1, hz=25.0))) == len(slow.frames)
 
 
 @pytest.mark.usefixtures('opengl')

@@ -34,7 +34,7 @@ def test_it_equals_a_dummy_vec_env_over_several_episodes():
         assert rewards.dtype == expected_rewards.dtype
         assert dones.tolist() == expected_dones.tolist()
         for info, expected in zip(infos, expected_infos, strict=True):
-            for key in ('is_success', 'TimeLimit.truncated'):
+            for key in ('is_success', 'diverged', 'TimeLimit.truncated'):
                 assert info[key] == expected[key]
             assert ('terminal_observation' in info) == ('terminal_observation' in expected)
             for key, values in info.get('terminal_observation', {}).items():

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
+from msgs_spec.robots import CommandPart
 from msgs_spec.tasks import task_spec
 
 REACH, HAND = task_spec('FetchReach').robot, task_spec('HandReach').robot
@@ -62,3 +65,15 @@ def test_a_command_is_held_after_the_timeout_and_its_age_outlives_the_episode():
     buffer.start_episode([0.0, 0.0, 0.0, 0.25])
     assert buffer.take().tolist() == [0.0, 0.0, 0.0, 0.25]
     assert buffer.age() == 1.0
+
+
+@pytest.mark.parametrize('names', ['xyz', ('x', 'y', 'z', 'turn'), ('gripper', 'x', 'y', 'z', 'a')])
+def test_a_robot_with_other_commands_holds_when_they_stop(names):
+    now = [0.0]
+    parts = tuple(CommandPart(name, -1.0, 1.0, 'x 0.05 m') for name in names)
+    buffer = CommandBuffer(replace(REACH, command=parts), 0.5, clock=lambda: now[0])
+    buffer.start_episode(np.zeros(len(parts)))
+    buffer.accept(np.full(len(parts), 0.7))
+    assert buffer.take().tolist() == [0.7] * len(parts)
+    now[0] = 1.0
+    assert buffer.take().tolist() == [0.7 * (name == 'gripper') for name in names]

@@ -1,0 +1,82 @@
+"""Tasks of other packages that the thirteen do not think of: other models, goals, commands."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.simulation.scene import Scene
+from fetch_hand_sim.simulation.tasks import registry
+from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
+from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
+from fetch_hand_sim.simulation.tasks.task import BatchConfig
+from msgs_spec.actions import action_from_command, command_from_action
+from msgs_spec.robots import FETCH, CommandPart
+from msgs_spec.tasks import TASKS, GoalKind, TaskFormulas
+from msgs_spec.topics import topics
+
+BLOCK = 'HandManipulateBlockRotateZ'
+
+
+class BlockNear(HandManipulateTask):
+    """The block under another name."""
+
+    ASSET = MANIPULATE_CONFIGS[BLOCK].asset
+
+    def __init__(self, spec, batch):
+        super().__init__(spec, batch, MANIPULATE_CONFIGS[BLOCK])
+
+
+def test_a_hand_task_of_another_name_is_the_same_physics():
+    spec = replace(TASKS[BLOCK], name='HandBlockNear', reference_id=None)
+    tasks = BlockNear(spec, BatchConfig()), HandManipulateTask(TASKS[BLOCK], BatchConfig())
+    generators = [np.random.default_rng(3)], [np.random.default_rng(3)]
+    ids = np.arange(1)
+    first, second = (t.reset(ids, g) for t, g in zip(tasks, generators, strict=True))
+    assert first.tobytes() == second.tobytes()
+    assert tasks[0].asset == tasks[1].asset == BlockNear.ASSET
+
+
+def test_a_model_of_its_own_is_the_one_that_is_simulated(monkeypatch):
+    class Missing(HandReachTask):
+        ASSET = '/nowhere/hand.xml'
+
+    with pytest.raises((FileNotFoundError, ValueError), match='nowhere'):
+        Missing(TASKS['HandReach'], BatchConfig())
+    monkeypatch.setattr(registry, 'foreign_simulation', lambda name: object)
+    monkeypatch.setattr(registry, 'task_spec', lambda name: replace(TASKS[BLOCK], name=name))
+    with pytest.raises(ValueError, match='the simulation of Mine lacks ASSET'):
+        registry.task_asset('Mine')
+    monkeypatch.undo()
+    monkeypatch.setattr(registry, 'task_asset', lambda name: 'another.xml')
+    with pytest.raises(ValueError, match=r'simulates hand/reach.xml; its ASSET, .* is another.xml'):
+        registry.make_task('HandReach')
+
+
+def test_a_pose_goal_needs_neither_a_ghost_nor_the_joint_of_its_object(monkeypatch):
+    """Such as that of FetchPush, turned."""
+    formulas = TaskFormulas(
+        topics=('object_pose',),
+        observation=lambda readings, tick_duration: readings['object_pose'].copy(),
+        achieved_goal=lambda readings: readings['object_pose'].copy(),
+    )
+    turned = {'name': 'FetchPushTurned', 'goal': GoalKind.POSE, 'rotation_threshold': 0.2}
+    spec = replace(TASKS['FetchPush'], **turned, formulas=formulas, reference_id=None)
+    assert 'object_joint' not in {each.name for each in topics(spec)}
+    assert 'object_joint' in {each.name for each in topics(TASKS[BLOCK])}
+    module = 'fetch_hand_sim.simulation.scene'
+    monkeypatch.setattr(f'{module}.task_spec', lambda name: spec)
+    monkeypatch.setattr(f'{module}.task_asset', lambda name: 'fetch/push.xml')
+    assert not Scene(spec.name).has_ghost
+    monkeypatch.undo()
+    assert Scene(BLOCK).has_ghost
+
+
+def test_limits_of_gripper_commands_hold_for_actions_too():
+    slow = tuple(CommandPart(axis, -0.02, 0.04, 'm') for axis in 'xyz')
+    robot = replace(FETCH, command=slow)
+    commands = command_from_action(robot, [[-1.0, 0.0, 3.0]])
+    np.testing.assert_allclose(commands, [[-0.02, 0.01, 0.04]])
+    np.testing.assert_allclose(action_from_command(robot, commands), [[-1.0, 0.0, 1.0]], atol=1e-12)
