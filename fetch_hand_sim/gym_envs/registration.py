@@ -150,7 +150,8 @@ def register_gymnasium_robotics(override: bool = False) -> None:
         both = _REFERENCE_ENV, _REFERENCE_VECTOR_ENV
         _register(name, *both, task=task, reward_type=reward_type)
     for name, without in _touch_ids(ids).items():
-        if name not in gymnasium.registry:
+        if override or name not in gymnasium.registry:
+            gymnasium.registry.pop(name, None)
             kwargs = {'name': name, 'without': without}
             gymnasium.register(name, entry_point=_WITHOUT_TOUCH, kwargs=kwargs)
 

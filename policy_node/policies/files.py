@@ -33,12 +33,14 @@ def read_file(path: Path, largest: int = LARGEST_POLICY) -> bytes:
 def write_file(path: Path, data: bytes) -> None:
     """Writes a file under a temporary name and moves it into place.
 
-    What is no regular file, such as a pipe, is written to as it is.
+    What is no regular file, such as a pipe or a link, is written to as it is.
 
     Raises:
         OSError: If that fails, and names the file; nothing is left behind.
     """
-    if path.exists() and not path.is_file() and not path.is_dir():
+    is_special = path.exists() and not path.is_file() and not path.is_dir()
+    # `/dev/stdout` is one, to whatever the output goes to.
+    if is_special or path.is_symlink():
         with _named(path):
             path.write_bytes(data)
     else:

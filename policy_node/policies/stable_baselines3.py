@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from msgs_spec.tasks import TaskSpec, task_spec
@@ -142,3 +143,9 @@ def _check_sizes(path: Path, spec: TaskSpec, policy: Any) -> None:
     }
     if found != wanted:
         raise ValueError(f'{path} has shapes {found}; {spec.name} has {wanted}')
+    limits = [getattr(policy.action_space, name, 0.0) for name in ('low', 'high')]
+    if not (np.all(limits[0] == -1.0) and np.all(limits[1] == 1.0)):
+        # Whatever rescaled them in training is not in the file.
+        raise ValueError(
+            f'{path} has actions in {one_line(policy.action_space)}; allowed: -1 ... 1'
+        )

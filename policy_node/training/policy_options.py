@@ -95,5 +95,9 @@ def require_writable(file: Path) -> None:
         raise UsageError(f'{file} cannot be written: {error.strerror}') from None
     if file.is_dir():
         raise UsageError(f'{file} cannot be written: it is a folder')
-    if not os.access(file if file.exists() else file.parent, os.W_OK):
+    needed = [file] if file.exists() else []
+    # A regular file is replaced by the new one, which its folder must take.
+    if not file.exists() or (file.is_file() and not file.is_symlink()):
+        needed.append(file.parent)
+    if not all(os.access(each, os.W_OK) for each in needed):
         raise UsageError(f'{file} cannot be written: it is read-only')

@@ -178,6 +178,9 @@ class Task(ABC):
     def read_data(self, index: int, data: mujoco.MjData) -> None:
         """Writes simulation `index` into `data`; what is derived needs `keeps_data`."""
         self.batch.get_data(index, data)
+        # Of a copy that has not stepped yet, what it keeps is newer than what the task reads.
+        for name, values in self._outputs.items():
+            getattr(data, name)[:] = values[index]
 
     def write_data(self, index: int, data: mujoco.MjData) -> None:
         """Lets simulation `index` go on from `data`, as if it had stepped that itself."""

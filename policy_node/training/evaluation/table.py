@@ -6,6 +6,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 _DIAGNOSES = {
     'stay': 'success at the next tick, given success at this one',
@@ -19,7 +20,7 @@ _DIAGNOSES = {
 def print_table(report: dict[str, Any]) -> None:
     """Prints rates with their 95 % intervals."""
     title = f'{report["task"]}: {report["policy"]}, {report["episodes"]} episodes'
-    table = Table('measure', 'value', '95 % interval', title=title)
+    table = Table('measure', 'value', '95 % interval', title=Text(title))
     names = {
         'success_gymnasium': 'success at the last step, gymnasium rule',
         'success_paper': 'success at the last step, paper rule',

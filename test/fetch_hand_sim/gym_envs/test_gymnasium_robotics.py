@@ -127,6 +127,15 @@ def test_importing_gymnasium_robotics_later_takes_nothing_back():
     assert result.stderr == ''
 
 
+def test_touch_sensors_say_it_too_where_the_references_are_replaced(registry):
+    name = 'HandManipulatePenRotate_ContinuousTouchSensors-v1'
+    if name not in registry:
+        gymnasium.register(name, entry_point='gymnasium_robotics:stops_at_an_assert')
+    fetch_hand_sim.register_gymnasium_robotics(override=True)
+    with pytest.raises(gymnasium.error.Error, match='without them it is HandManipulatePenRotate'):
+        gymnasium.make(name)
+
+
 def test_touch_sensors_say_in_one_line_that_they_are_not_there(make):
     with pytest.raises(gymnasium.error.Error, match='without them it is HandManipulateEggDense-v1'):
         make('HandManipulateEgg_BooleanTouchSensorsDense-v1')
@@ -204,7 +213,8 @@ def test_what_is_fixed_cannot_be_changed_in_vain(make):
 
 @pytest.mark.parametrize('name', ['FetchPickAndPlace-v4', 'HandManipulateEggRotate-v1'])
 @pytest.mark.parametrize('duplicate', [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_a_copy_goes_on_to_the_same_bits(name, duplicate, make):
+@pytest.mark.parametrize('is_looked_at', [False, True])
+def test_a_copy_goes_on_to_the_same_bits(name, duplicate, is_looked_at, make):
     make(name)
     env = gymnasium.make(name)
     env.reset(seed=4)
@@ -213,6 +223,8 @@ def test_a_copy_goes_on_to_the_same_bits(name, duplicate, make):
         env.step(env.action_space.sample())
     env.unwrapped.distance_threshold = 0.5
     twin = duplicate(env)
+    if is_looked_at:
+        assert twin.unwrapped.data.time == env.unwrapped.data.time
     for _ in range(3):
         action = env.action_space.sample()
         first, second = env.step(action), twin.step(action)

@@ -219,6 +219,17 @@ def test_stable_baselines3_model_answers_as_it_does_there(algorithm, tmp_path):
         load_policy(path, trust=True)
 
 
+def test_a_model_whose_actions_were_rescaled_is_refused(tmp_path):
+    """By how much is not in its file."""
+    library = pytest.importorskip('stable_baselines3')
+    env = gymnasium.make('fetch_hand_sim/FetchReach-v0')
+    half = gymnasium.wrappers.RescaleAction(env, np.float32(-0.5), np.float32(0.5))
+    path = tmp_path / 'half.zip'
+    library.PPO('MultiInputPolicy', half, policy_kwargs={'net_arch': [8]}, seed=1).save(path)
+    with pytest.raises(ValueError, match=r'half.zip has actions in Box\(-0.5, 0.5.*; allowed: -1'):
+        load_policy(path, 'FetchReach', trust=True)
+
+
 class Intruder:
     """Leaves a mark when it is unpickled."""
 

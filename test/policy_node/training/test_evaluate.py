@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch
 
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.policy import RandomPolicy, RestingPolicy
+from policy_node.policies.shipped import shipped_actors
 from policy_node.training.evaluate_policy import main
 from policy_node.training.evaluation.episodes import (
     EpisodeOutcomes,
@@ -223,6 +225,22 @@ def test_bad_usage_is_one_line_and_exit_status_2(
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1
+
+
+def test_a_result_goes_to_where_a_link_leads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`/dev/stdout` is one; and a path in brackets is no markup of the table's title."""
+    target, link = tmp_path / 'there.json', tmp_path / 'link.json'
+    target.write_text('before')
+    link.symlink_to(target)
+    actor = tmp_path / 'run[/b]' / 'actor.safetensors'
+    actor.parent.mkdir(parents=True)
+    shutil.copy(shipped_actors()['FetchReach'], actor)
+    arguments = ['--policy', str(actor), '--episodes', '2', '--threads', '1']
+    assert main([*arguments, '--json', str(link)]) == 0
+    assert link.is_symlink() and json.loads(target.read_text())['episodes'] == 2
+    assert 'run[/b]' in capsys.readouterr().out.replace('\n', '')
 
 
 def test_json_is_all_that_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
