@@ -1,8 +1,8 @@
-"""The tables of results in README.md and docs/simulation.md.
+"""The tables of results in README.md, docs/simulation.md and docs/training.md.
 
 Shipped actors come from the evaluation files beside them, speed from the last `make bench-sim`.
 
-python tools/readme_tables.py --write README.md docs/simulation.md
+python tools/readme_tables.py --write README.md docs/simulation.md docs/training.md
 """
 
 from __future__ import annotations
@@ -14,22 +14,21 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from policy_node.training.benchmark.actors_table import actors_table
+from policy_node.training.benchmark.actors_table import actors_summary, actors_table
 
 ROOT = Path(__file__).resolve().parent.parent
 ACTORS = ROOT / 'policy_node' / 'actors'
 SPEED = ROOT / 'bench' / 'results' / 'bench_sim.csv'
+# One task of each family.
+_SHORT = ('FetchPush', 'FetchPickAndPlace', 'HandReach', 'HandManipulateBlockFull')
 
 
 def speed_table(path: Path = SPEED) -> str:
     """Returns the Markdown table of environment steps per second, and what it was measured on."""
-    text = path.read_text(encoding='utf-8')
-    machine, rows = text.splitlines()[0].lstrip('# '), list(csv.DictReader(_without_comments(text)))
-    threads = sorted({int(row['threads']) for row in rows})
-    one, many = ({r['task']: r for r in rows if int(r['threads']) == n} for n in threads[:2])
+    machine, threads, (one, many) = _measured(path)
     lines = [
         '| task | this project | of bare physics | EnvPool | x EnvPool | Gymnasium-Robotics, one '
-        f'process | x that | {threads[1]} threads | of bare physics | x EnvPool '
+        f'process | x that | {threads} threads | of bare physics | x EnvPool '
         '| x one process of Gymnasium-Robotics |',
         '| --- |' + ' ---: |' * 10,
     ]
@@ -54,11 +53,48 @@ def speed_table(path: Path = SPEED) -> str:
     return '\n'.join([*lines, '', f'({machine})'])
 
 
+def speed_summary(path: Path = SPEED) -> str:
+    """Returns a few rows of the same with all threads, and the mean over all tasks."""
+    machine, threads, (one, many) = _measured(path)
+    ours, peer = 'this_project', 'envpool'
+    lines = [
+        f'| steps per second, {threads} threads | this package | EnvPool '
+        '| Gymnasium-Robotics, one process |',
+        '| --- | ---: | ---: | ---: |',
+    ]
+    for task in _SHORT:
+        speeds = (many[task][ours], many[task][peer], one[task]['gymnasium_robotics'])
+        lines.append(f'| {task} | ' + ' | '.join(f'{float(speed):,.0f}' for speed in speeds) + ' |')
+    gains = [
+        statistics.geometric_mean(ratios)
+        for ratios in (
+            [float(row['ratio_envpool']) for row in many.values()],
+            [float(many[task][ours]) / float(one[task]['gymnasium_robotics']) for task in one],
+        )
+    ]
+    lines.append(f'| *faster, mean of {len(one)} tasks* | | {gains[0]:.2f} x | {gains[1]:.1f} x |')
+    return '\n'.join([*lines, '', f'({machine})'])
+
+
+def _measured(path: Path) -> tuple[str, int, list[dict[str, dict[str, str]]]]:
+    """The machine, the larger number of threads, and the rows by task of one and of that many."""
+    text = path.read_text(encoding='utf-8')
+    rows = list(csv.DictReader(_without_comments(text)))
+    threads = sorted({int(row['threads']) for row in rows})[:2]
+    tables = [{r['task']: r for r in rows if int(r['threads']) == n} for n in threads]
+    return text.splitlines()[0].lstrip('# '), threads[1], tables
+
+
 def _without_comments(text: str) -> Iterable[str]:
     return (line for line in text.splitlines() if not line.startswith('#'))
 
 
-TABLES = {'results': lambda: actors_table(ACTORS), 'speed': speed_table}
+TABLES = {
+    'results': lambda: actors_table(ACTORS),
+    'results, short': lambda: actors_summary(ACTORS),
+    'speed': speed_table,
+    'speed, short': speed_summary,
+}
 
 
 def with_tables(page: str) -> str:

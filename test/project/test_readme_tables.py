@@ -16,12 +16,10 @@ ACTORS = ROOT / 'policy_node' / 'actors'
 TOOL = runpy.run_path(str(ROOT / 'tools' / 'readme_tables.py'))
 
 
-@pytest.mark.parametrize('page', ['README.md', 'docs/simulation.md'])
+@pytest.mark.parametrize('page', ['README.md', 'docs/simulation.md', 'docs/training.md'])
 def test_pages_have_the_present_tables(page: str) -> None:
     text = (ROOT / page).read_text(encoding='utf-8')
-    assert TOOL['with_tables'](text) == text, (
-        'run: python tools/readme_tables.py --write README.md docs/simulation.md'
-    )
+    assert TOOL['with_tables'](text) == text, 'run: make tables'
 
 
 @pytest.mark.parametrize('text', ['# nothing', '<!-- results -->', '<!-- /speed -->'])
@@ -31,7 +29,7 @@ def test_a_page_without_markers_is_refused(text: str) -> None:
 
 
 def test_the_readme_is_short() -> None:
-    assert (ROOT / 'README.md').read_text().count('\n') <= 130
+    assert (ROOT / 'README.md').read_text().count('\n') <= 150
 
 
 @pytest.mark.parametrize('path', shipped_actors().values(), ids=lambda path: path.stem)
