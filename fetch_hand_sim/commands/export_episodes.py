@@ -1,4 +1,4 @@
-"""`export_episodes DIR --to parquet|minari --output DIR`: logged episodes as datasets.
+"""`export_episodes DIR --to parquet|minari|lerobot --output DIR`: logged episodes as datasets.
 
 Exit code 0: all episodes are in the datasets; 1: something was skipped, named on stderr, or could
 not be written; 2: bad usage.
@@ -18,6 +18,7 @@ from fetch_hand_sim.episode_log import (
 )
 from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.episodes.export import export_minari, export_parquet
+from fetch_hand_sim.episodes.lerobot import export_lerobot
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
@@ -32,12 +33,13 @@ from msgs_spec.command_line import (
 )
 
 _NAME = 'export_episodes'
+_NEED_STEPS = {'minari': 'Minari', 'lerobot': 'LeRobot'}
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('path', type=Path, help='an episode, or a directory of episodes')
-    parser.add_argument('--to', choices=('parquet', 'minari'), required=True)
+    parser.add_argument('--to', choices=('parquet', 'minari', 'lerobot'), required=True)
     parser.add_argument('--output', type=Path, required=True, help='directory to write to')
     parser.add_argument(
         '--name', default='logged-v0', help='of a Minari dataset; default: logged-v0'
@@ -88,14 +90,16 @@ def _load(path: Path, to: str) -> EpisodeArrays:
         EpisodeReadError: If it cannot be read, or a dataset of this kind cannot hold it.
     """
     episode = load_episode(path)
-    if to == 'minari' and len(episode) == 0:
-        raise EpisodeReadError(f'{path}: no step was taken, and Minari needs one')
+    if to in _NEED_STEPS and len(episode) == 0:
+        raise EpisodeReadError(f'{path}: no step was taken, and {_NEED_STEPS[to]} needs one')
     return episode
 
 
 def _export(options: argparse.Namespace, episodes: Sequence[EpisodeArrays]) -> str:
     if options.to == 'parquet':
         return ', '.join(str(path) for path in export_parquet(episodes, options.output))
+    if options.to == 'lerobot':
+        return f'LeRobot dataset {export_lerobot(episodes, options.output)}'
     dataset_id = export_minari(episodes, options.output, options.name)
     return f'Minari dataset {dataset_id} in {options.output}'
 

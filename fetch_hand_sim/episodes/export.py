@@ -40,7 +40,12 @@ class ExportError(CommandError):
     """A dataset cannot be written; the message is one line."""
 
 
-def _require(module: str) -> Any:
+def require(module: str) -> Any:
+    """Imports what the extra `[data]` brings.
+
+    Raises:
+        ExportError: If it is missing; the line says how to install it.
+    """
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -68,7 +73,7 @@ def export_parquet(episodes: Sequence[EpisodeArrays], directory: Path) -> list[P
     Raises:
         ExportError: If pyarrow is missing, or a file exists or cannot be written; none is created.
     """
-    pyarrow, parquet = _require('pyarrow'), _require('pyarrow.parquet')
+    pyarrow, parquet = require('pyarrow'), require('pyarrow.parquet')
     task = episodes[0].spec.name
     tables = {
         directory / f'{task}.parquet': pyarrow.concat_tables(
@@ -168,7 +173,7 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
             f'dataset name {name!r}; allowed: letters, digits, _ and -, parts separated by /, such '
             'as logged-v0'
         )
-    minari, collector = _require('minari'), _require('minari.data_collector')
+    minari, collector = require('minari'), require('minari.data_collector')
     spec = episodes[0].spec
     dataset_id = f'{spec.name}/{name if _VERSION.search(name) else f"{name}-v0"}'
     if (directory / dataset_id).exists():

@@ -97,9 +97,9 @@ def test_episodes_of_the_recovered_environment_are_as_long_as_those_logged(
     environment.close()
 
 
-@pytest.mark.parametrize('format_', ['parquet', 'minari'])
+@pytest.mark.parametrize('format_', ['parquet', 'minari', 'lerobot'])
 def test_a_full_disk_leaves_nothing_that_stands_in_the_way(episodes, tmp_path, format_, capsys):
-    pytest.importorskip({'parquet': 'pyarrow', 'minari': 'minari'}[format_])
+    pytest.importorskip('minari' if format_ == 'minari' else 'pyarrow')
     code = (
         'import resource, sys\n'
         'resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n'

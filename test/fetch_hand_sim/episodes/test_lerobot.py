@@ -1,0 +1,147 @@
+"""LeRobot datasets made of logged episodes: every value, and the layout that lerobot reads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.commands import export_episodes
+from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
+from fetch_hand_sim.episodes import lerobot
+from policy_node.training import generate_episodes
+from support.episode_recorder import Recorder
+
+parquet = pytest.importorskip('pyarrow.parquet')
+
+TASK = 'FetchPush'
+DATA, EPISODES = 'data/chunk-000/file-{:03d}.parquet', 'meta/episodes/chunk-000/file-000.parquet'
+
+
+@pytest.fixture(scope='module')
+def episodes(tmp_path_factory):
+    directory = tmp_path_factory.mktemp('episodes')
+    arguments = ['--policy', 'random', '--task', TASK, '--episodes', '3', '--threads', '1']
+    assert generate_episodes.main([*arguments, '--output', str(directory)]) == 0
+    return directory
+
+
+def _export(source: Path, output: Path) -> int:
+    return export_episodes.main([str(source), '--to', 'lerobot', '--output', str(output)])
+
+
+@pytest.fixture(scope='module')
+def dataset(episodes, tmp_path_factory):
+    output = tmp_path_factory.mktemp('datasets')
+    assert _export(episodes, output) == 0
+    return output / TASK
+
+
+def test_frames_hold_what_the_episodes_hold(episodes, dataset):
+    columns = parquet.read_table(dataset / DATA.format(0)).to_pydict()
+    first = 0
+    for number, episode in enumerate(load_episodes(episodes)):
+        rows = slice(first, first + len(episode))
+        seen = episode.observations['observation'][:-1].astype(np.float32)
+        # Position of the gripper, fingers, both velocities; between them what is seen of the block.
+        robot = [0, 1, 2, 9, 10, *range(20, 25)]
+        block = [index for index in range(25) if index not in robot]
+        goal = episode.observations['desired_goal'][:-1].astype(np.float32)
+        expected = {
+            'observation.state': seen[:, robot],
+            'observation.environment_state': np.concatenate([seen[:, block], goal], axis=1),
+            'action': episode.actions.astype(np.float32),
+            'next.reward': episode.rewards,
+            'next.success': episode.success[1:],
+            'next.done': [False] * 49 + [True],
+            'timestamp': (np.arange(50) / 25).astype(np.float32),
+            'frame_index': np.arange(50),
+            'episode_index': [number] * 50,
+            'index': np.arange(first, first + 50),
+            'task_index': [0] * 50,
+        }
+        assert columns.keys() == expected.keys()
+        for name, values in expected.items():
+            np.testing.assert_array_equal(columns[name][rows], values, err_msg=name)
+        first += len(episode)
+    assert len(columns['index']) == first == 150
+
+
+def test_metadata_describe_the_files(dataset):
+    info = json.loads((dataset / 'meta/info.json').read_text())
+    table = parquet.read_table(dataset / DATA.format(0))
+    assert list(info['features']) == table.column_names
+    for name, feature in info['features'].items():
+        kind, (size,) = table.schema.field(name).type, feature['shape']
+        value = str(kind.value_type if size > 1 else kind)
+        assert {'float': 'float32'}.get(value, value) == feature['dtype']
+        assert size == 1 or kind.list_size == size == len(feature['names'])
+    assert (info['total_episodes'], info['total_frames'], info['fps']) == (3, 150, 25)
+    rows = parquet.read_table(dataset / EPISODES).to_pylist()
+    bounds = [(row['dataset_from_index'], row['dataset_to_index']) for row in rows]
+    assert bounds == [(0, 50), (50, 100), (100, 150)]
+    assert [row['tasks'] for row in rows] == [[TASK]] * 3
+    tasks = parquet.read_table(dataset / 'meta/tasks.parquet')
+    (index,) = json.loads(tasks.schema.metadata[b'pandas'])['index_columns']
+    assert tasks.to_pydict() == {'task_index': [0], index: [TASK]}
+
+
+def test_statistics_are_those_of_all_frames(dataset):
+    statistics = json.loads((dataset / 'meta/stats.json').read_text())
+    columns = parquet.read_table(dataset / DATA.format(0)).to_pydict()
+    for name, values in columns.items():
+        rows = np.asarray(values, dtype=np.float64).reshape(150, -1)
+        found = statistics[name]
+        np.testing.assert_array_equal(found['min'], rows.min(axis=0))
+        np.testing.assert_array_equal(found['max'], rows.max(axis=0))
+        np.testing.assert_allclose(found['mean'], rows.mean(axis=0), rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(found['std'], rows.std(axis=0), rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(found['q50'], np.median(rows, axis=0), rtol=1e-6, atol=1e-9)
+        assert found['count'] == [150]
+
+
+def test_long_datasets_are_several_files(episodes, tmp_path, monkeypatch):
+    monkeypatch.setattr(lerobot, '_FILE_MEGABYTES', 0.01)
+    assert _export(episodes, tmp_path) == 0
+    rows = parquet.read_table(tmp_path / TASK / EPISODES).to_pylist()
+    assert [row['data/file_index'] for row in rows] == [0, 1, 2]
+    indices = [
+        parquet.read_table(tmp_path / TASK / DATA.format(file))['index'].to_pylist()
+        for file in range(3)
+    ]
+    assert indices == [list(range(50 * n, 50 * n + 50)) for n in range(3)]
+
+
+def test_an_object_free_task_has_the_goal_alone_as_its_environment(tmp_path):
+    Recorder('FetchReach', 12.5).record(EpisodeDirectory(tmp_path / 'logged'))
+    assert _export(tmp_path / 'logged', tmp_path) == 0
+    info = json.loads((tmp_path / 'FetchReach/meta/info.json').read_text())
+    assert info['fps'] == 12.5
+    assert info['features']['observation.state']['shape'] == [10]
+    assert info['features']['observation.environment_state']['shape'] == [3]
+
+
+def test_episodes_of_two_rates_are_refused(tmp_path, capsys):
+    for rate in (25.0, 50.0):
+        Recorder('FetchReach', rate).record(EpisodeDirectory(tmp_path / 'logged'))
+    assert _export(tmp_path / 'logged', tmp_path / 'out') == 1
+    assert 'episodes at 25, 50 Hz; a LeRobot dataset has one rate' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+def test_nothing_is_overwritten(episodes, dataset, capsys):
+    assert _export(episodes, dataset.parent) == 1
+    assert 'exists; nothing is overwritten' in capsys.readouterr().err
+
+
+def test_lerobot_reads_it(dataset, monkeypatch):
+    monkeypatch.setenv('HF_HUB_OFFLINE', '1')
+    package = pytest.importorskip('lerobot.datasets.lerobot_dataset')
+    window = {'action': [step / 25 for step in range(8)]}
+    read = package.LeRobotDataset(f'me/{TASK}', root=dataset, delta_timestamps=window)
+    assert (read.num_episodes, len(read), read.fps) == (3, 150, 25)
+    assert read[148]['action'].shape == (8, 4)
+    assert read[148]['action_is_pad'].tolist() == [False] * 2 + [True] * 6
+    assert read[148]['task'] == TASK
