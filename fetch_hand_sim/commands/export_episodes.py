@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from fetch_hand_sim.commands.picture_size import picture_size
 from fetch_hand_sim.episode_log import (
     EpisodeArrays,
     EpisodeReadError,
@@ -18,11 +19,11 @@ from fetch_hand_sim.episode_log import (
 )
 from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.episodes.export import export_minari, export_parquet
-from fetch_hand_sim.episodes.lerobot import export_lerobot
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     EXIT_USAGE,
+    CommandError,
     CommandParser,
     UsageError,
     complain,
@@ -44,7 +45,21 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         '--name', default='logged-v0', help='of a Minari dataset; default: logged-v0'
     )
-    return parser.parse_args(arguments)
+    parser.add_argument(
+        '--pictures',
+        type=picture_size,
+        metavar='WxH',
+        help='films of this size in a LeRobot dataset; default: none',
+    )
+    parser.add_argument('--camera', help='of the model, for --pictures; default: a good view')
+    options = parser.parse_args(arguments)
+    if options.pictures and options.to != 'lerobot':
+        parser.error(f'--pictures is for --to lerobot, not {options.to}')
+    if options.camera and not options.pictures:
+        parser.error('--camera needs --pictures')
+    if options.pictures and any(side % 2 for side in options.pictures):
+        parser.error('--pictures: even sides are allowed')
+    return options
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -99,9 +114,26 @@ def _export(options: argparse.Namespace, episodes: Sequence[EpisodeArrays]) -> s
     if options.to == 'parquet':
         return ', '.join(str(path) for path in export_parquet(episodes, options.output))
     if options.to == 'lerobot':
-        return f'LeRobot dataset {export_lerobot(episodes, options.output)}'
+        return f'LeRobot dataset {_export_lerobot(options, episodes)}'
     dataset_id = export_minari(episodes, options.output, options.name)
     return f'Minari dataset {dataset_id} in {options.output}'
+
+
+def _export_lerobot(options: argparse.Namespace, episodes: Sequence[EpisodeArrays]) -> Path:
+    # Films are drawn with MuJoCo, which the other kinds do without.
+    from fetch_hand_sim.datasets.lerobot import export_lerobot
+    from fetch_hand_sim.datasets.lerobot_film import Camera
+
+    camera = None
+    if options.pictures is not None:
+        width, height = options.pictures
+        camera = Camera(width, height, options.camera)
+    try:
+        return export_lerobot(episodes, options.output, camera)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    except RuntimeError as error:
+        raise CommandError(str(error)) from None
 
 
 if __name__ == '__main__':

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fetch_hand_sim.commands.picture_size import picture_size
 from msgs_spec.command_line import (
     EXIT_SUCCESS,
     CommandError,
@@ -29,15 +30,6 @@ _NAME = 'render_episode'
 _SPEEDS = (0.01, 100.0)
 
 
-def _size(text: str) -> tuple[int, int]:
-    try:
-        width, height = (int(side) for side in text.split('x'))
-    except ValueError:
-        message = f'{text[:80]!r} given; allowed: two numbers with an x between them'
-        raise argparse.ArgumentTypeError(message) from None
-    return width, height
-
-
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('path', type=Path, help='an episode; with --grid a folder of episodes')
@@ -45,11 +37,15 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         '--out', type=Path, required=True, help='film.mp4, .gif or .webp; picture.png or .jpg'
     )
     parser.add_argument(
-        '--size', type=_size, default=(640, 480), metavar='WxH', help='pixels; default: 640x480'
+        '--size',
+        type=picture_size,
+        default=(640, 480),
+        metavar='WxH',
+        help='pixels; default: 640x480',
     )
     parser.add_argument('--camera', help='a camera of the model; default: a good view')
     parser.add_argument(
-        '--grid', type=_size, metavar='CxR', help='columns x rows of episodes, such as 4x4'
+        '--grid', type=picture_size, metavar='CxR', help='columns x rows of episodes, such as 4x4'
     )
     parser.add_argument('--frame', type=int, default=-1, help='of a picture; default: -1, the last')
     parser.add_argument('--speed', type=float, default=1.0, help='simulated seconds per second')

@@ -48,7 +48,9 @@ def check_kind(path: Path) -> None:
         _ffmpeg()
 
 
-def write_film(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+def write_film(
+    path: Path, pictures: Iterable[Picture], fps: float, keyframe_every: int = 0
+) -> None:
     """Writes pictures (height, width, 3) of one size; the file appears when it is complete.
 
     Args:
@@ -56,6 +58,8 @@ def write_film(path: Path, pictures: Iterable[Picture], fps: float) -> None:
         pictures: Drawn as they are written.
         fps: Pictures per second. A GIF or WebP shows 50 at most: it takes every n-th picture where
             there are more, so that the film lasts as long.
+        keyframe_every: Of an .mp4, how many pictures apart those are that need no other to be
+            shown, for who jumps about in it; 0 for as the encoder likes.
 
     Raises:
         UsageError: If there is no ffmpeg.
@@ -63,7 +67,7 @@ def write_film(path: Path, pictures: Iterable[Picture], fps: float) -> None:
     """
     with _appearing(path) as hidden:
         if path.suffix.lower() == '.mp4':
-            _write_mp4(hidden, pictures, fps)
+            _write_mp4(hidden, pictures, fps, keyframe_every)
         else:
             _write_animation(hidden, pictures, fps)
 
@@ -108,7 +112,7 @@ def _durations(count: int, fps: float, unit: int) -> list[int]:
     return [max(_SHORTEST_MS, length) for length in lengths.tolist()]
 
 
-def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float, keyframe_every: int) -> None:
     iterator = iter(pictures)
     first = next(iterator)
     height, width = first.shape[:2]
@@ -116,6 +120,8 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
     command += ['-s', f'{width}x{height}', '-r', f'{fps:g}', '-i', '-', '-an']
     # H.264 in 4:2:0, which every player shows, needs even sides.
     command += ['-vf', 'pad=ceil(iw/2)*2:ceil(ih/2)*2', '-c:v', 'libx264', '-crf', '20']
+    if keyframe_every:
+        command += ['-g', str(keyframe_every), '-bf', '0']
     command += ['-pix_fmt', 'yuv420p', '-movflags', '+faststart', '-f', 'mp4', str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stderr is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,13 +55,26 @@ class Studio:
             ValueError: If there is no such frame, or the model has no such camera.
             RuntimeError: If there is no OpenGL.
         """
-        frames = recording.frames
-        count = len(frames)
-        if not -count <= index < count:
-            raise ValueError(f'{recording.title}: frame {index}; allowed: {-count} ... {count - 1}')
-        index %= count
+        frames, index = recording.frames, self._index(recording, index)
         trail = [tracked_position(f) for f in frames[max(0, index - _TRAIL_TICKS) : index + 1]]
         return self._renderer(recording.spec.name).render(frames[index], trail)
+
+    def plain(self, recording: Recording, index: int) -> Picture:
+        """Returns the same as a camera would see it: no way of the object, a goal of one colour.
+
+        Raises:
+            ValueError: If there is no such frame, or the model has no such camera.
+            RuntimeError: If there is no OpenGL.
+        """
+        frame = recording.frames[self._index(recording, index)]
+        frame = replace(frame, is_success=False)
+        return self._renderer(recording.spec.name).render(frame, [])
+
+    def _index(self, recording: Recording, index: int) -> int:
+        count = len(recording.frames)
+        if not -count <= index < count:
+            raise ValueError(f'{recording.title}: frame {index}; allowed: {-count} ... {count - 1}')
+        return index % count
 
     def close(self) -> None:
         """Frees OpenGL."""

@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.commands import export_episodes
+from fetch_hand_sim.datasets import lerobot
+from fetch_hand_sim.datasets.lerobot_film import color_statistics
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
-from fetch_hand_sim.episodes import lerobot
+from fetch_hand_sim.films.pictures import Studio
+from fetch_hand_sim.films.recording import load_recordings
+from fetch_hand_sim.simulation.opengl import prepare_opengl
 from policy_node.training import generate_episodes
 from support.episode_recorder import Recorder
 
@@ -112,6 +116,72 @@ def test_long_datasets_are_several_files(episodes, tmp_path, monkeypatch):
         for file in range(3)
     ]
     assert indices == [list(range(50 * n, 50 * n + 50)) for n in range(3)]
+
+
+FILM = 'videos/observation.images.scene/chunk-000/file-000.mp4'
+
+
+def test_films_show_every_frame_and_say_where_each_episode_begins(episodes, tmp_path):
+    imageio_ffmpeg = pytest.importorskip('imageio_ffmpeg')
+    try:
+        prepare_opengl()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    arguments = ['--to', 'lerobot', '--output', str(tmp_path), '--pictures', '64x48']
+    assert export_episodes.main([str(episodes), *arguments]) == 0
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / TASK / FILM))
+    about = next(reader)
+    pictures = [np.frombuffer(picture, np.uint8).reshape(48, 64, 3) for picture in reader]
+    assert (about['size'], about['fps'], len(pictures)) == ((64, 48), 25.0, 150)
+    studio = Studio(64, 48)
+    for number, recording in enumerate(load_recordings(episodes, 3)):
+        for index in (0, 49):
+            drawn = studio.plain(recording, index).astype(int)
+            assert np.abs(drawn - pictures[50 * number + index]).mean() < 8.0
+    studio.close()
+    info = json.loads((tmp_path / TASK / 'meta/info.json').read_text())
+    assert info['features']['observation.images.scene']['shape'] == [48, 64, 3]
+    rows = parquet.read_table(tmp_path / TASK / EPISODES).to_pylist()
+    key = 'videos/observation.images.scene'
+    bounds = [(row[f'{key}/from_timestamp'], row[f'{key}/to_timestamp']) for row in rows]
+    assert bounds == [(0.0, 2.0), (2.0, 4.0), (4.0, 6.0)]
+
+
+def test_colors_are_summed_up_as_numbers_are():
+    picture = np.random.default_rng(0).integers(0, 256, size=(6, 8, 3), dtype=np.uint8)
+    histogram = np.array([np.bincount(picture[..., c].ravel(), minlength=256) for c in range(3)])
+    found = color_statistics(histogram, pixels=48)
+    rows = picture.reshape(-1, 3) / 255.0
+    expected = {'min': rows.min(axis=0), 'max': rows.max(axis=0), 'mean': rows.mean(axis=0)}
+    expected |= {'std': rows.std(axis=0)}
+    expected |= {'q50': np.quantile(rows, 0.5, axis=0, method='inverted_cdf')}
+    for name, values in expected.items():
+        np.testing.assert_allclose(np.ravel(found[name]), values, atol=1e-9)
+    assert found['count'] == [1]
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'says'),
+    [
+        (['--to', 'lerobot', '--pictures', '95x96'], 'even sides'),
+        (['--to', 'lerobot', '--pictures', 'large'], 'two numbers with an x'),
+        (['--to', 'minari', '--pictures', '96x96'], 'is for --to lerobot'),
+        (['--to', 'lerobot', '--camera', 'gripper_camera_rgb'], 'needs --pictures'),
+        (['--to', 'lerobot', '--pictures', '96x96', '--camera', 'nosuch'], 'nosuch'),
+    ],
+)
+def test_films_that_cannot_be_are_refused(episodes, tmp_path, arguments, says, capsys):
+    code = export_code([str(episodes), '--output', str(tmp_path / 'out'), *arguments])
+    assert code == 2
+    assert says in capsys.readouterr().err
+    assert not list(tmp_path.rglob('*.*'))
+
+
+def export_code(arguments: list[str]) -> int:
+    try:
+        return export_episodes.main(arguments)
+    except SystemExit as end:
+        return int(end.code or 0)
 
 
 def test_an_object_free_task_has_the_goal_alone_as_its_environment(tmp_path):

@@ -1,0 +1,1 @@
+"""Logged episodes as datasets that other libraries read."""

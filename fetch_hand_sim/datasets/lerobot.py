@@ -1,0 +1,233 @@
+"""Logged episodes as a LeRobot dataset, format 3.0: what imitation learning on robots reads.
+
+Needs pyarrow (the extra `[data]`), not lerobot itself, whose pins exclude other packages' torch.
+Files are those of `LeRobotDataset.create` and `save_episode` in lerobot 0.4.4.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.datasets.lerobot_columns import Columns, features, frames, statistics
+from fetch_hand_sim.datasets.lerobot_film import Camera, Histogram, color_statistics, write_episodes
+from fetch_hand_sim.episode_log import EpisodeArrays
+from fetch_hand_sim.episodes.export import ExportError, require
+from msgs_spec.tasks import TaskSpec
+
+_VERSION = 'v3.0'
+_FILES_PER_CHUNK = 1000
+# Uncompressed, as `meta/info.json` says; films are not measured.
+_FILE_MEGABYTES, _FILM_MEGABYTES = 100, 200
+_FILE = 'chunk-{chunk_index:03d}/file-{file_index:03d}'
+_DATA, _FILM = f'data/{_FILE}.parquet', f'videos/{{video_key}}/{_FILE}.mp4'
+_EPISODES = f'meta/episodes/{_FILE}.parquet'
+
+Row = dict[str, Any]
+
+
+def export_lerobot(
+    episodes: Sequence[EpisodeArrays], directory: Path, camera: Camera | None = None
+) -> Path:
+    """Writes the episodes of one task as a dataset of N frames each, one per action.
+
+    A frame is `observation.state`, what is observed of the robot; `observation.environment_state`,
+    what is observed of the object, then the desired goal; `action`; and what came of it,
+    `next.reward`, `next.success` and `next.done`. All float32, as LeRobot's policies take them.
+
+    Args:
+        episodes: At least one, all of one task and one rate, each with at least one step.
+        directory: Where to write.
+        camera: Whose films are part of it; None for none.
+
+    Returns:
+        The dataset, `directory/<task>`: `LeRobotDataset('me/<task>', root=...)`.
+
+    Raises:
+        ExportError: If pyarrow is missing, rates differ, or the dataset exists or cannot be
+            written; none is created.
+        UsageError: If a film is asked for and there is no ffmpeg.
+        ValueError: If the model has no such camera.
+        RuntimeError: If there is no OpenGL to draw with.
+    """
+    require('pyarrow.parquet')
+    spec = episodes[0].spec
+    rates = sorted({episode.record.control_hz for episode in episodes})
+    if len(rates) > 1:
+        found = ', '.join(f'{rate:g}' for rate in rates)
+        raise ExportError(f'{spec.name}: episodes at {found} Hz; a LeRobot dataset has one rate')
+    target = directory / spec.name
+    if target.exists():
+        raise ExportError(f'{target} exists; nothing is overwritten')
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix='.', suffix='.partial', dir=directory) as hidden:
+            dataset = Path(hidden) / spec.name
+            _Dataset(dataset, spec, rates[0], camera).write(episodes)
+            dataset.rename(target)
+    except OSError as error:
+        raise ExportError(f'{target}: {error.strerror or error}') from error
+    return target
+
+
+@dataclass(frozen=True, slots=True)
+class _Dataset:
+    """A dataset that is being written."""
+
+    path: Path
+    spec: TaskSpec
+    rate: float
+    camera: Camera | None
+
+    def write(self, episodes: Sequence[EpisodeArrays]) -> None:
+        pyarrow, parquet = require('pyarrow'), require('pyarrow.parquet')
+        begins = accumulate((len(episode) for episode in episodes), initial=0)
+        columns = [
+            frames(episode, number, begin)
+            for number, (episode, begin) in enumerate(zip(episodes, begins, strict=False))
+        ]
+        rows: list[Row] = []
+        colors: list[Histogram] = []
+        for number, group in enumerate(_files(columns)):
+            chunk, file = divmod(number, _FILES_PER_CHUNK)
+            where = {'chunk_index': chunk, 'file_index': file}
+            tables = [pyarrow.table({n: _column(v) for n, v in each.items()}) for each in group]
+            parquet.write_table(pyarrow.concat_tables(tables), self._file(_DATA, **where))
+            added = [self._row(each, where) for each in group]
+            if self.camera is not None:
+                paths = [episodes[row['episode_index']].path for row in added]
+                colors += self._film(self.camera, paths, added, where)
+            rows += added
+        table = pyarrow.Table.from_pylist(rows)
+        parquet.write_table(table, self._file(_EPISODES, chunk_index=0, file_index=0))
+        parquet.write_table(_tasks(self.spec), self._file('meta/tasks.parquet'))
+        self._write_json('meta/stats.json', self._statistics(columns, colors))
+        self._write_json('meta/info.json', self._info(rows))
+
+    def _row(self, columns: Columns, where: dict[str, int]) -> Row:
+        """What `meta/episodes` says of an episode."""
+        index = columns['index']
+        return {
+            'episode_index': int(columns['episode_index'][0]),
+            'tasks': [self.spec.name],
+            'length': len(index),
+            **{f'data/{name}': value for name, value in where.items()},
+            'dataset_from_index': int(index[0]),
+            'dataset_to_index': int(index[-1]) + 1,
+            **_flat({name: statistics(values) for name, values in columns.items()}),
+            'meta/episodes/chunk_index': 0,
+            'meta/episodes/file_index': 0,
+        }
+
+    def _film(
+        self, camera: Camera, paths: Sequence[Path], rows: Sequence[Row], where: dict[str, int]
+    ) -> list[Histogram]:
+        """Writes the film of some episodes and adds to their rows where it is."""
+        path = self._file(_FILM, video_key=camera.key, **where)
+        colors = write_episodes(path, paths, camera, self.rate)
+        begins = accumulate((row['length'] for row in rows), initial=0)
+        for row, begin, histogram in zip(rows, begins, colors, strict=False):
+            end = begin + row['length']
+            says = {'from_timestamp': begin / self.rate, 'to_timestamp': end / self.rate}
+            row |= {f'videos/{camera.key}/{name}': value for name, value in (where | says).items()}
+            row |= _flat({camera.key: color_statistics(histogram, camera.width * camera.height)})
+        return colors
+
+    def _statistics(self, columns: Sequence[Columns], colors: Sequence[Histogram]) -> Row:
+        found = {
+            name: statistics(np.concatenate([each[name] for each in columns]))
+            for name in features(self.spec)
+        }
+        if self.camera is not None:
+            pixels = self.camera.width * self.camera.height
+            found[self.camera.key] = color_statistics(np.sum(colors, axis=0), pixels)
+        return found
+
+    def _info(self, rows: Sequence[Row]) -> Row:
+        camera, rate = self.camera, self.rate
+        fps = int(rate) if rate == int(rate) else rate
+        return {
+            'codebase_version': _VERSION,
+            'robot_type': self.spec.robot.name,
+            'total_episodes': len(rows),
+            'total_frames': rows[-1]['dataset_to_index'],
+            'total_tasks': 1,
+            'chunks_size': _FILES_PER_CHUNK,
+            'data_files_size_in_mb': _FILE_MEGABYTES,
+            'video_files_size_in_mb': _FILM_MEGABYTES,
+            'fps': fps,
+            'splits': {'train': f'0:{len(rows)}'},
+            'data_path': _DATA,
+            'video_path': None if camera is None else _FILM,
+            'features': {
+                **({} if camera is None else {camera.key: camera.feature(fps)}),
+                **features(self.spec),
+            },
+        }
+
+    def _file(self, pattern: str, **fields: Any) -> Path:
+        path = self.path / pattern.format(**fields)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def _write_json(self, name: str, value: Any) -> None:
+        text = json.dumps(value, indent=4, ensure_ascii=False)
+        self._file(name).write_text(text, encoding='utf-8')
+
+
+def _files(episodes: Sequence[Columns]) -> Iterator[list[Columns]]:
+    """The episodes, file by file."""
+    group: list[Columns] = []
+    size = 0
+    for columns in episodes:
+        more = sum(values.nbytes for values in columns.values())
+        if group and size + more > _FILE_MEGABYTES * 2**20:
+            yield group
+            group, size = [], 0
+        group.append(columns)
+        size += more
+    yield group
+
+
+def _column(values: NDArray[Any]) -> Any:
+    """Numbers, or vectors of fixed size; a vector of one number is that number."""
+    pyarrow = require('pyarrow')
+    flat = pyarrow.array(values.ravel())
+    if values.ndim == 1 or values.shape[1] == 1:
+        return flat
+    return pyarrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
+
+
+def _flat(found: Row) -> Row:
+    """Statistics by column and kind as one row has them."""
+    return {
+        f'stats/{name}/{kind}': value
+        for name, kinds in found.items()
+        for kind, value in kinds.items()
+    }
+
+
+def _tasks(spec: TaskSpec) -> Any:
+    """The one task; pandas reads the names as the index of the table."""
+    names = '__index_level_0__'
+    number = {'pandas_type': 'int64', 'numpy_type': 'int64', 'metadata': None}
+    name = {'pandas_type': 'unicode', 'numpy_type': 'object', 'metadata': None}
+    pandas = {
+        'index_columns': [names],
+        'column_indexes': [],
+        'columns': [
+            {'name': 'task_index', 'field_name': 'task_index', **number},
+            {'name': None, 'field_name': names, **name},
+        ],
+        'pandas_version': '2.2.3',
+    }
+    table = require('pyarrow').table({'task_index': [0], names: [spec.name]})
+    return table.replace_schema_metadata({'pandas': json.dumps(pandas)})
