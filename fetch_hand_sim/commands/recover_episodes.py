@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fetch_hand_sim.episode_log import (
+    EpisodeInUseError,
     EpisodeLogError,
     EpisodeReadError,
     find_leftovers,
@@ -66,13 +67,16 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _recover(leftover: Path) -> bool:
-    """Recovers one episode and says what came out; whether it worked."""
+    """Recovers one episode and says what came out; False if it is left unfinished."""
     try:
         path = recover_episode(leftover)
         if path is None:
             say(f'cleared away {leftover}: it was killed before its first messages were written')
             return True
         episode = read_summary(path)
+    except EpisodeInUseError as error:
+        say(str(error))
+        return True
     except (EpisodeLogError, EpisodeReadError) as error:
         complain(_NAME, error)
         return False
