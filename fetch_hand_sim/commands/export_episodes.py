@@ -17,7 +17,7 @@ from fetch_hand_sim.episode_log import (
     expand_episodes,
 )
 from fetch_hand_sim.episode_log.arrays import load_episode
-from fetch_hand_sim.episodes.export import export_minari, export_parquet
+from fetch_hand_sim.episodes.export import export_minari, export_parquet, why_apart
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
@@ -54,13 +54,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     require_extra('data')
     skipped: list[EpisodeReadError] = []
-    episodes: list[EpisodeArrays] = []
+    by_task: dict[str, list[EpisodeArrays]] = {}
     try:
         paths = expand_episodes(options.path)
         with progress('episodes', len(paths)) as advance:
             for path in paths:
                 try:
-                    episodes.append(_load(path, options.to))
+                    _add(load_episode(path), by_task, options.to)
                 except EpisodeReadError as error:
                     skipped.append(error)
                 advance(1)
@@ -68,36 +68,36 @@ def _run(options: argparse.Namespace) -> int:
         raise UsageError(str(error)) from None
     for reason in skipped:
         complain(_NAME, f'skipped {reason}')
-    if not episodes and skipped:
+    if not by_task and skipped:
         return EXIT_USAGE
-    if not episodes:
+    if not by_task:
         raise UsageError(f'{options.path} holds no episode')
-    by_task: dict[str, list[EpisodeArrays]] = {}
-    for episode in episodes:
-        by_task.setdefault(episode.spec.name, []).append(episode)
-    for task, group in by_task.items():
-        done = f'{len(group)} episodes of {task}: {_export(options, group)}'
-        say(done)
+    for task, written in _export(options, by_task).items():
+        say(f'{len(by_task[task])} episodes of {task}: {written}')
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
 
 
-def _load(path: Path, to: str) -> EpisodeArrays:
-    """Reads an episode.
+def _add(episode: EpisodeArrays, by_task: dict[str, list[EpisodeArrays]], to: str) -> None:
+    """Puts an episode beside those of its task.
 
     Raises:
-        EpisodeReadError: If it cannot be read, or a dataset of this kind cannot hold it.
+        EpisodeReadError: If a dataset of this kind cannot hold it.
     """
-    episode = load_episode(path)
+    others = by_task.get(episode.spec.name)
     if to == 'minari' and len(episode) == 0:
-        raise EpisodeReadError(f'{path}: no step was taken, and Minari needs one')
-    return episode
+        raise EpisodeReadError(f'{episode.path}: no step was taken, and Minari needs one')
+    if to == 'minari' and others and (why := why_apart(episode, others[0])):
+        raise EpisodeReadError(f'{episode.path}: {why}; a Minari dataset has one environment')
+    by_task.setdefault(episode.spec.name, []).append(episode)
 
 
-def _export(options: argparse.Namespace, episodes: Sequence[EpisodeArrays]) -> str:
+def _export(options: argparse.Namespace, by_task: dict[str, list[EpisodeArrays]]) -> dict[str, str]:
+    """Writes all; returns for each task where it is."""
     if options.to == 'parquet':
-        return ', '.join(str(path) for path in export_parquet(episodes, options.output))
-    dataset_id = export_minari(episodes, options.output, options.name)
-    return f'Minari dataset {dataset_id} in {options.output}'
+        files = export_parquet(by_task, options.output)
+        return {task: ', '.join(map(str, paths)) for task, paths in files.items()}
+    ids = export_minari(by_task, options.output, options.name)
+    return {task: f'Minari dataset {each} in {options.output}' for task, each in ids.items()}
 
 
 if __name__ == '__main__':

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -33,7 +33,11 @@ _DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
 _VERSION = re.compile(r'-v\d+$')
 # Minari's: where datasets live, and what is in the directories above one.
 _MINARI_PATH, _NAMESPACE = 'MINARI_DATASETS_PATH', 'namespace_metadata.json'
+# Of a record, what `_environment` is made of.
+_OF_THE_ENVIRONMENT = ('control_hz', 'timing', 'reward_type', 'success_rule')
 _OBSERVATIONS = ('observation', 'achieved_goal', 'desired_goal')
+
+ByTask = Mapping[str, Sequence[EpisodeArrays]]
 
 
 class ExportError(CommandError):
@@ -50,8 +54,8 @@ def _require(module: str) -> Any:
         ) from error
 
 
-def export_parquet(episodes: Sequence[EpisodeArrays], directory: Path) -> list[Path]:
-    """Writes the episodes of one task as two tables.
+def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
+    """Writes the episodes of each task as two tables, all of them or none.
 
     `<task>.parquet` has N + 1 rows per episode, one per observation: `episode_index`, `step`,
     `timestamp` in seconds since the reset, the three observations, then what happened after it:
@@ -59,34 +63,43 @@ def export_parquet(episodes: Sequence[EpisodeArrays], directory: Path) -> list[P
     row. `<task>_episodes.parquet` has a row per episode: what the file says of itself.
 
     Args:
-        episodes: At least one, all of one task.
+        by_task: Episodes, at least one of each task.
         directory: Where to write.
 
     Returns:
-        The two files.
+        The two files of each task.
 
     Raises:
         ExportError: If pyarrow is missing, or a file exists or cannot be written; none is created.
     """
     pyarrow, parquet = _require('pyarrow'), _require('pyarrow.parquet')
-    task = episodes[0].spec.name
-    tables = {
-        directory / f'{task}.parquet': pyarrow.concat_tables(
-            _step_table(pyarrow, index, episode) for index, episode in enumerate(episodes)
-        ),
-        directory / f'{task}_episodes.parquet': pyarrow.Table.from_pylist(
-            [_episode_row(index, episode) for index, episode in enumerate(episodes)]
-        ),
+    paths = {
+        task: [directory / f'{task}.parquet', directory / f'{task}_episodes.parquet']
+        for task in by_task
     }
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        for path in tables:
-            if path.exists():
-                raise ExportError(f'{path} exists; nothing is overwritten')
+        _require_new(path for pair in paths.values() for path in pair)
+        tables: dict[Path, Any] = {}
+        for task, episodes in by_task.items():
+            tables |= zip(paths[task], _tables(pyarrow, episodes), strict=True)
         _write_tables(parquet, tables)
     except OSError as error:
         raise ExportError(f'{directory}: {error.strerror or error}') from error
-    return list(tables)
+    return paths
+
+
+def _require_new(paths: Iterable[Path]) -> None:
+    for path in paths:
+        if path.exists():
+            raise ExportError(f'{path} exists; nothing is overwritten')
+
+
+def _tables(pyarrow: Any, episodes: Sequence[EpisodeArrays]) -> tuple[Any, Any]:
+    """The steps of some episodes of one task, and the episodes."""
+    steps = [_step_table(pyarrow, index, episode) for index, episode in enumerate(episodes)]
+    rows = [_episode_row(index, episode) for index, episode in enumerate(episodes)]
+    return pyarrow.concat_tables(steps), pyarrow.Table.from_pylist(rows)
 
 
 def _write_tables(parquet: Any, tables: Mapping[Path, Any]) -> None:
@@ -146,17 +159,30 @@ def _episode_row(index: int, episode: EpisodeArrays) -> dict[str, Any]:
     }
 
 
-def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str) -> str:
-    """Writes the episodes of one task as a Minari dataset.
+def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
+    """Returns why an episode cannot be in the Minari dataset of another of its task, '' if it can.
+
+    A dataset has one environment, whose rewards and rate are those of all its episodes.
+    """
+    one, other = episode.record, first.record
+    for name in _OF_THE_ENVIRONMENT:
+        if getattr(one, name) != getattr(other, name):
+            return f'{name} {getattr(one, name)}, and {getattr(other, name)} in {first.path}'
+    return ''
+
+
+def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]:
+    """Writes the episodes of each task as a Minari dataset, all of them or none.
 
     Args:
-        episodes: At least one, all of one task.
+        by_task: Episodes, at least one of each task, and none that is apart from the first of its
+            task, see `why_apart`.
         directory: Where Minari datasets live (`MINARI_DATASETS_PATH`).
         name: Of the dataset, such as `logged-v0` or `me/logged-v0`; the task comes before it, and a
             version after it if it has none.
 
     Returns:
-        The id of the dataset, `<task>/<name>`.
+        The id of each task's dataset, `<task>/<name>`.
 
     Raises:
         UsageError: If the name is not allowed.
@@ -169,10 +195,28 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
             'as logged-v0'
         )
     minari, collector = _require('minari'), _require('minari.data_collector')
+    versioned = name if _VERSION.search(name) else f'{name}-v0'
+    ids = {task: f'{task}/{versioned}' for task in by_task}
+    try:
+        _require_new(directory / dataset_id for dataset_id in ids.values())
+        directory.mkdir(parents=True, exist_ok=True)
+        with _appearing(directory, list(ids.values())), warnings.catch_warnings():
+            # Minari warns of every field that only an author could fill in.
+            warnings.filterwarnings('ignore', module='minari')
+            for task, episodes in by_task.items():
+                _create_dataset(minari, collector, ids[task], episodes)
+    except ImportError as error:
+        raise ExportError(f"{error}; install with pip install 'fetch_hand_sim[data]'") from error
+    except (OSError, ValueError, AssertionError) as error:
+        raise ExportError(f'{directory}: {" ".join(str(error).split())}') from error
+    return ids
+
+
+def _create_dataset(
+    minari: Any, collector: Any, dataset_id: str, episodes: Sequence[EpisodeArrays]
+) -> None:
+    """Writes a dataset where `MINARI_DATASETS_PATH` says."""
     spec = episodes[0].spec
-    dataset_id = f'{spec.name}/{name if _VERSION.search(name) else f"{name}-v0"}'
-    if (directory / dataset_id).exists():
-        raise ExportError(f'{directory / dataset_id} exists; nothing is overwritten')
     buffers = [
         collector.EpisodeBuffer(
             id=index,
@@ -188,31 +232,21 @@ def export_minari(episodes: Sequence[EpisodeArrays], directory: Path, name: str)
     ]
     # Actions worked out from commands are not all float32.
     actions = spaces.Box(-1.0, 1.0, (spec.robot.action_size,), np.float64)
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        with _appearing(directory, dataset_id), warnings.catch_warnings():
-            # Minari warns of every field that only an author could fill in.
-            warnings.filterwarnings('ignore', module='minari')
-            minari.create_dataset_from_buffers(
-                dataset_id,
-                buffers,
-                env=_environment(episodes[0]),
-                observation_space=observation_space(spec),
-                action_space=actions,
-                algorithm_name=_algorithm(episodes),
-                description=f'Logged episodes of {spec.name}.',
-                data_format='arrow',
-                requirements=_requirements(episodes[0]),
-            )
-    except ImportError as error:
-        raise ExportError(f"{error}; install with pip install 'fetch_hand_sim[data]'") from error
-    except (OSError, ValueError, AssertionError) as error:
-        raise ExportError(f'{dataset_id}: {" ".join(str(error).split())}') from error
-    return dataset_id
+    minari.create_dataset_from_buffers(
+        dataset_id,
+        buffers,
+        env=_environment(episodes[0]),
+        observation_space=observation_space(spec),
+        action_space=actions,
+        algorithm_name=_algorithm(episodes),
+        description=f'Logged episodes of {spec.name}.',
+        data_format='arrow',
+        requirements=_requirements(episodes[0]),
+    )
 
 
 @contextmanager
-def _appearing(directory: Path, dataset_id: str) -> Iterator[None]:
+def _appearing(directory: Path, dataset_ids: Sequence[str]) -> Iterator[None]:
     """Minari writes into a hidden folder meanwhile; what is whole at the end moves to its place."""
     # Minari joins a relative path to itself.
     directory = directory.resolve()
@@ -227,7 +261,8 @@ def _appearing(directory: Path, dataset_id: str) -> Iterator[None]:
             target.parent.mkdir(parents=True, exist_ok=True)
             if not target.exists():
                 source.replace(target)
-        (Path(hidden) / dataset_id).rename(directory / dataset_id)
+        for dataset_id in dataset_ids:
+            (Path(hidden) / dataset_id).rename(directory / dataset_id)
 
 
 def _environment(episode: EpisodeArrays) -> Any:
