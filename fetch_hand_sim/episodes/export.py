@@ -26,7 +26,6 @@ from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
 from fetch_hand_sim.gym_envs.spaces import observation_space
 from msgs_spec.command_line import CommandError, UsageError, printable
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 
 # Parts of a dataset's id become directories.
 _DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
@@ -272,9 +271,7 @@ def _environment(episode: EpisodeArrays) -> Any:
     spec = copy.deepcopy(gymnasium.spec(environment_id(episode.spec.name)))
     for name in ('reward_type', 'success_rule', 'control_hz'):
         spec.kwargs[name] = getattr(record, name)
-    # Robots up to 1.0 took as many steps at every rate.
-    rate = record.control_hz if record.timing == 'seconds' else DEFAULT_CONTROL_HZ
-    spec.max_episode_steps = task_spec(episode.spec.name, control_hz=rate).episode_ticks
+    spec.max_episode_steps = episode.spec.episode_ticks
     return spec
 
 

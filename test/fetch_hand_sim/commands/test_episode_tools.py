@@ -279,6 +279,15 @@ def test_loaded_observations_are_those_of_the_simulation(generated):
         )
 
 
+@pytest.mark.parametrize('timing', ['seconds', 'ticks'])
+@pytest.mark.parametrize('control_hz', [12.5, 25.0, 50.0])
+def test_the_task_of_a_whole_episode_has_as_many_ticks(control_hz, timing, tmp_path):
+    path = Recorder('FetchReach', control_hz, timing=timing).record(EpisodeDirectory(tmp_path))
+    (arrays,) = load_episodes(path)
+    assert arrays.spec.episode_ticks == len(arrays)
+    assert dataclasses.replace(arrays.spec, episode_ticks=50) == TASKS['FetchReach']
+
+
 def test_decoding_all_at_once_equals_one_at_a_time(generated):
     _, paths = generated
     episode = read_episode(paths[0])
