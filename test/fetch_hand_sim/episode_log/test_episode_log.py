@@ -21,6 +21,7 @@ from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
     EpisodeWriter,
     LogSettings,
+    durable,
     find_leftovers,
     log_time,
     read_episode,
@@ -445,6 +446,15 @@ def test_metadata_must_be_strings(tmp_path):
 def test_bad_settings_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         LogSettings(**bad)
+
+
+@pytest.mark.parametrize('task', ['Fetch-Near', 'fetch.near v2', 'Näher_000001_seed1'])
+def test_numbers_go_on_whatever_a_task_is_called(tmp_path, task):
+    for number, seed in enumerate((5, 0)):
+        writer = EpisodeDirectory(tmp_path).begin(task, seed, {})
+        assert durable.active_path(tmp_path, f'{task}_{number:06d}_seed{seed}').is_dir()
+        # What was cut off has its number too.
+        writer._stream.close()
 
 
 def test_numbers_go_on_after_what_is_there(tmp_path):
