@@ -145,10 +145,12 @@ def _ffmpeg() -> str:
 @contextmanager
 def _appearing(path: Path) -> Iterator[Path]:
     """A hidden file beside the path that takes its name when all is written."""
-    hidden = path.with_name(f'.{path.stem}.active{path.suffix.lower()}')
+    # A link stays one: what it leads to is written.
+    target = path.resolve()
+    hidden = target.with_name(f'.{target.stem}.active{path.suffix.lower()}')
     try:
         yield hidden
-        os.replace(hidden, path)
+        os.replace(hidden, target)
     except OSError as error:
         raise CommandError(f'{path}: {error.strerror or error}') from error
     finally:

@@ -87,6 +87,23 @@ def test_mp4_holds_every_picture(tmp_path):
     assert np.abs(frames.mean(axis=(1, 2, 3)) - 40.0 * np.arange(5)).max() < 6.0
 
 
+@pytest.mark.parametrize('name', ['film.gif', 'picture.PNG'])
+@pytest.mark.parametrize('is_there', [True, False])
+def test_a_link_stays_one_and_what_it_leads_to_is_written(name, is_there, tmp_path):
+    (tmp_path / 'store').mkdir()
+    target, link = tmp_path / 'store' / 'newest', tmp_path / name
+    if is_there:
+        target.write_bytes(b'older')
+    link.symlink_to(target)
+    if link.suffix == '.gif':
+        write_film(link, iter(PICTURES), fps=25.0)
+    else:
+        write_picture(link, PICTURES[0])
+    assert link.is_symlink() and [each.name for each in target.parent.iterdir()] == ['newest']
+    with Image.open(target) as image:
+        assert image.size == (7, 5)
+
+
 def test_a_film_that_fails_leaves_nothing(tmp_path):
     def pictures():
         yield PICTURES[0]
