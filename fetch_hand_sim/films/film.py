@@ -25,6 +25,8 @@ STILL = ('.png', '.jpg')
 _QUALITY = 72
 _COLORS = 128
 _SAMPLES = 8
+# Pixels of a side, at most.
+_LARGEST_SIDE = {'.mp4': 16384, '.gif': 65535, '.webp': 16383, '.jpg': 65500}
 # Milliseconds that a GIF and a WebP count in.
 _UNITS = {'.gif': 10, '.webp': 1}
 # Of a picture in either: browsers show what is shorter for 100.
@@ -46,6 +48,18 @@ def check_kind(path: Path) -> None:
         raise UsageError(f'--out {path}: {path.absolute().parent} is no directory')
     if kind == '.mp4':
         _ffmpeg()
+
+
+def check_size(path: Path, width: int, height: int) -> None:
+    """Checks that pictures of a size can be written, before they are drawn.
+
+    Raises:
+        UsageError: If the kind of file takes none as large.
+    """
+    kind = path.suffix.lower()
+    largest = _LARGEST_SIDE.get(kind)
+    if largest is not None and max(width, height) > largest:
+        raise UsageError(f'{width}x{height} pixels; allowed: {largest} a side of a {kind} file')
 
 
 def write_film(path: Path, pictures: Iterable[Picture], fps: float) -> None:

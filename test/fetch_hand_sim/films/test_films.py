@@ -13,7 +13,7 @@ from PIL import Image
 
 from fetch_hand_sim.commands.render_episode import main as render_episode
 from fetch_hand_sim.episode_log import EpisodeDirectory
-from fetch_hand_sim.films.film import check_kind, write_film, write_picture
+from fetch_hand_sim.films.film import check_kind, check_size, write_film, write_picture
 from fetch_hand_sim.films.pictures import Studio, grid, sheets, tile, with_frame
 from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.simulation.opengl import prepare_opengl
@@ -132,6 +132,20 @@ def test_what_cannot_be_written_is_said_before_drawing(out, tmp_path):
     (tmp_path / 'film.webp').mkdir()
     with pytest.raises(UsageError, match=r'film\.webp is a directory'):
         check_kind(tmp_path / 'film.webp')
+
+
+@pytest.mark.parametrize(('kind', 'largest'), [('webp', 16383), ('mp4', 16384), ('jpg', 65500)])
+def test_a_sheet_that_a_file_cannot_hold_is_one_line_before_drawing(
+    folder, tmp_path, kind, largest, monkeypatch, capsys
+):
+    monkeypatch.setattr(Studio, 'picture', lambda *_: pytest.fail('drawn'))
+    out = tmp_path / f'x.{kind}'
+    arguments = ['--grid', '20x1', '--size', '4096x48', '--out', str(out)]
+    assert render_episode([str(folder), *arguments]) == 2
+    assert capsys.readouterr().err == (
+        f'render_episode: 81958x48 pixels; allowed: {largest} a side of a .{kind} file\n'
+    )
+    check_size(out, largest, largest)
 
 
 def test_tiles_lie_in_rows():
