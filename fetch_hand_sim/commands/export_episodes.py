@@ -17,7 +17,8 @@ from fetch_hand_sim.episode_log import (
     expand_episodes,
 )
 from fetch_hand_sim.episode_log.arrays import load_episode
-from fetch_hand_sim.episodes.export import export_minari, export_parquet, why_apart
+from fetch_hand_sim.episodes.export import export_parquet
+from fetch_hand_sim.episodes.minari_export import export_minari, why_apart
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,

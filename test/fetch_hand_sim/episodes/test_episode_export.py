@@ -164,6 +164,34 @@ def test_of_two_tasks_none_is_written_where_there_is_no_room_for_both(
     assert export_episodes.main(arguments) == 0
 
 
+@pytest.mark.parametrize('format_', ['parquet', 'minari'])
+def test_of_two_exports_at_once_one_writes_and_the_other_finds_it_there(
+    episodes, two_tasks, tmp_path, format_, monkeypatch
+):
+    """The other one begins before the first has written anything."""
+    module = {'parquet': 'pyarrow.parquet', 'minari': 'minari'}[format_]
+    write = {'parquet': 'write_table', 'minari': 'create_dataset_from_buffers'}[format_]
+    library = pytest.importorskip(module)
+    written, others = getattr(library, write), []
+    command = [sys.executable, '-m', 'fetch_hand_sim.commands.export_episodes', str(two_tasks)]
+    options = ['--to', format_, '--output', str(tmp_path)]
+
+    def begin_another(*arguments, **more):
+        if not others:
+            others.append(subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True))
+            with pytest.raises(subprocess.TimeoutExpired):
+                others[0].wait(4.0)
+        return written(*arguments, **more)
+
+    monkeypatch.setattr(library, write, begin_another)
+    assert export_episodes.main([str(episodes), *options]) == 0
+    (line,) = others[0].communicate()[1].splitlines()
+    assert others[0].returncode == 1 and 'exists; nothing is overwritten' in line
+    first = {'parquet': f'{TASK}.parquet', 'minari': TASK}[format_]
+    second = {'parquet': [f'{TASK}_episodes.parquet'], 'minari': []}[format_]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [first, *second]
+
+
 def test_a_minari_dataset_has_episodes_of_one_environment(tmp_path, monkeypatch, capsys):
     minari = pytest.importorskip('minari')
     pytest.importorskip('pyarrow')
