@@ -161,7 +161,8 @@ def _appearing(path: Path) -> Iterator[Path]:
     """A hidden file beside the path that takes its name when all is written."""
     # A link stays one: what it leads to is written.
     target = path.resolve()
-    hidden = target.with_name(f'.{target.stem}.active{path.suffix.lower()}')
+    # Of this process: two that write one film at once leave that of the later, and it is whole.
+    hidden = target.with_name(f'.{target.stem}.{os.getpid()}.active{path.suffix.lower()}')
     try:
         yield hidden
         os.replace(hidden, target)

@@ -104,6 +104,30 @@ def test_a_link_stays_one_and_what_it_leads_to_is_written(name, is_there, tmp_pa
         assert image.size == (7, 5)
 
 
+def test_two_processes_that_write_one_film_leave_a_whole_one(tmp_path):
+    pytest.importorskip('imageio_ffmpeg')
+    import imageio.v3 as imageio
+
+    path = tmp_path / 'film.mp4'
+    code = (
+        'import numpy as np, pathlib, sys\n'
+        'from fetch_hand_sim.films.film import write_film\n'
+        'pictures = iter(np.zeros((9, 48, 64, 3), np.uint8))\n'
+        'write_film(pathlib.Path(sys.argv[1]), pictures, 25.0)'
+    )
+
+    def pictures():
+        for number, picture in enumerate(PICTURES):
+            if number == 3:
+                subprocess.run([sys.executable, '-c', code, str(path)], check=True)
+                assert len(imageio.imread(path)) == 9
+            yield np.kron(picture, np.ones((20, 20, 1), dtype=np.uint8))
+
+    write_film(path, pictures(), fps=25.0)
+    assert imageio.imread(path).shape == (5, 100, 140, 3)
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
 def test_a_film_that_fails_leaves_nothing(tmp_path):
     def pictures():
         yield PICTURES[0]
