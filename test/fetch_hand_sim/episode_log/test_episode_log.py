@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 
 import mujoco
 import numpy as np
@@ -334,6 +335,27 @@ def test_the_compiled_model_comes_back_bit_by_bit(reach, tmp_path):
     path = tmp_path / 'model.mjb'
     path.write_bytes(data)
     assert model_sha256(mujoco.MjModel.from_binary_path(str(path))) == model_sha256(model)
+
+
+def test_a_fingerprint_is_that_of_the_model_and_not_of_the_folder_it_lies_in(reach, tmp_path):
+    original = asset_path('fetch/reach.xml')
+    shutil.copytree(original.parents[1], tmp_path / 'elsewhere')
+    models = [
+        mujoco.MjSpec.from_file(str(path)).compile()
+        for path in (original, tmp_path / 'elsewhere' / 'fetch' / 'reach.xml')
+    ]
+    assert models[0].paths != models[1].paths
+    assert model_sha256(models[0]) == model_sha256(models[1])
+    fingerprints = {model_sha256(models[0])}
+    for change in (
+        lambda model: setattr(model.opt, 'timestep', 0.003),
+        lambda model: setattr(model.vis.map, 'stiffness', 1.0),
+        lambda model: model.mesh_vert.__setitem__(0, 1.0),
+        lambda model: model.body_mass.__setitem__(1, 1.0),
+    ):
+        change(models[1])
+        fingerprints.add(model_sha256(models[1]))
+    assert len(fingerprints) == 5
 
 
 @pytest.mark.parametrize('compression', ['none', 'lz4', 'zstd'])
