@@ -61,7 +61,7 @@ def _run(options: argparse.Namespace) -> int:
         with progress('episodes', len(paths)) as advance:
             for path in paths:
                 try:
-                    _add(load_episode(path), by_task, options.to)
+                    _add(path, by_task, options.to)
                 except EpisodeReadError as error:
                     skipped.append(error)
                 advance(1)
@@ -78,17 +78,18 @@ def _run(options: argparse.Namespace) -> int:
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
 
 
-def _add(episode: EpisodeArrays, by_task: dict[str, list[EpisodeArrays]], to: str) -> None:
-    """Puts an episode beside those of its task.
+def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], to: str) -> None:
+    """Reads an episode and puts it beside those of its task.
 
     Raises:
-        EpisodeReadError: If a dataset of this kind cannot hold it.
+        EpisodeReadError: If it cannot be read, or a dataset of this kind cannot hold it.
     """
+    episode = load_episode(path)
     others = by_task.get(episode.spec.name)
     if to == 'minari' and len(episode) == 0:
-        raise EpisodeReadError(f'{episode.path}: no step was taken, and Minari needs one')
+        raise EpisodeReadError(f'{path}: no step was taken, and Minari needs one')
     if to == 'minari' and others and (why := why_apart(episode, others[0])):
-        raise EpisodeReadError(f'{episode.path}: {why}; a Minari dataset has one environment')
+        raise EpisodeReadError(f'{path}: {why}; a Minari dataset has one environment')
     by_task.setdefault(episode.spec.name, []).append(episode)
 
 

@@ -202,7 +202,7 @@ def test_a_minari_dataset_has_episodes_of_one_environment(tmp_path, monkeypatch,
     arguments = [str(tmp_path / 'logged'), '--output', str(tmp_path), '--to']
     assert export_episodes.main([*arguments, 'minari']) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert 'FetchReach_000001_seed0_0.mcap: control_hz 50.0, and 25.0 in ' in line
+    assert 'FetchReach_000001_seed0: control_hz 50.0, and 25.0 in ' in line
     dataset = minari.load_dataset('FetchReach/logged-v0')
     assert (dataset.total_episodes, dataset.total_steps) == (2, 100)
     # Tables say the rate of each.
