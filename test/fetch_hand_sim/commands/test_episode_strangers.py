@@ -278,6 +278,20 @@ def test_names_that_are_no_text_and_command_a_terminal(finished, tmp_path):
         assert all(line.isprintable() for line in output.splitlines())
 
 
+def test_what_macos_puts_beside_files_is_none_of_them(finished, tmp_path, capsys):
+    """`tar` there adds a companion to each file, and to each folder."""
+    shutil.copytree(finished, tmp_path / NAME)
+    shutil.copytree(finished, tmp_path / 'alone')
+    (tmp_path / 'alone' / 'metadata.yaml').unlink()
+    (tmp_path / 'alone' / f'{NAME}_0.mcap').rename(tmp_path / 'alone.mcap')
+    for file in (f'{NAME}/._{NAME}_0.mcap', f'{NAME}/._metadata.yaml', f'._{NAME}', '._alone.mcap'):
+        (tmp_path / file).write_bytes(b'\0\5\x16\7')
+    (tmp_path / 'alone' / '._x.mcap').write_bytes(b'\0\5\x16\7')
+    assert list_episodes.main([str(tmp_path)]) == check_episode.main([str(tmp_path)]) == 0
+    assert '2 episodes' in capsys.readouterr().out
+    assert len(load_episodes(tmp_path)) == 2
+
+
 def test_too_long_a_name_is_one_line(capsys):
     for tool in (list_episodes, check_episode, recover_episodes):
         assert tool.main(['x' * 5000]) == 2
