@@ -358,6 +358,20 @@ def test_an_export_has_the_episodes_that_a_list_has(finished, tmp_path, capsys):
         assert_one_line_each(text, 2)
 
 
+@pytest.mark.parametrize('is_inside', [True, False])
+def test_one_unfinished_episode_is_recovered_by_the_path_that_lists_give(
+    directory, is_inside, monkeypatch, capsys
+):
+    leave(directory, 'other', b'')
+    leftover = directory / '.cut.active'
+    if is_inside:
+        monkeypatch.chdir(leftover)
+    assert recover_episodes.main(['.' if is_inside else str(leftover)]) == 0
+    assert 'recovered' in capsys.readouterr().out
+    assert not leftover.exists() and read_episode(directory / 'cut')
+    assert [each.name for each in find_leftovers(directory)] == ['other']
+
+
 def test_a_dry_run_says_by_its_code_what_cannot_be_recovered(directory, capsys):
     leave(directory, 'strange', b'').joinpath('notes.txt').write_text('hi')
     for options in (['--dry-run'], []):
