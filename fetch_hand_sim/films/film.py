@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -169,4 +169,6 @@ def _appearing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise CommandError(f'{path}: {error.strerror or error}') from error
     finally:
-        hidden.unlink(missing_ok=True)
+        # A disk that may only be read refuses to remove what is not there, too.
+        with suppress(OSError):
+            hidden.unlink()

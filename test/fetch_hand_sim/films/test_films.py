@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import subprocess
 import sys
@@ -141,6 +142,19 @@ def test_a_film_that_fails_leaves_nothing(tmp_path):
 def test_a_full_disk_is_one_line():
     with pytest.raises(CommandError):
         write_picture(check_path('/proc/picture.png'), PICTURES[0])
+
+
+def test_a_disk_that_may_only_be_read_is_one_line(tmp_path, monkeypatch):
+    """As Linux does it: it looks for a file only where it may write."""
+
+    def refuse(path, *_, **options):
+        raise OSError(errno.EROFS, 'Read-only file system', str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr('pathlib.Path.unlink', refuse)
+        patch.setattr('PIL.Image.Image.save', lambda image, path, **options: refuse(path))
+        with pytest.raises(CommandError, match=r'picture\.png: Read-only file system'):
+            write_picture(tmp_path / 'picture.png', PICTURES[0])
 
 
 def check_path(text):
