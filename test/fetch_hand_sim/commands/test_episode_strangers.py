@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import struct
@@ -290,6 +291,19 @@ def test_what_macos_puts_beside_files_is_none_of_them(finished, tmp_path, capsys
     assert list_episodes.main([str(tmp_path)]) == check_episode.main([str(tmp_path)]) == 0
     assert '2 episodes' in capsys.readouterr().out
     assert len(load_episodes(tmp_path)) == 2
+
+
+def test_a_folder_that_may_not_be_read_is_said_to_be_that(finished, monkeypatch):
+    """Such as those that root has logged in a container."""
+
+    def refuse(path):
+        raise PermissionError(errno.EACCES, 'Permission denied', path)
+
+    monkeypatch.setattr(os, 'scandir', refuse)
+    monkeypatch.setattr(os, 'listdir', refuse)
+    for read in (read_episode, read_summary, load_episodes):
+        with pytest.raises(EpisodeReadError, match=f'{NAME}: Permission denied'):
+            read(finished)
 
 
 def test_too_long_a_name_is_one_line(capsys):
