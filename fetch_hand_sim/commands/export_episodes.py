@@ -12,13 +12,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fetch_hand_sim.commands.picture_size import picture_size
+from fetch_hand_sim.datasets.minari import export_minari, why_apart
+from fetch_hand_sim.datasets.parquet import export_parquet
+from fetch_hand_sim.datasets.writing import ByTask
 from fetch_hand_sim.episode_log import (
     EpisodeArrays,
     EpisodeReadError,
     expand_episodes,
 )
 from fetch_hand_sim.episode_log.arrays import load_episode
-from fetch_hand_sim.episodes.export import export_minari, export_parquet
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
@@ -34,13 +36,13 @@ from msgs_spec.command_line import (
 )
 
 _NAME = 'export_episodes'
-_NEED_STEPS = {'minari': 'Minari', 'lerobot': 'LeRobot'}
+_TITLES = {'parquet': 'Parquet', 'minari': 'Minari', 'lerobot': 'LeRobot'}
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('path', type=Path, help='an episode, or a directory of episodes')
-    parser.add_argument('--to', choices=('parquet', 'minari', 'lerobot'), required=True)
+    parser.add_argument('--to', choices=tuple(_TITLES), required=True)
     parser.add_argument('--output', type=Path, required=True, help='directory to write to')
     parser.add_argument(
         '--name', default='logged-v0', help='of a Minari dataset; default: logged-v0'
@@ -71,13 +73,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     require_extra('data')
     skipped: list[EpisodeReadError] = []
-    episodes: list[EpisodeArrays] = []
+    by_task: dict[str, list[EpisodeArrays]] = {}
     try:
         paths = expand_episodes(options.path)
         with progress('episodes', len(paths)) as advance:
             for path in paths:
                 try:
-                    episodes.append(_load(path, options.to))
+                    _add(path, by_task, options.to)
                 except EpisodeReadError as error:
                     skipped.append(error)
                 advance(1)
@@ -85,41 +87,58 @@ def _run(options: argparse.Namespace) -> int:
         raise UsageError(str(error)) from None
     for reason in skipped:
         complain(_NAME, f'skipped {reason}')
-    if not episodes and skipped:
+    by_task = {task: episodes for task, episodes in by_task.items() if episodes}
+    if not by_task and skipped:
         return EXIT_USAGE
-    if not episodes:
+    if not by_task:
         raise UsageError(f'{options.path} holds no episode')
-    by_task: dict[str, list[EpisodeArrays]] = {}
-    for episode in episodes:
-        by_task.setdefault(episode.spec.name, []).append(episode)
-    for task, group in by_task.items():
-        done = f'{len(group)} episodes of {task}: {_export(options, group)}'
-        say(done)
+    for task, written in _export(options, by_task).items():
+        say(f'{len(by_task[task])} episodes of {task}: {written}')
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
 
 
-def _load(path: Path, to: str) -> EpisodeArrays:
-    """Reads an episode.
+def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], to: str) -> None:
+    """Reads an episode and puts it beside those of its task.
 
     Raises:
         EpisodeReadError: If it cannot be read, or a dataset of this kind cannot hold it.
     """
     episode = load_episode(path)
-    if to in _NEED_STEPS and len(episode) == 0:
-        raise EpisodeReadError(f'{path}: no step was taken, and {_NEED_STEPS[to]} needs one')
-    return episode
+    others = by_task.setdefault(episode.spec.name, [])
+    if why := _why_left_out(episode, others, to):
+        raise EpisodeReadError(f'{path}: {why}')
+    others.append(episode)
 
 
-def _export(options: argparse.Namespace, episodes: Sequence[EpisodeArrays]) -> str:
+def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: str) -> str:
+    """Why a dataset of this kind cannot hold an episode beside others of its task; '' if it can."""
+    if to == 'parquet':
+        return ''
+    if len(episode) == 0:
+        return f'no step was taken, and {_TITLES[to]} needs one'
+    if not others:
+        return ''
+    rates = episode.record.control_hz, others[0].record.control_hz
+    if to == 'lerobot' and rates[0] != rates[1]:
+        of = others[0].path
+        return f'{rates[0]:g} Hz, and {rates[1]:g} Hz in {of}; a LeRobot dataset has one rate'
+    why = why_apart(episode, others[0]) if to == 'minari' else ''
+    return why and f'{why}; a Minari dataset has one environment'
+
+
+def _export(options: argparse.Namespace, by_task: dict[str, list[EpisodeArrays]]) -> dict[str, str]:
+    """Writes all; returns for each task where it is."""
     if options.to == 'parquet':
-        return ', '.join(str(path) for path in export_parquet(episodes, options.output))
+        files = export_parquet(by_task, options.output)
+        return {task: ', '.join(map(str, paths)) for task, paths in files.items()}
     if options.to == 'lerobot':
-        return f'LeRobot dataset {_export_lerobot(options, episodes)}'
-    dataset_id = export_minari(episodes, options.output, options.name)
-    return f'Minari dataset {dataset_id} in {options.output}'
+        found = _export_lerobot(options, by_task)
+        return {task: f'LeRobot dataset {path}' for task, path in found.items()}
+    ids = export_minari(by_task, options.output, options.name)
+    return {task: f'Minari dataset {each} in {options.output}' for task, each in ids.items()}
 
 
-def _export_lerobot(options: argparse.Namespace, episodes: Sequence[EpisodeArrays]) -> Path:
+def _export_lerobot(options: argparse.Namespace, by_task: ByTask) -> dict[str, Path]:
     # Films are drawn with MuJoCo, which the other kinds do without.
     from fetch_hand_sim.datasets.lerobot import export_lerobot
     from fetch_hand_sim.datasets.lerobot_film import Camera
@@ -129,7 +148,7 @@ def _export_lerobot(options: argparse.Namespace, episodes: Sequence[EpisodeArray
         width, height = options.pictures
         camera = Camera(width, height, options.camera)
     try:
-        return export_lerobot(episodes, options.output, camera)
+        return export_lerobot(by_task, options.output, camera)
     except ValueError as error:
         raise UsageError(str(error)) from None
     except RuntimeError as error:

@@ -13,8 +13,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fetch_hand_sim.episode_log import (
+    EpisodeInUseError,
     EpisodeLogError,
     EpisodeReadError,
+    Leftover,
+    durable,
     find_leftovers,
     read_summary,
     recover_episode,
@@ -36,7 +39,9 @@ _NAME = 'recover_episodes'
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     parser = CommandParser(prog=_NAME, description=__doc__)
-    parser.add_argument('directory', type=Path, help='where episodes are collected')
+    parser.add_argument(
+        'directory', type=Path, help='where episodes are collected, or one that is unfinished'
+    )
     parser.add_argument('--dry-run', action='store_true', help='only name what is unfinished')
     options = parser.parse_args(arguments)
     return run_command(_NAME, lambda: _run(options))
@@ -47,7 +52,7 @@ def _run(options: argparse.Namespace) -> int:
         # Path.is_dir raises where a name is too long.
         if not os.path.isdir(options.directory):
             raise UsageError(f'{options.directory} is no directory')
-        leftovers = find_leftovers(options.directory)
+        leftovers = _find(options.directory)
     except EpisodeLogError as error:
         raise UsageError(str(error)) from None
     failures = 0
@@ -65,14 +70,25 @@ def _run(options: argparse.Namespace) -> int:
     return EXIT_FAILURE if failures else EXIT_SUCCESS
 
 
+def _find(directory: Path) -> list[Leftover]:
+    """The unfinished episodes in a folder; of the folder of one, as lists name it, that one."""
+    path = Path(os.path.abspath(directory))
+    if durable.active_name(path) is None:
+        return find_leftovers(directory)
+    return [each for each in find_leftovers(path.parent) if each.path == path]
+
+
 def _recover(leftover: Path) -> bool:
-    """Recovers one episode and says what came out; whether it worked."""
+    """Recovers one episode and says what came out; False if it is left unfinished."""
     try:
         path = recover_episode(leftover)
         if path is None:
             say(f'cleared away {leftover}: it was killed before its first messages were written')
             return True
         episode = read_summary(path)
+    except EpisodeInUseError as error:
+        say(str(error))
+        return True
     except (EpisodeLogError, EpisodeReadError) as error:
         complain(_NAME, error)
         return False

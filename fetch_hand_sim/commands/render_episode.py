@@ -79,8 +79,16 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _render(options: argparse.Namespace) -> None:
-    from fetch_hand_sim.films.film import STILL, write_film, write_picture
-    from fetch_hand_sim.films.pictures import Picture, Studio, framed, grid, sheets, tile
+    from fetch_hand_sim.films.film import STILL, check_size, write_film, write_picture
+    from fetch_hand_sim.films.pictures import (
+        Picture,
+        Studio,
+        framed,
+        grid,
+        sheet_size,
+        sheets,
+        tile,
+    )
     from fetch_hand_sim.films.recording import Recording, find_playable, load_recordings
 
     columns, rows = options.grid or (1, 1)
@@ -90,6 +98,7 @@ def _render(options: argparse.Namespace) -> None:
     if options.grid is None and (found := len(find_playable(options.path))) > 1:
         say(f'{recordings[0].title} alone, of {found} episodes; --grid CxR takes several')
     width, height = options.size
+    check_size(options.out, *sheet_size(len(recordings), columns, width, height))
     studio = Studio(width, height, options.camera)
     try:
         if options.out.suffix.lower() in STILL:

@@ -19,8 +19,14 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.datasets.lerobot_columns import Columns, features, frames, statistics
 from fetch_hand_sim.datasets.lerobot_film import Camera, Histogram, color_statistics, write_episodes
+from fetch_hand_sim.datasets.writing import (
+    ByTask,
+    ExportError,
+    alone_in,
+    require_module,
+    require_new,
+)
 from fetch_hand_sim.episode_log import EpisodeArrays
-from fetch_hand_sim.episodes.export import ExportError, require
 from msgs_spec.tasks import TaskSpec
 
 _VERSION = 'v3.0'
@@ -35,47 +41,43 @@ Row = dict[str, Any]
 
 
 def export_lerobot(
-    episodes: Sequence[EpisodeArrays], directory: Path, camera: Camera | None = None
-) -> Path:
-    """Writes the episodes of one task as a dataset of N frames each, one per action.
+    by_task: ByTask, directory: Path, camera: Camera | None = None
+) -> dict[str, Path]:
+    """Writes the episodes of each task as a dataset of N frames each, all of them or none.
 
     A frame is `observation.state`, what is observed of the robot; `observation.environment_state`,
     what is observed of the object, then the desired goal; `action`; and what came of it,
     `next.reward`, `next.success` and `next.done`. All float32, as LeRobot's policies take them.
 
     Args:
-        episodes: At least one, all of one task and one rate, each with at least one step.
+        by_task: Episodes, at least one of each task, each with a step and of one rate.
         directory: Where to write.
         camera: Whose films are part of it; None for none.
 
     Returns:
-        The dataset, `directory/<task>`: `LeRobotDataset('me/<task>', root=...)`.
+        Each task's dataset, `directory/<task>`: `LeRobotDataset('me/<task>', root=...)`.
 
     Raises:
-        ExportError: If pyarrow is missing, rates differ, or the dataset exists or cannot be
-            written; none is created.
+        ExportError: If pyarrow is missing, or a dataset exists or cannot be written; none is
+            created.
         UsageError: If a film is asked for and there is no ffmpeg.
-        ValueError: If the model has no such camera.
+        ValueError: If a model has no such camera.
         RuntimeError: If there is no OpenGL to draw with.
     """
-    require('pyarrow.parquet')
-    spec = episodes[0].spec
-    rates = sorted({episode.record.control_hz for episode in episodes})
-    if len(rates) > 1:
-        found = ', '.join(f'{rate:g}' for rate in rates)
-        raise ExportError(f'{spec.name}: episodes at {found} Hz; a LeRobot dataset has one rate')
-    target = directory / spec.name
-    if target.exists():
-        raise ExportError(f'{target} exists; nothing is overwritten')
+    require_module('pyarrow.parquet')
+    targets = {task: directory / task for task in by_task}
     try:
-        directory.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix='.', suffix='.partial', dir=directory) as hidden:
-            dataset = Path(hidden) / spec.name
-            _Dataset(dataset, spec, rates[0], camera).write(episodes)
-            dataset.rename(target)
+        with alone_in(directory):
+            require_new(targets.values())
+            with TemporaryDirectory(prefix='.', suffix='.partial', dir=directory) as hidden:
+                for task, episodes in by_task.items():
+                    rate = episodes[0].record.control_hz
+                    _Dataset(Path(hidden) / task, episodes[0].spec, rate, camera).write(episodes)
+                for task, target in targets.items():
+                    (Path(hidden) / task).rename(target)
     except OSError as error:
-        raise ExportError(f'{target}: {error.strerror or error}') from error
-    return target
+        raise ExportError(f'{directory}: {error.strerror or error}') from error
+    return targets
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,7 @@ class _Dataset:
     camera: Camera | None
 
     def write(self, episodes: Sequence[EpisodeArrays]) -> None:
-        pyarrow, parquet = require('pyarrow'), require('pyarrow.parquet')
+        pyarrow, parquet = require_module('pyarrow'), require_module('pyarrow.parquet')
         begins = accumulate((len(episode) for episode in episodes), initial=0)
         columns = [
             frames(episode, number, begin)
@@ -199,7 +201,7 @@ def _files(episodes: Sequence[Columns]) -> Iterator[list[Columns]]:
 
 def _column(values: NDArray[Any]) -> Any:
     """Numbers, or vectors of fixed size; a vector of one number is that number."""
-    pyarrow = require('pyarrow')
+    pyarrow = require_module('pyarrow')
     flat = pyarrow.array(values.ravel())
     if values.ndim == 1 or values.shape[1] == 1:
         return flat
@@ -229,5 +231,5 @@ def _tasks(spec: TaskSpec) -> Any:
         ],
         'pandas_version': '2.2.3',
     }
-    table = require('pyarrow').table({'task_index': [0], names: [spec.name]})
+    table = require_module('pyarrow').table({'task_index': [0], names: [spec.name]})
     return table.replace_schema_metadata({'pandas': json.dumps(pandas)})

@@ -4,7 +4,12 @@ from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episodes
 from fetch_hand_sim.episode_log.episode_metadata import episode_metadata
 from fetch_hand_sim.episode_log.episode_record import EpisodeOutcome, EpisodeRecord
 from fetch_hand_sim.episode_log.episodes import EpisodeDirectory, episode_name
-from fetch_hand_sim.episode_log.errors import EpisodeExistsError, EpisodeLogError, EpisodeReadError
+from fetch_hand_sim.episode_log.errors import (
+    EpisodeExistsError,
+    EpisodeInUseError,
+    EpisodeLogError,
+    EpisodeReadError,
+)
 from fetch_hand_sim.episode_log.leftovers import Leftover, find_leftovers
 from fetch_hand_sim.episode_log.log_times import log_time
 from fetch_hand_sim.episode_log.reader import Episode, read_episode
@@ -24,6 +29,7 @@ __all__ = [
     'EpisodeArrays',
     'EpisodeDirectory',
     'EpisodeExistsError',
+    'EpisodeInUseError',
     'EpisodeLogError',
     'EpisodeOutcome',
     'EpisodeReadError',

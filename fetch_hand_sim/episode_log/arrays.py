@@ -19,7 +19,7 @@ from msgs_spec.actions import action_from_command
 from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.observations import ObservationAssembler
-from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
 
 Flags = NDArray[np.bool_]
@@ -33,7 +33,7 @@ class EpisodeArrays(HasOutcome):
 
     Attributes:
         path: The MCAP file.
-        spec: The task.
+        spec: The task, `episode_ticks` as many as the episode has where it is whole.
         observations: `observation`, `achieved_goal` and `desired_goal`, (N + 1, size) each, as
             `Simulation` returns them, bit for bit.
         actions: (N, action size), normalised to [-1, 1].
@@ -144,7 +144,7 @@ class _Decoder:
             raise ValueError(f'it says {outcome.steps} steps and holds {steps}')
         return EpisodeArrays(
             path=self._file.path,
-            spec=task_spec(self._task.name),
+            spec=self._record.spec,
             observations=self._assembler.assemble(vectors),
             actions=action_from_command(self._task.robot, commands),
             commands=commands,

@@ -13,6 +13,7 @@ from typing import TypeVar
 from msgs_spec.parameters import LARGEST_PERTURBATION
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import (
+    DEFAULT_CONTROL_HZ,
     REWARD_TYPES,
     SUCCESS_RULES,
     TIMINGS,
@@ -34,7 +35,7 @@ class EpisodeRecord:
     """What an episode is: the record `episode`.
 
     Attributes:
-        task: The task, with the joint names that its messages have.
+        task: The task, with the joint names that its messages have, `episode_ticks` at 25 Hz.
         episode: Number of the episode in its run, from 0.
         seed: Seed of the reset.
         reward_type: 'sparse' or 'dense'.
@@ -76,6 +77,13 @@ class EpisodeRecord:
             perturb_limit=_perturb_limit(metadata),
             timing=_word({'timing': 'ticks', **metadata}, 'timing', TIMINGS),
         )
+
+    @property
+    def spec(self) -> TaskSpec:
+        """The task with its usual joint names, `episode_ticks` as many as the episode has."""
+        # Robots up to 1.0 took as many at every rate.
+        rate = self.control_hz if self.timing == 'seconds' else DEFAULT_CONTROL_HZ
+        return task_spec(self.task.name, control_hz=rate)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from fetch_hand_sim.episode_log.errors import EpisodeExistsError, EpisodeLogErro
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from fetch_hand_sim.episode_log.writer import EpisodeWriter
 
-_NAME = re.compile(r'\.?(?P<task>\w+)_(?P<index>\d+)_seed\d+(\.active)?')
+_NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed\d+(\.active)?')
 
 
 def episode_name(task: str, index: int, seed: int) -> str:

@@ -23,6 +23,10 @@ class EpisodeExistsError(EpisodeLogError):
     """The name is taken by a finished episode, or by one being written."""
 
 
+class EpisodeInUseError(EpisodeLogError):
+    """Another process writes or recovers the episode, or has just completed it."""
+
+
 class EpisodeReadError(ValueError):
     """A file is not a complete, undamaged episode; the message is one line with path and reason."""
 

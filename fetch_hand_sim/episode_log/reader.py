@@ -179,7 +179,8 @@ def mcap_file(path: Path) -> Path:
             if path.exists() and not path.is_file():
                 raise EpisodeReadError(f'{path} is no regular file')  # A pipe would never end.
             return path
-        files = sorted(file for file in path.glob('*.mcap') if file.is_file())
+        # `glob` finds nothing where it may not look.
+        files = sorted(file for file in path.iterdir() if is_mcap(file) and file.is_file())
     except OSError as error:
         raise EpisodeReadError(f'{path}: {error.strerror}') from error
     if len(files) != 1:
@@ -187,6 +188,11 @@ def mcap_file(path: Path) -> Path:
             f'{path} holds {len(files)} MCAP files; an episode is a directory of one'
         )
     return files[0]
+
+
+def is_mcap(path: Path) -> bool:
+    """Whether a name is that of an MCAP file, and of none that macOS puts beside it in archives."""
+    return path.suffix == '.mcap' and not path.name.startswith('._')
 
 
 @contextmanager

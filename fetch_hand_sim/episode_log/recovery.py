@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,7 +24,7 @@ from fetch_hand_sim.episode_log.episode_bag import (
     store_bag,
 )
 from fetch_hand_sim.episode_log.episode_record import EpisodeOutcome
-from fetch_hand_sim.episode_log.errors import EpisodeLogError, one_line
+from fetch_hand_sim.episode_log.errors import EpisodeInUseError, EpisodeLogError, one_line
 from fetch_hand_sim.episode_log.leftovers import inspect_leftover
 from fetch_hand_sim.episode_log.limits import ReceivedAllowance
 from fetch_hand_sim.episode_log.offered_qos import parse_offered_qos
@@ -123,20 +125,23 @@ def recover_episode(leftover: Path) -> Path | None:
         The bag directory; None if there was nothing to keep.
 
     Raises:
-        EpisodeLogError: If it is being written, is not what a robot leaves, or the disk refuses.
+        EpisodeInUseError: If it is being written, or another process recovers it or has done so.
+        EpisodeLogError: If it is not what a robot leaves, or the disk refuses.
     """
     name = durable.active_name(leftover)
     if name is None:
         raise EpisodeLogError(f'{leftover} is no unfinished episode')
     found = inspect_leftover(leftover, now_s=0.0)
     if found is None:
-        raise EpisodeLogError(f'{leftover} is being written')
+        raise _in_use(leftover)
     if found.problem:
         raise EpisodeLogError(f'cannot recover episode {leftover}: {found.problem}')
     try:
         return _recover(leftover, name)
     except EpisodeLogError:
         raise
+    except FileNotFoundError:
+        raise _in_use(leftover) from None
     except OSError as error:
         reason = error.strerror or error
         raise EpisodeLogError(f'cannot recover episode {leftover}: {reason}') from error
@@ -150,17 +155,22 @@ def _recover(leftover: Path, name: str) -> Path | None:
         _clear_away(leftover)
         return None
     with durable.open_regular(file) as torn:
-        if not durable.try_lock(torn):
-            raise EpisodeLogError(f'{leftover} is being written')
+        # Whoever recovers it holds the file and its replacement; after that it is another one.
+        if not durable.try_lock(torn) or not os.fstat(torn.fileno()).st_nlink:
+            raise _in_use(leftover)
         remains = _read(torn)
         if remains.was_killed_at_the_start:
             _clear_away(leftover)
             return None
         if final.exists():
             raise EpisodeLogError(f'{final} exists; episodes are never overwritten')
-        _replace(file, remains)
-        durable.publish(leftover, final)
+        with _replaced(file, remains):
+            durable.publish(leftover, final)
     return final
+
+
+def _in_use(leftover: Path) -> EpisodeInUseError:
+    return EpisodeInUseError(f'{leftover} is being written, or another process has recovered it')
 
 
 def _clear_away(leftover: Path) -> None:
@@ -183,16 +193,20 @@ def _read(stream: BinaryIO) -> _Remains:
     return remains
 
 
-def _replace(file: Path, remains: _Remains) -> None:
+@contextmanager
+def _replaced(file: Path, remains: _Remains) -> Iterator[None]:
+    """Writes the file anew and puts that in its place, locked until the end of the block."""
     if not remains.messages or EPISODE not in remains.metadata:
         raise EpisodeLogError(f'{file} is damaged before its first message: nothing to recover')
     rewritten = durable.rewritten_file(file)
     try:
         with durable.create(rewritten) as stream:
+            durable.lock(stream)
             description = _write(stream, file, remains)
             store_bag(stream, file.parent, description)
-        read_episode(rewritten)
-        rewritten.replace(file)
+            read_episode(rewritten)
+            rewritten.replace(file)
+            yield
     finally:
         rewritten.unlink(missing_ok=True)
 

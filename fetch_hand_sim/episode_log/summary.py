@@ -19,6 +19,7 @@ from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.reader import (
     check_summary,
     episode_records,
+    is_mcap,
     mcap_file,
     one_line_errors,
 )
@@ -141,7 +142,7 @@ def expand_episodes(path: Path) -> list[Path]:
 def _is_bag(path: Path) -> bool:
     try:
         if path.is_dir():
-            return durable.metadata_file(path).exists() or any(path.glob('*.mcap'))
+            return durable.metadata_file(path).exists() or any(map(is_mcap, path.glob('*.mcap')))
     except OSError:
         return True  # Whoever reads it will hear why it cannot be read.
-    return path.suffix == '.mcap'
+    return is_mcap(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,6 +16,8 @@ from fetch_hand_sim.episode_log.errors import EpisodeLogError
 from fetch_hand_sim.episode_log.limits import (
     MAX_ATTACHMENT_BYTES,
     MAX_CHUNKS,
+    MAX_MESSAGES,
+    MAX_UNPACKED_BYTES,
     ReceivedAllowance,
 )
 from fetch_hand_sim.episode_log.log_times import log_time
@@ -22,6 +25,11 @@ from fetch_hand_sim.episode_log.offered_qos import offered_qos
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from msgs_spec.schemas import schema_text, type_hash
 from msgs_spec.topics import TopicSpec
+
+_TOO_LONG = (
+    f'the episode is too long for a file of {MAX_MESSAGES} messages and '
+    f'{MAX_UNPACKED_BYTES // 2**20} MiB of them'
+)
 
 
 def _reason(error: OSError) -> str:
@@ -122,9 +130,14 @@ class EpisodeWriter:
         """Appends all messages of the tick stamped `stamp_ns`, in their order; see `write`.
 
         When it is due, they are handed to the operating system with it.
+
+        Raises:
+            EpisodeLogError: At the first error of the disk, or where the episode has become longer
+                than readers take; what there is so far can be recovered.
         """
         self._tick_ns, self._rank = stamp_ns, 0
         for topic, data in messages:
+            self._require_room(len(data))
             self._append_next(topic, data)
         if self._is_open and self._is_flush_due(stamp_ns):
             self._flush(stamp_ns)
@@ -246,6 +259,12 @@ class EpisodeWriter:
         except OSError as error:
             raise self._fail(error) from error
         return True
+
+    def _require_room(self, size: int) -> None:
+        """Ends the log of an episode that no reader would take with one message more."""
+        if self._is_open and not self._bag.takes(size):
+            self.flush()
+            raise self._fail(OSError(errno.EFBIG, _TOO_LONG))
 
     def _append_next(self, topic: TopicSpec, data: bytes) -> bool:
         if self._tick_ns is None:

@@ -14,7 +14,7 @@ import numpy as np
 from fetch_hand_sim.episode_log import Episode, EpisodeReadError, episode_metadata, read_episode
 from fetch_hand_sim.episode_log.episode_record import EpisodeRecord
 from fetch_hand_sim.episode_log.errors import one_line
-from fetch_hand_sim.episode_log.model import model_sha256
+from fetch_hand_sim.episode_log.model import former_model_sha256, model_sha256
 from fetch_hand_sim.episode_log.reader import DAMAGED
 from fetch_hand_sim.episode_log.ticks import LoggedTick, split_ticks
 from fetch_hand_sim.episodes.context import source_revision
@@ -92,7 +92,7 @@ class EpisodeChecker:
     def __init__(self) -> None:
         self._key: tuple[object, ...] = ()
         self._simulation: Simulation | None = None
-        self._model_sha256 = ''
+        self._fingerprints: tuple[str, ...] = ()
 
     def check(self, path: Path) -> CheckResult:
         """Checks one episode.
@@ -136,10 +136,13 @@ class EpisodeChecker:
                 timing=cast(Timing, record.timing),
             )
             self._key = key
-            self._model_sha256 = model_sha256(self._simulation.model)
+            model = self._simulation.model
+            self._fingerprints = (model_sha256(model), former_model_sha256(model))
         return self._simulation
 
     def _changes(self, episode: Episode, runner: EpisodeRunner) -> list[str]:
+        recorded = episode.metadata
+        is_former = recorded.get('model_sha256') in self._fingerprints[1:]
         here = episode_metadata(
             runner.spec,
             episode=runner.episode,
@@ -148,10 +151,9 @@ class EpisodeChecker:
             success_rule=runner.simulation.metric.success_rule,
             control_hz=runner.simulation.control_hz,
             timing=runner.simulation.timing,
-            model_sha256=self._model_sha256,
+            model_sha256=self._fingerprints[is_former],
             source_revision=source_revision(),
         )
-        recorded = episode.metadata
         return [
             f'{name.removesuffix("_version")} {printable(recorded[name])[:12]} -> {value[:12]}'
             for name, value in here.items()

@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ STILL = ('.png', '.jpg')
 _QUALITY = 72
 _COLORS = 128
 _SAMPLES = 8
+# Pixels of a side, at most.
+_LARGEST_SIDE = {'.mp4': 16384, '.gif': 65535, '.webp': 16383, '.jpg': 65500}
 # Milliseconds that a GIF and a WebP count in.
 _UNITS = {'.gif': 10, '.webp': 1}
 # Of a picture in either: browsers show what is shorter for 100.
@@ -46,6 +48,18 @@ def check_kind(path: Path) -> None:
         raise UsageError(f'--out {path}: {path.absolute().parent} is no directory')
     if kind == '.mp4':
         _ffmpeg()
+
+
+def check_size(path: Path, width: int, height: int) -> None:
+    """Checks that pictures of a size can be written, before they are drawn.
+
+    Raises:
+        UsageError: If the kind of file takes none as large.
+    """
+    kind = path.suffix.lower()
+    largest = _LARGEST_SIDE.get(kind)
+    if largest is not None and max(width, height) > largest:
+        raise UsageError(f'{width}x{height} pixels; allowed: {largest} a side of a {kind} file')
 
 
 def write_film(
@@ -151,11 +165,16 @@ def _ffmpeg() -> str:
 @contextmanager
 def _appearing(path: Path) -> Iterator[Path]:
     """A hidden file beside the path that takes its name when all is written."""
-    hidden = path.with_name(f'.{path.stem}.active{path.suffix.lower()}')
+    # A link stays one: what it leads to is written.
+    target = path.resolve()
+    # Of this process: two that write one film at once leave that of the later, and it is whole.
+    hidden = target.with_name(f'.{target.stem}.{os.getpid()}.active{path.suffix.lower()}')
     try:
         yield hidden
-        os.replace(hidden, path)
+        os.replace(hidden, target)
     except OSError as error:
         raise CommandError(f'{path}: {error.strerror or error}') from error
     finally:
-        hidden.unlink(missing_ok=True)
+        # A disk that may only be read refuses to remove what is not there, too.
+        with suppress(OSError):
+            hidden.unlink()

@@ -90,13 +90,17 @@ class Studio:
         return self._renderers[task]
 
 
+def sheet_size(count: int, columns: int, width: int, height: int) -> tuple[int, int]:
+    """Returns width and height of so many pictures of one size side by side."""
+    rows = -(-count // columns)
+    return columns * (width + _GAP) - _GAP, rows * (height + _GAP) - _GAP
+
+
 def tile(pictures: Sequence[Picture], columns: int) -> Picture:
     """Puts pictures of one size side by side, row by row; what is missing stays white."""
     height, width = pictures[0].shape[:2]
-    rows = -(-len(pictures) // columns)
-    sheet = np.full(
-        (rows * (height + _GAP) - _GAP, columns * (width + _GAP) - _GAP, 3), 255, dtype=np.uint8
-    )
+    total_width, total_height = sheet_size(len(pictures), columns, width, height)
+    sheet = np.full((total_height, total_width, 3), 255, dtype=np.uint8)
     for number, picture in enumerate(pictures):
         top, left = (number // columns) * (height + _GAP), (number % columns) * (width + _GAP)
         sheet[top : top + height, left : left + width] = picture

@@ -81,7 +81,10 @@ class Guard:
             target: Path and query.
             headers: Those of the request.
         """
-        path = urlsplit(target).path
+        try:
+            path = urlsplit(target).path
+        except ValueError:
+            return Refusal(400, 'this is no address')
         if path in _FORBIDDEN_PATHS:
             return Refusal(403, 'this page takes no files')
         hosts = headers.get_all('Host')

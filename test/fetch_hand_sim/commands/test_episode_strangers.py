@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import struct
@@ -278,6 +279,33 @@ def test_names_that_are_no_text_and_command_a_terminal(finished, tmp_path):
         assert all(line.isprintable() for line in output.splitlines())
 
 
+def test_what_macos_puts_beside_files_is_none_of_them(finished, tmp_path, capsys):
+    """`tar` there adds a companion to each file, and to each folder."""
+    shutil.copytree(finished, tmp_path / NAME)
+    shutil.copytree(finished, tmp_path / 'alone')
+    (tmp_path / 'alone' / 'metadata.yaml').unlink()
+    (tmp_path / 'alone' / f'{NAME}_0.mcap').rename(tmp_path / 'alone.mcap')
+    for file in (f'{NAME}/._{NAME}_0.mcap', f'{NAME}/._metadata.yaml', f'._{NAME}', '._alone.mcap'):
+        (tmp_path / file).write_bytes(b'\0\5\x16\7')
+    (tmp_path / 'alone' / '._x.mcap').write_bytes(b'\0\5\x16\7')
+    assert list_episodes.main([str(tmp_path)]) == check_episode.main([str(tmp_path)]) == 0
+    assert '2 episodes' in capsys.readouterr().out
+    assert len(load_episodes(tmp_path)) == 2
+
+
+def test_a_folder_that_may_not_be_read_is_said_to_be_that(finished, monkeypatch):
+    """Such as those that root has logged in a container."""
+
+    def refuse(path):
+        raise PermissionError(errno.EACCES, 'Permission denied', path)
+
+    monkeypatch.setattr(os, 'scandir', refuse)
+    monkeypatch.setattr(os, 'listdir', refuse)
+    for read in (read_episode, read_summary, load_episodes):
+        with pytest.raises(EpisodeReadError, match=f'{NAME}: Permission denied'):
+            read(finished)
+
+
 def test_too_long_a_name_is_one_line(capsys):
     for tool in (list_episodes, check_episode, recover_episodes):
         assert tool.main(['x' * 5000]) == 2
@@ -342,6 +370,20 @@ def test_an_export_has_the_episodes_that_a_list_has(finished, tmp_path, capsys):
     for text in (listed.err, exported.err):
         assert 'dangling.mcap' in text and 'several holds 2 MCAP files' in text
         assert_one_line_each(text, 2)
+
+
+@pytest.mark.parametrize('is_inside', [True, False])
+def test_one_unfinished_episode_is_recovered_by_the_path_that_lists_give(
+    directory, is_inside, monkeypatch, capsys
+):
+    leave(directory, 'other', b'')
+    leftover = directory / '.cut.active'
+    if is_inside:
+        monkeypatch.chdir(leftover)
+    assert recover_episodes.main(['.' if is_inside else str(leftover)]) == 0
+    assert 'recovered' in capsys.readouterr().out
+    assert not leftover.exists() and read_episode(directory / 'cut')
+    assert [each.name for each in find_leftovers(directory)] == ['other']
 
 
 def test_a_dry_run_says_by_its_code_what_cannot_be_recovered(directory, capsys):

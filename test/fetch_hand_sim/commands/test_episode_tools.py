@@ -18,6 +18,7 @@ from fetch_hand_sim.episode_log import (
     read_episode,
     read_summary,
 )
+from fetch_hand_sim.episode_log.model import former_model_sha256, model_sha256
 from fetch_hand_sim.episode_log.ticks import split_ticks
 from fetch_hand_sim.episodes import checker
 from fetch_hand_sim.episodes.checker import EpisodeChecker
@@ -241,6 +242,15 @@ def test_check_runs_goals_that_were_set_on_the_way(tmp_path):
     assert len(np.unique(arrays.goals, axis=0)) == 2
 
 
+def test_the_fingerprint_of_a_log_of_1_0_is_known_too(tmp_path, monkeypatch):
+    monkeypatch.setattr('support.episode_recorder.model_sha256', former_model_sha256)
+    recorder = Recorder('FetchReach')
+    path = recorder.record(EpisodeDirectory(tmp_path))
+    recorded = read_episode(path).metadata['model_sha256']
+    assert recorded != model_sha256(recorder.simulation.model)
+    assert not [line for line in EpisodeChecker().check(path).changed if 'model' in line]
+
+
 def test_check_episode_codes(reach, tmp_path, capsys):
     assert check_episode.main([str(reach)]) == 0
     assert capsys.readouterr().out.count('identical, 51 ticks') == 3
@@ -277,6 +287,15 @@ def test_loaded_observations_are_those_of_the_simulation(generated):
         np.testing.assert_array_equal(
             arrays.actions, action_from_command(spec.robot, arrays.commands)
         )
+
+
+@pytest.mark.parametrize('timing', ['seconds', 'ticks'])
+@pytest.mark.parametrize('control_hz', [12.5, 25.0, 50.0])
+def test_the_task_of_a_whole_episode_has_as_many_ticks(control_hz, timing, tmp_path):
+    path = Recorder('FetchReach', control_hz, timing=timing).record(EpisodeDirectory(tmp_path))
+    (arrays,) = load_episodes(path)
+    assert arrays.spec.episode_ticks == len(arrays)
+    assert dataclasses.replace(arrays.spec, episode_ticks=50) == TASKS['FetchReach']
 
 
 def test_decoding_all_at_once_equals_one_at_a_time(generated):

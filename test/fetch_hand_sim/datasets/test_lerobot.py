@@ -193,12 +193,27 @@ def test_an_object_free_task_has_the_goal_alone_as_its_environment(tmp_path):
     assert info['features']['observation.environment_state']['shape'] == [3]
 
 
-def test_episodes_of_two_rates_are_refused(tmp_path, capsys):
+def test_episodes_of_another_rate_are_left_out(tmp_path, capsys):
     for rate in (25.0, 50.0):
         Recorder('FetchReach', rate).record(EpisodeDirectory(tmp_path / 'logged'))
     assert _export(tmp_path / 'logged', tmp_path / 'out') == 1
-    assert 'episodes at 25, 50 Hz; a LeRobot dataset has one rate' in capsys.readouterr().err
-    assert not (tmp_path / 'out').exists()
+    printed = capsys.readouterr()
+    assert '1 episodes of FetchReach' in printed.out
+    assert '50 Hz, and 25 Hz in' in printed.err and 'has one rate' in printed.err
+
+
+def test_all_tasks_are_written_or_none(episodes, tmp_path, capsys):
+    logged = tmp_path / 'logged'
+    Recorder('FetchReach').record(EpisodeDirectory(logged))
+    for episode in episodes.iterdir():
+        (logged / episode.name).symlink_to(episode)
+    (tmp_path / 'out/FetchReach').mkdir(parents=True)
+    assert _export(logged, tmp_path / 'out') == 1
+    assert 'exists; nothing is overwritten' in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / 'out').iterdir()] == ['FetchReach']
+    (tmp_path / 'out/FetchReach').rmdir()
+    assert _export(logged, tmp_path / 'out') == 0
+    assert sorted(path.name for path in (tmp_path / 'out').iterdir()) == ['FetchPush', 'FetchReach']
 
 
 def test_nothing_is_overwritten(episodes, dataset, capsys):

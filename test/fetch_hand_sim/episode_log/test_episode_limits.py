@@ -9,9 +9,11 @@ from mcap.writer import CompressionType, Writer
 
 from fetch_hand_sim.episode_log import (
     Attachment,
+    EpisodeLogError,
     EpisodeReadError,
     EpisodeWriter,
     LogSettings,
+    find_leftovers,
     limits,
     load_episodes,
     read_episode,
@@ -115,6 +117,20 @@ def test_chunks_are_bounded_too(tmp_path, recorder, ticks):
     path = writer.finish({})
     assert read_summary(path).message_count == taken + sum(len(tick.messages) for tick in ticks)
     assert limits.MAX_CHUNKS // 2 - 1 <= taken <= limits.MAX_CHUNKS
+
+
+def test_an_episode_that_is_too_long_is_one_line_and_can_be_recovered(tmp_path, recorder, ticks):
+    """A task of another package may last as long as it likes."""
+    writer = EpisodeWriter(tmp_path, 'episode', recorder.metadata())
+    messages, begun = ticks[1].messages, 0
+    with pytest.raises(EpisodeLogError, match='too long for a file of 50000 messages') as caught:
+        for begun in range(limits.MAX_MESSAGES):
+            writer.write_tick(ticks[0].stamp_ns + begun * 40_000_000, messages)
+    assert str(caught.value).count('\n') == 0
+    assert begun == limits.MAX_MESSAGES // len(messages)
+    assert writer.write_tick(10**15, messages) is False and writer.finish({}) is None
+    (leftover,) = find_leftovers(tmp_path)
+    assert read_summary(recover_episode(leftover.path)).message_count == limits.MAX_MESSAGES
 
 
 def test_the_smallest_chunks_read_too(tmp_path, recorder, ticks):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 
 import mujoco
 import numpy as np
@@ -21,6 +22,7 @@ from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
     EpisodeWriter,
     LogSettings,
+    durable,
     find_leftovers,
     log_time,
     read_episode,
@@ -335,6 +337,27 @@ def test_the_compiled_model_comes_back_bit_by_bit(reach, tmp_path):
     assert model_sha256(mujoco.MjModel.from_binary_path(str(path))) == model_sha256(model)
 
 
+def test_a_fingerprint_is_that_of_the_model_and_not_of_the_folder_it_lies_in(reach, tmp_path):
+    original = asset_path('fetch/reach.xml')
+    shutil.copytree(original.parents[1], tmp_path / 'elsewhere')
+    models = [
+        mujoco.MjSpec.from_file(str(path)).compile()
+        for path in (original, tmp_path / 'elsewhere' / 'fetch' / 'reach.xml')
+    ]
+    assert models[0].paths != models[1].paths
+    assert model_sha256(models[0]) == model_sha256(models[1])
+    fingerprints = {model_sha256(models[0])}
+    for change in (
+        lambda model: setattr(model.opt, 'timestep', 0.003),
+        lambda model: setattr(model.vis.map, 'stiffness', 1.0),
+        lambda model: model.mesh_vert.__setitem__(0, 1.0),
+        lambda model: model.body_mass.__setitem__(1, 1.0),
+    ):
+        change(models[1])
+        fingerprints.add(model_sha256(models[1]))
+    assert len(fingerprints) == 5
+
+
 @pytest.mark.parametrize('compression', ['none', 'lz4', 'zstd'])
 def test_settings_reach_the_file(reach, tmp_path, compression):
     settings = LogSettings(chunk_size=4096, compression=compression, flush_period_ns=10**12)
@@ -445,6 +468,15 @@ def test_metadata_must_be_strings(tmp_path):
 def test_bad_settings_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         LogSettings(**bad)
+
+
+@pytest.mark.parametrize('task', ['Fetch-Near', 'fetch.near v2', 'Näher_000001_seed1'])
+def test_numbers_go_on_whatever_a_task_is_called(tmp_path, task):
+    for number, seed in enumerate((5, 0)):
+        writer = EpisodeDirectory(tmp_path).begin(task, seed, {})
+        assert durable.active_path(tmp_path, f'{task}_{number:06d}_seed{seed}').is_dir()
+        # What was cut off has its number too.
+        writer._stream.close()
 
 
 def test_numbers_go_on_after_what_is_there(tmp_path):

@@ -19,9 +19,11 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
+from fetch_hand_sim.commands import recover_episodes
 from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
     EpisodeExistsError,
+    EpisodeInUseError,
     EpisodeLogError,
     EpisodeReadError,
     EpisodeWriter,
@@ -270,6 +272,36 @@ def test_an_episode_whose_directory_is_cleared_away_while_it_begins_takes_the_ne
     path = recorder.record(EpisodeDirectory(tmp_path))
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     assert path.name.startswith('FetchReach_000001_')
+
+
+@pytest.mark.parametrize(
+    ('step', 'call'), [('open_regular', 0), ('open_regular', 1), ('try_lock', 1), ('publish', 0)]
+)
+def test_of_two_recoveries_at_once_one_makes_the_bag_and_the_other_says_so(
+    killed, tmp_path, monkeypatch, step, call, capsys
+):
+    """The other one comes right after a file was opened or locked, or before the bag is shown."""
+    directory = tmp_path / 'copy'
+    shutil.copytree(killed[0], directory)
+    (leftover,) = find_leftovers(directory)
+    do, calls = getattr(durable, step), []
+
+    def meanwhile(*arguments, **options):
+        result = None if step == 'publish' else do(*arguments, **options)
+        calls.append(step)
+        if len(calls) == call + 1:
+            assert recover_episodes.main([str(directory)]) == 0
+        return do(*arguments, **options) if step == 'publish' else result
+
+    monkeypatch.setattr(durable, step, meanwhile)
+    assert recover_episodes.main([str(directory)]) == 0
+    said = capsys.readouterr().out
+    assert said.count(f'\nrecovered {directory}') == 1, said
+    path = directory / leftover.name
+    assert sorted(file.name for file in path.iterdir()) == [f'{path.name}_0.mcap', 'metadata.yaml']
+    assert find_leftovers(directory) == []
+    with pytest.raises(EpisodeInUseError, match='another process has recovered it'):
+        recover_episode(leftover.path)
 
 
 def test_a_recovery_that_fails_changes_nothing(killed, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from PIL import Image
 
 from fetch_hand_sim.commands.render_episode import main as render_episode
 from fetch_hand_sim.episode_log import EpisodeDirectory
-from fetch_hand_sim.films.film import check_kind, write_film, write_picture
+from fetch_hand_sim.films.film import check_kind, check_size, write_film, write_picture
 from fetch_hand_sim.films.pictures import Studio, grid, sheets, tile, with_frame
 from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.simulation.opengl import prepare_opengl
@@ -87,6 +88,47 @@ def test_mp4_holds_every_picture(tmp_path):
     assert np.abs(frames.mean(axis=(1, 2, 3)) - 40.0 * np.arange(5)).max() < 6.0
 
 
+@pytest.mark.parametrize('name', ['film.gif', 'picture.PNG'])
+@pytest.mark.parametrize('is_there', [True, False])
+def test_a_link_stays_one_and_what_it_leads_to_is_written(name, is_there, tmp_path):
+    (tmp_path / 'store').mkdir()
+    target, link = tmp_path / 'store' / 'newest', tmp_path / name
+    if is_there:
+        target.write_bytes(b'older')
+    link.symlink_to(target)
+    if link.suffix == '.gif':
+        write_film(link, iter(PICTURES), fps=25.0)
+    else:
+        write_picture(link, PICTURES[0])
+    assert link.is_symlink() and [each.name for each in target.parent.iterdir()] == ['newest']
+    with Image.open(target) as image:
+        assert image.size == (7, 5)
+
+
+def test_two_processes_that_write_one_film_leave_a_whole_one(tmp_path):
+    pytest.importorskip('imageio_ffmpeg')
+    import imageio.v3 as imageio
+
+    path = tmp_path / 'film.mp4'
+    code = (
+        'import numpy as np, pathlib, sys\n'
+        'from fetch_hand_sim.films.film import write_film\n'
+        'pictures = iter(np.zeros((9, 48, 64, 3), np.uint8))\n'
+        'write_film(pathlib.Path(sys.argv[1]), pictures, 25.0)'
+    )
+
+    def pictures():
+        for number, picture in enumerate(PICTURES):
+            if number == 3:
+                subprocess.run([sys.executable, '-c', code, str(path)], check=True)
+                assert len(imageio.imread(path)) == 9
+            yield np.kron(picture, np.ones((20, 20, 1), dtype=np.uint8))
+
+    write_film(path, pictures(), fps=25.0)
+    assert imageio.imread(path).shape == (5, 100, 140, 3)
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
 def test_a_film_that_fails_leaves_nothing(tmp_path):
     def pictures():
         yield PICTURES[0]
@@ -102,6 +144,19 @@ def test_a_full_disk_is_one_line():
         write_picture(check_path('/proc/picture.png'), PICTURES[0])
 
 
+def test_a_disk_that_may_only_be_read_is_one_line(tmp_path, monkeypatch):
+    """As Linux does it: it looks for a file only where it may write."""
+
+    def refuse(path, *_, **options):
+        raise OSError(errno.EROFS, 'Read-only file system', str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr('pathlib.Path.unlink', refuse)
+        patch.setattr('PIL.Image.Image.save', lambda image, path, **options: refuse(path))
+        with pytest.raises(CommandError, match=r'picture\.png: Read-only file system'):
+            write_picture(tmp_path / 'picture.png', PICTURES[0])
+
+
 def check_path(text):
     from pathlib import Path
 
@@ -115,6 +170,20 @@ def test_what_cannot_be_written_is_said_before_drawing(out, tmp_path):
     (tmp_path / 'film.webp').mkdir()
     with pytest.raises(UsageError, match=r'film\.webp is a directory'):
         check_kind(tmp_path / 'film.webp')
+
+
+@pytest.mark.parametrize(('kind', 'largest'), [('webp', 16383), ('mp4', 16384), ('jpg', 65500)])
+def test_a_sheet_that_a_file_cannot_hold_is_one_line_before_drawing(
+    folder, tmp_path, kind, largest, monkeypatch, capsys
+):
+    monkeypatch.setattr(Studio, 'picture', lambda *_: pytest.fail('drawn'))
+    out = tmp_path / f'x.{kind}'
+    arguments = ['--grid', '20x1', '--size', '4096x48', '--out', str(out)]
+    assert render_episode([str(folder), *arguments]) == 2
+    assert capsys.readouterr().err == (
+        f'render_episode: 81958x48 pixels; allowed: {largest} a side of a .{kind} file\n'
+    )
+    check_size(out, largest, largest)
 
 
 def test_tiles_lie_in_rows():

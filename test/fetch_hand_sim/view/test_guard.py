@@ -52,6 +52,13 @@ def test_one_host_is_needed(headers):
     assert Guard().refusal('/', Headers(headers)).status == 400
 
 
+@pytest.mark.parametrize('token', [None, TOKEN])
+@pytest.mark.parametrize('target', ['//[', 'http://[::1/', '//a[b]c/?token=a-token'])
+def test_what_is_no_address_is_refused(target, token):
+    """A traceback on the terminal of the robot would be a visitor's to make."""
+    assert refusal(Guard(token), target, Host='localhost').status == 400
+
+
 def test_no_files_from_visitors():
     headers = {'Host': 'localhost', 'Origin': 'http://localhost'}
     assert refusal(Guard(), '/drop?sid=1', **headers).status == 403

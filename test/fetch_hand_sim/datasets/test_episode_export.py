@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import shutil
 import subprocess
 import sys
 
@@ -113,6 +115,106 @@ def test_a_full_disk_leaves_nothing_that_stands_in_the_way(episodes, tmp_path, f
     assert list(tmp_path.iterdir()) == []
     assert export_episodes.main(arguments) == 0, capsys.readouterr()
     assert not [path for path in tmp_path.rglob('*') if path.name.startswith('.')]
+
+
+@pytest.fixture(scope='module')
+def two_tasks(episodes, tmp_path_factory):
+    """A folder of FetchPush and FetchReach, whose files come after the other's."""
+    directory = tmp_path_factory.mktemp('two_tasks')
+    shutil.copytree(episodes, directory, dirs_exist_ok=True)
+    Recorder('FetchReach').record(EpisodeDirectory(directory))
+    return directory
+
+
+@pytest.mark.parametrize(
+    ('format_', 'there'),
+    [('parquet', 'FetchReach_episodes.parquet'), ('minari', 'FetchReach/logged-v0')],
+)
+def test_of_two_tasks_none_is_written_where_one_is_there(two_tasks, tmp_path, format_, there):
+    pytest.importorskip({'parquet': 'pyarrow', 'minari': 'minari'}[format_])
+    (tmp_path / there).mkdir(parents=True)
+    arguments = [str(two_tasks), '--to', format_, '--output', str(tmp_path)]
+    assert export_episodes.main(arguments) == 1
+    assert [path.name for path in tmp_path.iterdir()] == [there.partition('/')[0]]
+    (tmp_path / there).rmdir()
+    assert export_episodes.main(arguments) == 0
+
+
+@pytest.mark.parametrize('format_', ['parquet', 'minari'])
+def test_of_two_tasks_none_is_written_where_there_is_no_room_for_both(
+    two_tasks, tmp_path, format_, monkeypatch, capsys
+):
+    """As a disk that is full after the first."""
+    module = {'parquet': 'pyarrow.parquet', 'minari': 'minari'}[format_]
+    write = {'parquet': 'write_table', 'minari': 'create_dataset_from_buffers'}[format_]
+    library, done = pytest.importorskip(module), []
+    written = getattr(library, write)
+
+    def once(*arguments, **options):
+        if len(done) == (2 if format_ == 'parquet' else 1):
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        done.append(written(*arguments, **options))
+
+    arguments = [str(two_tasks), '--to', format_, '--output', str(tmp_path)]
+    with monkeypatch.context() as patch:
+        patch.setattr(library, write, once)
+        assert export_episodes.main(arguments) == 1
+    assert 'No space left' in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert export_episodes.main(arguments) == 0
+
+
+@pytest.mark.parametrize('format_', ['parquet', 'minari'])
+def test_of_two_exports_at_once_one_writes_and_the_other_finds_it_there(
+    episodes, two_tasks, tmp_path, format_, monkeypatch
+):
+    """The other one begins before the first has written anything."""
+    module = {'parquet': 'pyarrow.parquet', 'minari': 'minari'}[format_]
+    write = {'parquet': 'write_table', 'minari': 'create_dataset_from_buffers'}[format_]
+    library = pytest.importorskip(module)
+    written, others = getattr(library, write), []
+    command = [sys.executable, '-m', 'fetch_hand_sim.commands.export_episodes', str(two_tasks)]
+    options = ['--to', format_, '--output', str(tmp_path)]
+
+    def begin_another(*arguments, **more):
+        if not others:
+            others.append(subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True))
+            with pytest.raises(subprocess.TimeoutExpired):
+                others[0].wait(4.0)
+        return written(*arguments, **more)
+
+    monkeypatch.setattr(library, write, begin_another)
+    assert export_episodes.main([str(episodes), *options]) == 0
+    (line,) = others[0].communicate()[1].splitlines()
+    assert others[0].returncode == 1 and 'exists; nothing is overwritten' in line
+    first = {'parquet': f'{TASK}.parquet', 'minari': TASK}[format_]
+    second = {'parquet': [f'{TASK}_episodes.parquet'], 'minari': []}[format_]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [first, *second]
+
+
+def test_a_minari_dataset_has_episodes_of_one_environment(tmp_path, monkeypatch, capsys):
+    minari = pytest.importorskip('minari')
+    pytest.importorskip('pyarrow')
+    monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path))
+    logged = EpisodeDirectory(tmp_path / 'logged')
+    for control_hz in (25.0, 50.0, 25.0):
+        Recorder('FetchReach', control_hz).record(logged)
+    arguments = [str(tmp_path / 'logged'), '--output', str(tmp_path), '--to']
+    assert export_episodes.main([*arguments, 'minari']) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'FetchReach_000001_seed0: control_hz 50.0, and 25.0 in ' in line
+    dataset = minari.load_dataset('FetchReach/logged-v0')
+    assert (dataset.total_episodes, dataset.total_steps) == (2, 100)
+    # Tables say the rate of each.
+    assert export_episodes.main([*arguments, 'parquet']) == 0
+
+
+def test_a_dataset_name_that_no_disk_takes_is_one_line(episodes, tmp_path, capsys):
+    pytest.importorskip('minari')
+    arguments = [str(episodes), '--to', 'minari', '--output', str(tmp_path), '--name', 'x' * 300]
+    assert export_episodes.main(arguments) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'File name too long' in line
 
 
 def test_of_two_tables_none_is_written_beside_one_that_is_there(episodes, tmp_path, capsys):

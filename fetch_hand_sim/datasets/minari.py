@@ -1,0 +1,168 @@
+"""Logged episodes as Minari datasets.
+
+Needs the extra `[data]`. Values are those of `load_episodes`, float64, unchanged.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from fetch_hand_sim.datasets.writing import (
+    ByTask,
+    ExportError,
+    alone_in,
+    require_module,
+    require_new,
+)
+from fetch_hand_sim.episode_log import EpisodeArrays
+from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
+from fetch_hand_sim.gym_envs.spaces import observation_space
+from msgs_spec.command_line import UsageError
+
+# Parts of a dataset's id become directories.
+_DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
+_VERSION = re.compile(r'-v\d+$')
+# Minari's: where datasets live, and what is in the directories above one.
+_MINARI_PATH, _NAMESPACE = 'MINARI_DATASETS_PATH', 'namespace_metadata.json'
+# Of a record, what `_environment` is made of.
+_OF_THE_ENVIRONMENT = ('control_hz', 'timing', 'reward_type', 'success_rule')
+
+
+def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
+    """Returns why an episode cannot be in the Minari dataset of another of its task, '' if it can.
+
+    A dataset has one environment, whose rewards and rate are those of all its episodes.
+    """
+    one, other = episode.record, first.record
+    for name in _OF_THE_ENVIRONMENT:
+        if getattr(one, name) != getattr(other, name):
+            return f'{name} {getattr(one, name)}, and {getattr(other, name)} in {first.path}'
+    return ''
+
+
+def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]:
+    """Writes the episodes of each task as a Minari dataset, all of them or none.
+
+    Args:
+        by_task: Episodes, at least one of each task, and none that is apart from the first of its
+            task, see `why_apart`.
+        directory: Where Minari datasets live (`MINARI_DATASETS_PATH`).
+        name: Of the dataset, such as `logged-v0` or `me/logged-v0`; the task comes before it, and a
+            version after it if it has none.
+
+    Returns:
+        The id of each task's dataset, `<task>/<name>`.
+
+    Raises:
+        UsageError: If the name is not allowed.
+        ExportError: If minari is missing, the dataset exists or cannot be written. No dataset is
+            created in either case.
+    """
+    if not _DATASET_NAME.fullmatch(name):
+        raise UsageError(
+            f'dataset name {name!r}; allowed: letters, digits, _ and -, parts separated by /, such '
+            'as logged-v0'
+        )
+    minari, collector = require_module('minari'), require_module('minari.data_collector')
+    versioned = name if _VERSION.search(name) else f'{name}-v0'
+    ids = {task: f'{task}/{versioned}' for task in by_task}
+    try:
+        with alone_in(directory):
+            require_new(directory / dataset_id for dataset_id in ids.values())
+            with _appearing(directory, list(ids.values())):
+                for task, episodes in by_task.items():
+                    _create_dataset(minari, collector, ids[task], episodes)
+    except ImportError as error:
+        raise ExportError(f"{error}; install with pip install 'fetch_hand_sim[data]'") from error
+    except (OSError, ValueError, AssertionError) as error:
+        raise ExportError(f'{directory}: {" ".join(str(error).split())}') from error
+    return ids
+
+
+def _create_dataset(
+    minari: Any, collector: Any, dataset_id: str, episodes: Sequence[EpisodeArrays]
+) -> None:
+    """Writes a dataset where `MINARI_DATASETS_PATH` says."""
+    spec = episodes[0].spec
+    buffers = [
+        collector.EpisodeBuffer(
+            id=index,
+            seed=episode.record.seed,
+            observations=dict(episode.observations),
+            actions=episode.actions,
+            rewards=episode.rewards.tolist(),
+            terminations=episode.terminated.tolist(),
+            truncations=episode.truncated.tolist(),
+            infos={'is_success': episode.success[:, None]},
+        )
+        for index, episode in enumerate(episodes)
+    ]
+    # Actions worked out from commands are not all float32.
+    actions = spaces.Box(-1.0, 1.0, (spec.robot.action_size,), np.float64)
+    minari.create_dataset_from_buffers(
+        dataset_id,
+        buffers,
+        env=_environment(episodes[0]),
+        observation_space=observation_space(spec),
+        action_space=actions,
+        algorithm_name=_algorithm(episodes),
+        description=f'Logged episodes of {spec.name}.',
+        data_format='arrow',
+        requirements=_requirements(episodes[0]),
+    )
+
+
+@contextmanager
+def _appearing(directory: Path, dataset_ids: Sequence[str]) -> Iterator[None]:
+    """Minari writes into a hidden folder meanwhile; what is whole at the end moves to its place."""
+    # Minari joins a relative path to itself.
+    directory = directory.resolve()
+    with TemporaryDirectory(prefix='.', suffix='.partial', dir=directory) as hidden:
+        os.environ[_MINARI_PATH] = hidden
+        try:
+            with warnings.catch_warnings():
+                # Minari warns of every field that only an author could fill in.
+                warnings.filterwarnings('ignore', module='minari')
+                yield
+        finally:
+            os.environ[_MINARI_PATH] = str(directory)
+        for source in Path(hidden).rglob(_NAMESPACE):
+            target = directory / source.relative_to(hidden)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if not target.exists():
+                source.replace(target)
+        for dataset_id in dataset_ids:
+            (Path(hidden) / dataset_id).rename(directory / dataset_id)
+
+
+def _environment(episode: EpisodeArrays) -> Any:
+    """The Gymnasium environment the episode could have come from, for `recover_environment`."""
+    register_environments()
+    record = episode.record
+    spec = copy.deepcopy(gymnasium.spec(environment_id(episode.spec.name)))
+    for name in ('reward_type', 'success_rule', 'control_hz'):
+        spec.kwargs[name] = getattr(record, name)
+    spec.max_episode_steps = episode.spec.episode_ticks
+    return spec
+
+
+def _algorithm(episodes: Sequence[EpisodeArrays]) -> str:
+    checkpoints = {episode.metadata.get('checkpoint_sha256', 'unknown') for episode in episodes}
+    return f'checkpoints {", ".join(sorted(checkpoints))}'
+
+
+def _requirements(episode: EpisodeArrays) -> list[str]:
+    names = ('mujoco', 'gymnasium-robotics')
+    return [f'{name}=={episode.metadata.get(f"{name}_version", "unknown")}' for name in names]

@@ -1,0 +1,126 @@
+"""Logged episodes as Parquet tables.
+
+Needs the extra `[data]`. Values are those of `load_episodes`, float64, unchanged.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.datasets.writing import (
+    ByTask,
+    ExportError,
+    alone_in,
+    require_module,
+    require_new,
+)
+from fetch_hand_sim.episode_log import EpisodeArrays
+from msgs_spec.command_line import printable
+
+_OBSERVATIONS = ('observation', 'achieved_goal', 'desired_goal')
+
+
+def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
+    """Writes the episodes of each task as two tables, all of them or none.
+
+    `<task>.parquet` has N + 1 rows per episode, one per observation: `episode_index`, `step`,
+    `timestamp` in seconds since the reset, the three observations, then what happened after it:
+    `action`, `command`, `reward`, `terminated`, `truncated`, `next_success`, all null in the last
+    row. `<task>_episodes.parquet` has a row per episode: what the file says of itself.
+
+    Args:
+        by_task: Episodes, at least one of each task.
+        directory: Where to write.
+
+    Returns:
+        The two files of each task.
+
+    Raises:
+        ExportError: If pyarrow is missing, or a file exists or cannot be written; none is created.
+    """
+    pyarrow, parquet = require_module('pyarrow'), require_module('pyarrow.parquet')
+    paths = {
+        task: [directory / f'{task}.parquet', directory / f'{task}_episodes.parquet']
+        for task in by_task
+    }
+    try:
+        with alone_in(directory):
+            require_new(path for pair in paths.values() for path in pair)
+            tables: dict[Path, Any] = {}
+            for task, episodes in by_task.items():
+                tables |= zip(paths[task], _tables(pyarrow, episodes), strict=True)
+            _write_tables(parquet, tables)
+    except OSError as error:
+        raise ExportError(f'{directory}: {error.strerror or error}') from error
+    return paths
+
+
+def _tables(pyarrow: Any, episodes: Sequence[EpisodeArrays]) -> tuple[Any, Any]:
+    """The steps of some episodes of one task, and the episodes."""
+    steps = [_step_table(pyarrow, index, episode) for index, episode in enumerate(episodes)]
+    rows = [_episode_row(index, episode) for index, episode in enumerate(episodes)]
+    return pyarrow.concat_tables(steps), pyarrow.Table.from_pylist(rows)
+
+
+def _write_tables(parquet: Any, tables: Mapping[Path, Any]) -> None:
+    """Writes all tables under hidden names, then gives them theirs: a full disk leaves none."""
+    hidden = {path: path.with_name(f'.{path.name}.partial') for path in tables}
+    try:
+        for path, table in tables.items():
+            with hidden[path].open('wb') as stream:
+                parquet.write_table(table, stream, compression='zstd')
+        for path in tables:
+            os.replace(hidden[path], path)
+    finally:
+        for partial in hidden.values():
+            partial.unlink(missing_ok=True)
+
+
+def _step_table(pyarrow: Any, index: int, episode: EpisodeArrays) -> Any:
+    rows = len(episode) + 1
+    seconds = (episode.stamps - episode.stamps[0]) / 1e9
+    columns = {
+        'episode_index': pyarrow.array(np.full(rows, index)),
+        'step': pyarrow.array(np.arange(rows)),
+        'timestamp': pyarrow.array(seconds),
+        **{name: _column(pyarrow, episode.observations[name], rows) for name in _OBSERVATIONS},
+        'action': _column(pyarrow, episode.actions, rows),
+        'command': _column(pyarrow, episode.commands, rows),
+        'reward': _column(pyarrow, episode.rewards, rows),
+        'terminated': _column(pyarrow, episode.terminated, rows),
+        'truncated': _column(pyarrow, episode.truncated, rows),
+        'next_success': _column(pyarrow, episode.success[1:], rows),
+    }
+    return pyarrow.table(columns)
+
+
+def _column(pyarrow: Any, values: NDArray[Any], rows: int) -> Any:
+    """A column of numbers, or of vectors of fixed size, filled up with nulls to `rows`."""
+    column = pyarrow.array(values.ravel())
+    if values.ndim == 2:
+        column = pyarrow.FixedSizeListArray.from_arrays(column, values.shape[1])
+    return pyarrow.concat_arrays([column, pyarrow.nulls(rows - len(values), column.type)])
+
+
+def _episode_row(index: int, episode: EpisodeArrays) -> dict[str, Any]:
+    record, outcome = episode.record, episode.outcome
+    return {
+        'episode_index': index,
+        'path': printable(str(episode.path)),
+        'task': episode.spec.name,
+        'seed': record.seed,
+        'steps': len(episode),
+        'return': float(episode.rewards.sum()),
+        'success': bool(episode.success[-1]),
+        'complete': outcome.is_complete,
+        'control_hz': record.control_hz,
+        'metadata': json.dumps(episode.metadata),
+        'result': json.dumps(episode.result),
+    }
