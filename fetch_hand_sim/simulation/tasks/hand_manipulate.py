@@ -24,6 +24,7 @@ from fetch_hand_sim.simulation.tasks.task import (
     integration_state,
     joint_qpos_slice,
     joint_qvel_slice,
+    weakly,
 )
 from msgs_spec.actions import resting_command
 from msgs_spec.rotations import (
@@ -110,8 +111,8 @@ class HandManipulateTask(HandTask):
         self._object_qvel = self._qvel[:, joint_qvel_slice(model, _OBJECT_JOINT)]
         self._sensors |= {
             'object_pose': self._object_qpos.copy,
-            'object_twist': self._object_twist,
-            'object_joint': self._object_joint,
+            'object_twist': weakly(self._object_twist),
+            'object_joint': weakly(self._object_joint),
         }
         self._object_site = model.site(_OBJECT_SITE).id
         self._resting_command = resting_command(spec.robot)

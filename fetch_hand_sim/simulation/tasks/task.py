@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
+from weakref import WeakMethod
 
 import mujoco
 import numpy as np
@@ -105,7 +106,7 @@ class Task(ABC):
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._joint_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
         # What reads the vectors (N, topic.size) of a topic; families add theirs.
-        self._sensors: dict[str, Callable[[], Array]] = {'joint_states': self._joint_states}
+        self._sensors: dict[str, Callable[[], Array]] = {'joint_states': weakly(self._joint_states)}
         self._observed = observed_topics(spec)
 
     @property
@@ -222,6 +223,21 @@ class Task(ABC):
             ],
             axis=1,
         )
+
+
+def weakly(sensor: Callable[[], Array]) -> Callable[[], Array]:
+    """A method that does not keep its object alive, for an object that keeps the method.
+
+    A task would else wait for the garbage collector, which does not see how large a batch is.
+    """
+    method = WeakMethod(sensor)
+
+    def read() -> Array:
+        bound = method()
+        assert bound is not None, 'only the object itself calls it'
+        return bound()
+
+    return read
 
 
 def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:

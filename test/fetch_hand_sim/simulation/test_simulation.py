@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import gc
 import logging
+import weakref
 from typing import Any
 
 import numpy as np
@@ -280,3 +282,17 @@ def test_memory_does_not_grow_with_episodes(task):
 
     before = run_episodes()
     assert run_episodes() - before < 4_000_000, 'bytes that 150 more episodes took'
+
+
+@pytest.mark.parametrize('task', ['FetchPush', 'HandReach', 'HandManipulateEggFull'])
+def test_a_simulation_frees_its_memory_when_nobody_has_it_any_more(task):
+    gc.disable()
+    try:
+        simulation = Simulation(task, num_threads=1)
+        simulation.reset(seed=0)
+        simulation.step(np.zeros((1, simulation.spec.robot.action_size)))
+        physics = weakref.ref(simulation.task)
+        del simulation
+        assert physics() is None
+    finally:
+        gc.enable()
