@@ -83,6 +83,14 @@ def test_bad_arguments_are_refused(arguments, message):
         make('FetchReach', **arguments)
 
 
+@pytest.mark.parametrize('make_one', [gymnasium.make, gymnasium.make_vec])
+def test_an_id_makes_its_own_task_only(make_one):
+    name = environment_id('FetchReach')
+    with pytest.raises(ValueError, match='FetchReach-v0 is FetchReach, not FetchPush'):
+        make_one(name, task='FetchPush')
+    assert make_one(make_one(name, task='FetchReach').spec).spec.id == name
+
+
 @pytest.mark.parametrize(
     ('arguments', 'error', 'message'),
     [
