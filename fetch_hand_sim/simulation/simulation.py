@@ -163,7 +163,6 @@ class Simulation:
     def write_data(self, index: int, data: Any) -> None:
         """Lets simulation `index` go on from a `mujoco.MjData`, changed by whoever had it."""
         self._task.write_data(index, data)
-        self._is_started[index] = True
 
     def apply_model_changes(self) -> None:
         """Steps with `model` as it is now; the simulation keeps a copy of its own."""

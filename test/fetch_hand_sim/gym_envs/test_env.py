@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import subprocess
 import sys
 
@@ -137,6 +138,18 @@ def test_a_diverged_episode_is_truncated():
     observation, _, terminated, truncated, info = env.step(np.zeros(4))
     assert (terminated, truncated, info['diverged']) == (False, True, True)
     assert env.observation_space.contains(observation)
+
+
+def test_looking_at_the_data_starts_no_episode():
+    env = make('FetchPush').unwrapped
+    assert env.data.time > 0.0
+    with pytest.raises(gymnasium.error.ResetNeeded, match='reset comes before the first step'):
+        env.step(np.zeros(4))
+    env.data.qpos[:] += 0.01
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        copy.deepcopy(env).step(np.zeros(4))
+    env.reset(seed=0)
+    env.step(np.zeros(4))
 
 
 def test_the_flat_view_is_the_concatenation():
