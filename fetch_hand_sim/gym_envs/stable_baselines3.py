@@ -41,6 +41,8 @@ class FetchHandVecEnv(VecEnv):
         super().__init__(
             num_envs, self.batch.single_observation_space, self.batch.single_action_space
         )
+        # Films of `VecVideoRecorder` take their speed from it.
+        self.metadata = dict(self.batch.metadata)
         self._actions: NDArray[np.float32] | None = None
 
     def reset(self) -> Observation:

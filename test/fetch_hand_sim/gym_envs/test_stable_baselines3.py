@@ -58,6 +58,11 @@ def test_attributes_of_some_environments():
     assert not env.has_attr('colour')
 
 
+def test_films_are_as_fast_as_the_robots():
+    for rate in (25.0, 50.0):
+        assert FetchHandVecEnv('FetchReach', control_hz=rate).metadata['render_fps'] == rate
+
+
 def test_it_learns_with_hindsight():
     torch.set_num_threads(1)
     env = VecMonitor(FetchHandVecEnv('FetchReach', 4, max_episode_steps=10))
