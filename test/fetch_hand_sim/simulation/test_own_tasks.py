@@ -55,6 +55,17 @@ def test_a_model_of_its_own_is_the_one_that_is_simulated(monkeypatch):
         registry.make_task('HandReach')
 
 
+def test_a_model_that_steps_by_another_time_is_refused(monkeypatch):
+    class Finer(HandReachTask):
+        def __init__(self, spec, batch):
+            super().__init__(spec, batch)
+            self.model.opt.timestep = 0.001
+
+    monkeypatch.setattr(registry, '_family', lambda spec: Finer)
+    with pytest.raises(ValueError, match=r'steps by 0.001 s; .* take 0.002 s \(<option timestep'):
+        registry.make_task('HandReach')
+
+
 def test_a_pose_goal_needs_neither_a_ghost_nor_the_joint_of_its_object(monkeypatch):
     """Such as that of FetchPush, turned."""
     formulas = TaskFormulas(
