@@ -83,6 +83,8 @@ class Pictures:
         """
         if self._scene is None:
             self._scene = Scene(self._simulation.spec.name)
+        # With the thresholds that hold now: goals are drawn as large as they are.
+        self._scene.spec = self._simulation.metric.spec
         frame = simulation_frame(self._simulation, index)
         if mode == 'human':
             self._show(self._scene, frame)

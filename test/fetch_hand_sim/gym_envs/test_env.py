@@ -254,6 +254,21 @@ def test_rendering_gives_a_picture_or_says_what_it_needs(
     assert result.stdout.strip() in (picture, reason[:80].strip()), result.stderr
 
 
+def test_pictures_show_the_threshold_that_holds(monkeypatch):
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    env = make('FetchReach', render_mode='rgb_array', distance_threshold=0.04).unwrapped
+    env.reset(seed=0)
+    try:
+        before = env.render()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    env.distance_threshold = 0.01
+    after = env.render()
+    assert (before != after).any()
+    env.distance_threshold = 0.04
+    assert (before == env.render()).all()
+
+
 def test_opengl_can_be_chosen_after_mujoco_was_imported(monkeypatch):
     monkeypatch.delenv('MUJOCO_GL', raising=False)
     choice, code = 'import os\nos.environ["MUJOCO_GL"] = "egl"\n', 'import mujoco\n'
