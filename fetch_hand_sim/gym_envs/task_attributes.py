@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Real
 from typing import Any
@@ -52,9 +53,17 @@ class TaskAttributes:
 
     def compute_truncated(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
-    ) -> bool:
-        """Whether MuJoCo lost the simulation at the step that gave `info`."""
-        return bool(info and info.get('diverged', False))
+    ) -> Any:
+        """Whether MuJoCo lost the simulation at the step that gave `info`.
+
+        Returns:
+            A boolean; an array (N,) for N infos, or for those of a batch of N.
+        """
+        if info is None or isinstance(info, Mapping):
+            lost = np.asarray((info or {}).get('diverged', False), dtype=bool)
+            return lost if lost.ndim else bool(lost)
+        each = [self.compute_truncated(achieved_goal, desired_goal, one) for one in info]
+        return np.array(each, dtype=bool)
 
     @property
     def dt(self) -> float:

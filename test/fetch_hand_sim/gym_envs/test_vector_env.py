@@ -210,6 +210,21 @@ def test_a_diverged_environment_is_truncated_and_starts_again():
     assert info['_is_success'].tolist() == [True, False, True]
 
 
+def test_what_was_lost_can_be_asked_of_one_step_and_of_many():
+    env = make_vec('FetchPush', 3)
+    observation, _ = env.reset(seed=0)
+    env.unwrapped.simulation.task.batch.bind('qvel')[1, 0] = np.nan
+    truncated, info = env.step(np.zeros((3, 4)))[3:]
+    goals = observation['achieved_goal'], observation['desired_goal']
+    lost = env.unwrapped.compute_truncated
+    assert lost(*goals, info).tolist() == truncated.tolist()
+    infos = [{'diverged': each} for each in truncated]
+    # A list, and an array of objects as replay buffers keep them.
+    for many in (infos, np.array(infos)):
+        assert lost(*goals, many).tolist() == truncated.tolist()
+    assert [lost(*goals, one) for one in ({}, None, infos[1])] == [False, False, True]
+
+
 BAD_RESETS = {
     'options': ({'options': [1]}, TypeError, r'a dictionary or None, not \[1\]'),
     'unknown option': (
