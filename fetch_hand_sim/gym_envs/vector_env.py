@@ -202,6 +202,11 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             **_masked({'final_obs': final, 'final_info': _masked(values, ended)}, ended),
         }
 
+    @property  # type: ignore[misc]
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The random generator of every environment, (N,), live."""
+        return tuple(self.simulation.generator(i) for i in range(self.num_envs))
+
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
         """The seed of every environment's random generator, (N,); -1 before its first episode."""
@@ -300,6 +305,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 _SETTABLE = ('reward_type', 'distance_threshold', 'rotation_threshold')
 # What each environment has for itself.
 _OF_EACH: dict[str, Callable[[FetchHandVectorEnv], Sequence[Any]]] = {
+    'np_random': lambda batch: batch.np_random,
     'np_random_seed': lambda batch: batch.np_random_seed,
     'goal': lambda batch: list(batch.simulation.goals.copy()),
     'data': lambda batch: [batch.simulation.data(i) for i in range(batch.num_envs)],

@@ -169,6 +169,13 @@ class Simulation:
         self._model_may_change = True
         self._task.batch.set_models(self.model)
 
+    def generator(self, index: int) -> np.random.Generator:
+        """The random generator of simulation `index`, live: starts and goals are drawn from it."""
+        generator = self._generators[index]
+        if generator is None:
+            generator = self._generators[index] = seeding.np_random(None)[0]
+        return generator
+
     @property
     def tick_duration(self) -> float:
         """Simulated seconds per step."""
@@ -397,7 +404,7 @@ class Simulation:
 
     def _start(self, ids: NDArray[np.intp]) -> None:
         """Begins episodes; what MuJoCo warned of before counts no more."""
-        self.goals[ids] = self._task.reset(ids, [self._generator(i) for i in ids.tolist()])
+        self.goals[ids] = self._task.reset(ids, [self.generator(i) for i in ids.tolist()])
         self._warnings = self._count_warnings()
         self._is_started[ids] = True
 
@@ -455,12 +462,6 @@ class Simulation:
         for index, generator in zip(selected.tolist(), fresh, strict=True):
             if generator is not None:
                 self._generators[index] = generator
-
-    def _generator(self, index: int) -> np.random.Generator:
-        generator = self._generators[index]
-        if generator is None:
-            generator = self._generators[index] = seeding.np_random(None)[0]
-        return generator
 
 
 def _generator_from(seed: Any) -> np.random.Generator:

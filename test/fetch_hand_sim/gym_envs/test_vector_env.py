@@ -189,6 +189,21 @@ def test_seeds_are_told_as_gymnasiums_vectorisation_tells_them():
             assert each.np_random_seed == each.unwrapped.get_attr('np_random_seed') == expected
 
 
+def test_random_generators_are_those_that_are_drawn_from():
+    env = make_vec('FetchReach', 2)
+    members = [lambda: gymnasium.make(environment_id('FetchReach'))] * 2
+    reference = gymnasium.vector.SyncVectorEnv(members)
+    for each in (env, reference):
+        each.reset(seed=5)
+    for mine, other in zip(env.np_random, reference.np_random, strict=True):
+        assert mine.bit_generator.state == other.bit_generator.state
+    kept = [each.bit_generator.state for each in env.get_attr('np_random')]
+    first, _ = env.reset()
+    for generator, state in zip(env.np_random, kept, strict=True):
+        generator.bit_generator.state = state
+    assert_same(env.reset()[0], first)
+
+
 def test_a_seed_that_nobody_gave_is_told_too():
     env = make_vec('FetchReach', 2)
     assert env.np_random_seed == (-1, -1)
