@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from fetch_hand_sim.gym_envs.task_attributes import check_reset_options
 from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Observation
 
@@ -46,7 +47,13 @@ class FetchHandVecEnv(VecEnv):
         self._actions: NDArray[np.float32] | None = None
 
     def reset(self) -> Observation:
-        """Starts all episodes, with the seeds that `seed` set."""
+        """Starts all episodes, with the seeds that `seed` set.
+
+        Raises:
+            ValueError: If `set_options` set any; there are none.
+        """
+        for options in self._options:
+            check_reset_options(options, allowed=())
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         observation, _ = self.batch.reset(seed=seeds)
         self._reset_seeds()
@@ -78,8 +85,8 @@ class FetchHandVecEnv(VecEnv):
         return self.batch.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the environments."""
-        values = self.batch.get_attr(attr_name)
+        """An attribute of the environments; methods are not called."""
+        values = self.batch.attributes(attr_name)
         return [values[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
@@ -89,7 +96,7 @@ class FetchHandVecEnv(VecEnv):
             AttributeError: If there is no such attribute, or it cannot be set.
             ValueError: If a shared one is set for some environments only.
         """
-        values = list(self.batch.get_attr(attr_name))
+        values = list(self.batch.attributes(attr_name))
         for index in self._get_indices(indices):
             values[index] = value
         self.batch.set_attr(attr_name, values)
@@ -101,7 +108,12 @@ class FetchHandVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Calls a method of the environments."""
+        """Calls a method of the environments.
+
+        Raises:
+            AttributeError: If there is none.
+            ValueError: If it is for all of them only: `reset`, `step` or `close`.
+        """
         results = self.batch.call(method_name, *method_args, **method_kwargs)
         return [results[i] for i in self._get_indices(indices)]
 

@@ -229,19 +229,33 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
         Raises:
             AttributeError: If an environment has no such attribute.
+            ValueError: If it is a method for all of them only: `reset`, `step` or `close`.
         """
+        if name in _FOR_ALL:
+            raise ValueError(f'{name} is for all environments of a batch; use it directly')
         if name == 'render':
             return self.render() or (None,) * self.num_envs
+        values = self.attributes(name)
+        if name in _OF_EACH or not callable(values[0]):
+            return values
+        return (values[0](*args, **kwargs),) * self.num_envs
+
+    def attributes(self, name: str) -> tuple[Any, ...]:
+        """An attribute of every environment; of a method the method, which `get_attr` calls.
+
+        Raises:
+            AttributeError: If an environment has no such attribute.
+        """
         if name in _OF_EACH:
             return tuple(_OF_EACH[name](self))
-        shared = getattr(self, _SHARED.get(name, name))
-        return (shared(*args, **kwargs) if callable(shared) else shared,) * self.num_envs
+        return (getattr(self, _SHARED.get(name, name)),) * self.num_envs
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every environment.
 
         Raises:
             AttributeError: If an environment has no such attribute.
+            ValueError: As `call`, since a method is called, as `SyncVectorEnv` does.
         """
         return self.call(name)
 
@@ -310,6 +324,8 @@ _OF_EACH: dict[str, Callable[[FetchHandVectorEnv], Sequence[Any]]] = {
     'goal': lambda batch: list(batch.simulation.goals.copy()),
     'data': lambda batch: [batch.simulation.data(i) for i in range(batch.num_envs)],
 }
+# What one environment of a batch does not do without the others.
+_FOR_ALL = ('reset', 'step', 'close')
 # Names of the single environment for what the batch calls otherwise.
 _SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_observation_space'}
 

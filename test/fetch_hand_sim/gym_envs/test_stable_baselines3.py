@@ -58,6 +58,21 @@ def test_attributes_of_some_environments():
     assert not env.has_attr('colour')
 
 
+def test_what_concerns_all_environments_is_not_done_to_some():
+    env = FetchHandVecEnv('FetchReach', 2)
+    first = env.reset()
+    with pytest.raises(ValueError, match='reset is for all environments of a batch'):
+        env.env_method('reset', indices=[1])
+    # To ask for a method is not to call it.
+    assert all(env.has_attr(name) for name in ('reset', 'step', 'compute_reward'))
+    (reward,) = env.get_attr('compute_reward', indices=0)
+    assert reward(first['achieved_goal'], first['achieved_goal']).tolist() == [0.0, 0.0]
+    assert np.array_equal(env.batch.simulation.observe()['desired_goal'], first['desired_goal'])
+    env.set_options({'goal': [0.0, 0.0, 0.0]})
+    with pytest.raises(ValueError, match="reset option 'goal' is not known; allowed: none"):
+        env.reset()
+
+
 def test_films_are_as_fast_as_the_robots():
     for rate in (25.0, 50.0):
         assert FetchHandVecEnv('FetchReach', control_hz=rate).metadata['render_fps'] == rate
