@@ -7,6 +7,7 @@ no steps and ends no episodes: whoever drives it decides.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,7 +70,8 @@ class StepResult:
 class Simulation:
     """N copies of one task on a pool of threads; pickled and copied with its state.
 
-    Call `reset` before `step`.
+    Call `reset` before `step`. A forked process has no threads but its own: a batch of several
+    refuses to go on there, and a copy of it goes on.
 
     Args:
         task: One of the thirteen tasks (`msgs_spec.tasks.TASKS`).
@@ -136,6 +138,7 @@ class Simulation:
         self._all = np.arange(num_envs)
         self._is_pushed = False
         self._is_started = np.zeros(num_envs, dtype=np.bool_)
+        self._process = os.getpid()
 
     @property
     def task(self) -> Task:
@@ -362,6 +365,7 @@ class Simulation:
         if not self._is_started.all():
             waiting = np.flatnonzero(~self._is_started).tolist()
             raise ResetNeeded(f'reset comes before the first step: simulations {waiting!s:.60}')
+        self._require_threads()
         self._task.apply_commands(commands)
         try:
             self._task.step()
@@ -404,9 +408,18 @@ class Simulation:
 
     def _start(self, ids: NDArray[np.intp]) -> None:
         """Begins episodes; what MuJoCo warned of before counts no more."""
+        self._require_threads()
         self.goals[ids] = self._task.reset(ids, [self.generator(i) for i in ids.tolist()])
         self._warnings = self._count_warnings()
         self._is_started[ids] = True
+
+    def _require_threads(self) -> None:
+        """Refuses to wait for ever for threads that a forked process does not have."""
+        if self._process != os.getpid() and self._task.batch.nthread > 1:
+            raise RuntimeError(
+                'this process was forked, and the threads of a batch stay behind: make the batch '
+                'here, copy it (copy.deepcopy), or give it num_threads=1'
+            )
 
     def _observation(self, observation: Array, achieved_goal: Array) -> Observation:
         return {
