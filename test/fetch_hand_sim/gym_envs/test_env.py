@@ -289,6 +289,29 @@ def test_without_opengl_rendering_says_what_it_needs(monkeypatch):
     assert result.stdout.startswith('rendering needs OpenGL'), result.stderr
 
 
+RENDER_TWICE = RENDER.replace(
+    'else:',
+    '    try:\n        env.render()\n    except RuntimeError:\n        print("again")\nelse:',
+)
+
+
+def test_a_display_that_does_not_answer_is_none(monkeypatch):
+    for name in ('MUJOCO_GL', 'DISPLAY', 'WAYLAND_DISPLAY'):
+        monkeypatch.delenv(name, raising=False)
+    code = RENDER_TWICE.format(task='FetchReach', arguments='render_mode="rgb_array"', spread=10)
+    command = [sys.executable, '-c', code]
+    without = subprocess.run(command, capture_output=True, text=True)
+    monkeypatch.setenv('DISPLAY', ':4711')
+    gone = subprocess.run(command, capture_output=True, text=True)
+    assert (gone.returncode, gone.stdout) == (0, without.stdout), gone.stderr
+    monkeypatch.setenv('MUJOCO_GL', 'glfw')
+    asked = subprocess.run(command, capture_output=True, text=True)
+    assert asked.returncode == 0, asked.stderr
+    first, second = asked.stdout.splitlines()
+    assert first.startswith('rendering needs OpenGL')
+    assert second == 'again'
+
+
 def test_without_a_display_a_window_says_what_it_needs(monkeypatch):
     monkeypatch.delenv('DISPLAY', raising=False)
     monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
