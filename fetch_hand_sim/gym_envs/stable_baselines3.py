@@ -68,10 +68,14 @@ class FetchHandVecEnv(VecEnv):
         """Steps all environments."""
         assert self._actions is not None, 'step_async comes before step_wait'
         observation, reward, _, truncated, info = self.batch.step(self._actions)
-        columns = {**info, 'TimeLimit.truncated': truncated}
-        names = ('is_success', 'diverged', 'TimeLimit.truncated')
-        rows = zip(*(columns[name].tolist() for name in names), strict=True)
-        infos: list[dict[str, Any]] = [dict(zip(names, row, strict=True)) for row in rows]
+        # What an ended episode says of its last step.
+        last = info.get('final_info', info)
+        columns = {
+            name: np.where(truncated, last[name], info[name]) for name in ('is_success', 'diverged')
+        }
+        columns['TimeLimit.truncated'] = truncated
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        infos: list[dict[str, Any]] = [dict(zip(columns, row, strict=True)) for row in rows]
         for index in np.flatnonzero(truncated).tolist():
             infos[index]['terminal_observation'] = info['final_obs'][index]
         return observation, reward.astype(np.float32), truncated, infos

@@ -198,8 +198,10 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._elapsed[ended] = 0
         self._ended = np.zeros(self.num_envs, dtype=bool)
         return observation, {
-            **_masked(values, ~ended),
-            **_masked({'final_obs': final, 'final_info': _masked(values, ended)}, ended),
+            **_masked(_only(values, ~ended), ~ended),
+            **_masked(
+                {'final_obs': final, 'final_info': _masked(_only(values, ended), ended)}, ended
+            ),
         }
 
     @property  # type: ignore[misc]
@@ -333,6 +335,11 @@ _SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_o
 def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
     """Info as Gymnasium batches it: values (N,) and for whom they count."""
     return {**values, **{f'_{name}': mask.copy() for name in values}}
+
+
+def _only(values: Mapping[str, NDArray[Any]], mask: Flags) -> dict[str, NDArray[Any]]:
+    """Values (N,) of those for whom they count; zero for the others, as Gymnasium has it."""
+    return {name: np.where(mask, rows, np.zeros_like(rows)) for name, rows in values.items()}
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

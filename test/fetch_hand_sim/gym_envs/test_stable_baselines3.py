@@ -14,10 +14,16 @@ from fetch_hand_sim.gym_envs.stable_baselines3 import FetchHandVecEnv
 from support.hindsight import assert_goals_are_exchanged
 
 
-def test_it_equals_a_dummy_vec_env_over_several_episodes():
-    ours = FetchHandVecEnv('HandReach', 3, max_episode_steps=4, reward_type='dense')
+@pytest.mark.parametrize('threshold', [None, 10.0])
+def test_it_equals_a_dummy_vec_env_over_several_episodes(threshold):
+    arguments = {
+        'max_episode_steps': 4,
+        'reward_type': 'dense',
+        'distance_threshold': threshold,
+    }
+    ours = FetchHandVecEnv('HandReach', 3, **arguments)
     name = f'fetch_hand_sim:{environment_id("HandReach")}'
-    members = [lambda: gymnasium.make(name, max_episode_steps=4, reward_type='dense')] * 3
+    members = [lambda: gymnasium.make(name, **arguments)] * 3
     reference = DummyVecEnv(members)
     ours.seed(7)
     reference.seed(7)

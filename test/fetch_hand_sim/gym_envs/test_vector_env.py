@@ -78,6 +78,24 @@ def test_it_equals_gymnasiums_vectorisation_over_several_episodes(task, mode):
     assert ends == (2 if mode is AutoresetMode.NEXT_STEP else 3)
 
 
+@pytest.mark.parametrize('mode', [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_successes_count_for_those_only_that_the_masks_name(mode):
+    arguments = {'max_episode_steps': 3, 'distance_threshold': 10.0}
+    members = [lambda: gymnasium.make(environment_id('FetchReach'), **arguments)] * 2
+    reference = gymnasium.vector.SyncVectorEnv(members, autoreset_mode=mode)
+    pair = make_vec('FetchReach', 2, autoreset_mode=mode, **arguments), reference
+    actions = np.zeros((2, 4), dtype=np.float32)
+    for env in pair:
+        env.reset(seed=0)
+        env.step(actions)
+        env.reset(options={'reset_mask': np.array([True, False])})
+    for _ in range(4):
+        mine, other = (env.step(actions)[4] for env in pair)
+        assert mine.keys() == other.keys()
+        for name in mine.keys() - {'final_obs'}:
+            assert_same(mine[name], other[name])
+
+
 def test_without_autoreset_an_ended_episode_waits_for_its_reset():
     env = make_vec('FetchReach', 2, max_episode_steps=2, autoreset_mode='Disabled')
     env.reset(seed=0)
