@@ -337,6 +337,23 @@ def test_wrappers_go_around_the_batch():
         fetch_hand_sim.make_vec(name, 2, wrappers=[gymnasium.wrappers.TimeLimit])
 
 
+def test_functions_of_a_wrapper_of_single_environments_are_asked_of_each():
+    name = environment_id('FetchReach')
+    joined = functools.partial(
+        gymnasium.wrappers.TransformObservation,
+        func=lambda each: np.concatenate([each['observation'], each['desired_goal']]),
+        observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (13,), np.float64),
+    )
+    shaped = functools.partial(gymnasium.wrappers.TransformReward, func=lambda each: max(each, -9))
+    env = fetch_hand_sim.make_vec(name, 2, wrappers=[joined, shaped])
+    first, _ = env.reset(seed=0)
+    assert env.single_observation_space.shape == (13,)
+    assert env.observation_space.contains(first)
+    plain, _ = make_vec('FetchReach', 2).reset(seed=0)
+    assert_same(first[:, 10:], plain['desired_goal'])
+    assert env.step(np.zeros((2, 4), dtype=np.float32))[1].tolist() == [-1.0, -1.0]
+
+
 def test_gymnasium_records_a_film(tmp_path, monkeypatch):
     pytest.importorskip('moviepy')
     monkeypatch.setenv('MUJOCO_GL', 'egl')
