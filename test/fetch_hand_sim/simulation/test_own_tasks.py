@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.scene import Scene
-from fetch_hand_sim.simulation.tasks import registry
+from fetch_hand_sim.simulation.tasks import hand_manipulate, registry
+from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
 from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
 from fetch_hand_sim.simulation.tasks.task import BatchConfig
@@ -53,6 +55,18 @@ def test_a_model_of_its_own_is_the_one_that_is_simulated(monkeypatch):
     monkeypatch.setattr(registry, 'task_asset', lambda name: 'another.xml')
     with pytest.raises(ValueError, match=r'simulates hand/reach.xml; its ASSET, .* is another.xml'):
         registry.make_task('HandReach')
+
+
+def test_a_start_that_cannot_be_is_refused_instead_of_looked_for_for_ever(monkeypatch):
+    with pytest.raises(ValueError, match=r'object_range 0.07 m leaves no place that is 0.1 m away'):
+        replace(FETCH_CONFIGS['FetchPush'], object_range=0.07)
+    replace(FETCH_CONFIGS['FetchReach'], object_range=0.0)
+    monkeypatch.setattr(hand_manipulate, '_MOST_TRIES', 3)
+    # No object of 6 cm reaches it.
+    monkeypatch.setattr(hand_manipulate, 'PALM_HEIGHT', 1.0)
+    simulation = Simulation(BLOCK)
+    with pytest.raises(RuntimeError, match=f'{BLOCK}: the object fell off the palm 3 times'):
+        simulation.reset(seed=0)
 
 
 def test_a_model_that_steps_by_another_time_is_refused(monkeypatch):
