@@ -152,7 +152,13 @@ class Task(ABC):
         self.batch.step(nstep=self.substeps)
 
     def output(self, name: str) -> Array:
-        """Binds a derived field of `MjData`, (N, ...), live and read-only: `xpos`, `cdof`, ..."""
+        """Binds a derived field of `MjData`, (N, ...), live and read-only: `xpos`, `cdof`, ...
+
+        Sensors of the model are off until somebody binds `sensordata`.
+        """
+        if name == 'sensordata':
+            self.model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_SENSOR.value
+            self.batch.set_models(self.model)
         self._outputs[name] = self.batch.bind(name)
         return self._outputs[name]
 

@@ -57,6 +57,26 @@ def test_a_model_of_its_own_is_the_one_that_is_simulated(monkeypatch):
         registry.make_task('HandReach')
 
 
+def test_sensors_are_on_for_who_reads_them_and_change_no_bit():
+    class Touching(BlockNear):
+        def __init__(self, spec, batch):
+            super().__init__(spec, batch)
+            self.touch = self.output('sensordata')
+
+    states = []
+    for kind in (Touching, BlockNear):
+        task = kind(TASKS[BLOCK], BatchConfig())
+        task.reset(np.arange(1), [np.random.default_rng(0)])
+        for _ in range(10):
+            task.apply_commands(task.resting_commands() + 0.3)
+            task.step()
+        states.append(task.batch.state.tobytes())
+        if isinstance(task, Touching):
+            assert task.touch.shape == (1, 29)
+            assert task.touch.any()
+    assert states[0] == states[1]
+
+
 def test_a_start_that_cannot_be_is_refused_instead_of_looked_for_for_ever(monkeypatch):
     with pytest.raises(ValueError, match=r'object_range 0.07 m leaves no place that is 0.1 m away'):
         replace(FETCH_CONFIGS['FetchPush'], object_range=0.07)
