@@ -46,7 +46,7 @@ def make_task(
     spec = task_spec(name, control_hz=control_hz if timing == 'seconds' else DEFAULT_CONTROL_HZ)
     batch = BatchConfig(num_envs, num_threads, substeps_per_tick(control_hz), keeps_data, timing)
     task: Task = _family(spec)(spec, batch)
-    if task.asset != (named := task_asset(name)):
+    if str(task.asset) != (named := task_asset(name)):
         raise ValueError(f'{name} simulates {task.asset}; its ASSET, which is drawn, is {named}')
     if (timestep := float(task.model.opt.timestep)) != PHYSICS_TIMESTEP:
         raise ValueError(

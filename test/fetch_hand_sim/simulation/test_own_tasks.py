@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.simulation.tasks import hand_manipulate, registry
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS
@@ -55,6 +56,18 @@ def test_a_model_of_its_own_is_the_one_that_is_simulated(monkeypatch):
     monkeypatch.setattr(registry, 'task_asset', lambda name: 'another.xml')
     with pytest.raises(ValueError, match=r'simulates hand/reach.xml; its ASSET, .* is another.xml'):
         registry.make_task('HandReach')
+
+
+def test_a_model_may_be_named_by_its_path(monkeypatch):
+    class Mine(HandReachTask):
+        ASSET = asset_path('hand/reach.xml')
+
+    monkeypatch.setitem(TASKS, 'Mine', replace(TASKS['HandReach'], name='Mine', reference_id=None))
+    monkeypatch.setattr(registry, 'foreign_simulation', lambda name: Mine)
+    simulation = Simulation('Mine')
+    simulation.reset(seed=0)
+    assert simulation.asset == Mine.ASSET
+    assert Scene('Mine').model.nq == simulation.model.nq
 
 
 def test_sensors_are_on_for_who_reads_them_and_change_no_bit():
