@@ -140,6 +140,19 @@ def test_a_diverged_episode_is_truncated():
     assert env.observation_space.contains(observation)
 
 
+def test_a_goal_stays_that_of_its_episode():
+    env = make('FetchReach').unwrapped
+    kept, said = [], []
+    for seed in range(3):
+        said.append(env.reset(seed=seed)[0]['desired_goal'])
+        kept.append(env.goal)
+    assert np.array_equal(kept, said)
+    env.goal = kept[0]
+    assert np.array_equal(kept, said)
+    env.goal[:] = 1.0
+    assert env.step(np.zeros(4))[0]['desired_goal'].tolist() == [1.0] * 3
+
+
 def test_looking_at_the_data_starts_no_episode():
     env = make('FetchPush').unwrapped
     assert env.data.time > 0.0
