@@ -22,27 +22,49 @@ _WINDOWS = ('glfw', 'glx', 'enable', 'enabled', 'on', 'true', '1')
 ADVICE = 'rendering needs OpenGL: apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6'
 
 
-@functools.cache
 def prepare_opengl() -> str:
+    """Readies this process to draw.
+
+    Returns:
+        The backend's name.
+
+    Raises:
+        RuntimeError: If there is none; the message is one line with the packages to install. Or if
+            this process was forked from one that draws: its OpenGL would wait for threads that
+            stayed behind.
+    """
+    backend = _backend()
+    if _process_that_draws() != os.getpid():
+        raise RuntimeError(
+            'this process was forked from one that draws pictures, and OpenGL does not come along: '
+            "start it by 'spawn' or 'forkserver', or before the first picture"
+        )
+    return backend
+
+
+@functools.cache
+def _process_that_draws() -> int:
+    """The process that asked first, in all that are forked from it."""
+    return os.getpid()
+
+
+@functools.cache
+def _backend() -> str:
     """Chooses the backend for this process; what `MUJOCO_GL` says goes first, then a display.
 
     GLFW is not tried without a display: MuJoCo fails then, and ends the process at a second try.
 
-    Returns:
-        Its name.
-
     Raises:
-        RuntimeError: If there is none; the message is one line with the packages to install.
+        RuntimeError: If there is none.
     """
     asked = os.environ.get('MUJOCO_GL', '').strip().lower()
-    has_display = sys.platform != 'linux' or _display_answers()
-    if asked in _WINDOWS and not has_display:
+    if asked in _WINDOWS and not _has_display():
         raise RuntimeError(f'{ADVICE} (MUJOCO_GL={asked} needs a display, and none answers)')
     if asked:
         # Again: MuJoCo has looked at it when it was imported, which may have been before.
         _use(asked)
         return asked
-    if has_display:
+    if _has_display():
         return 'glfw'
     for backend, library in _LIBRARIES.items():
         if _is_installed(library):
@@ -51,8 +73,10 @@ def prepare_opengl() -> str:
     raise RuntimeError(ADVICE)
 
 
-def _display_answers() -> bool:
+def _has_display() -> bool:
     """Whether a window could be opened; `DISPLAY` may be that of a session long gone."""
+    if sys.platform != 'linux':
+        return True
     if not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')):
         return False
     try:

@@ -325,6 +325,39 @@ def test_a_display_that_does_not_answer_is_none(monkeypatch):
     assert second == 'again'
 
 
+FORKED = """
+import multiprocessing, gymnasium, fetch_hand_sim
+
+def draw(env):
+    name = env.spec.id
+    for each in (env, gymnasium.make(name, render_mode='rgb_array', width=32, height=32)):
+        each.reset(seed=0)
+        try:
+            each.render()
+        except RuntimeError as error:
+            print(str(error)[:23], flush=True)
+
+env = gymnasium.make('fetch_hand_sim/FetchReach-v0', render_mode='rgb_array', width=32, height=32)
+env.reset(seed=0)
+try:
+    env.render()
+except RuntimeError:
+    print('nothing draws here')
+else:
+    child = multiprocessing.get_context('fork').Process(target=draw, args=(env,))
+    child.start()
+    child.join(60)
+    child.kill()
+"""
+
+
+def test_a_forked_process_does_not_wait_for_the_opengl_of_its_parent(monkeypatch):
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    result = subprocess.run([sys.executable, '-c', FORKED], capture_output=True, text=True)
+    expected = (['this process was forked'] * 2, ['nothing draws here'])
+    assert result.stdout.splitlines() in expected, result.stderr
+
+
 def test_without_a_display_a_window_says_what_it_needs(monkeypatch):
     monkeypatch.delenv('DISPLAY', raising=False)
     monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
