@@ -5,6 +5,7 @@ Thirteen are those of Plappert et al. 2018; other packages add theirs (`foreign_
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -304,6 +305,10 @@ def substeps_per_tick(control_hz: float, timestep: float = PHYSICS_TIMESTEP) -> 
     )
 
 
+# What Gymnasium takes in an id and every system in a file name.
+_NAME = re.compile(r'\w[\w.-]*')
+
+
 def _accept(name: str, spec: Any) -> TaskSpec:
     """Returns what another package calls a task, if it is one."""
     if not isinstance(spec, TaskSpec):
@@ -312,6 +317,8 @@ def _accept(name: str, spec: Any) -> TaskSpec:
         raise ValueError(f'the task calls itself {spec.name!r}')
     if name in TASKS:
         raise ValueError('one of the thirteen has this name')
+    if not _NAME.fullmatch(name):
+        raise ValueError(f'a name has letters, digits, _, - and . only, not {name!r}')
     if spec.formulas is None and not any(_is_observed_as(spec, known) for known in TASKS.values()):
         raise ValueError('it has no formulas')
     achieved = [part.size for part in spec.observation if part.name == spec.achieved_goal]

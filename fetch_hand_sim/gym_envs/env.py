@@ -102,6 +102,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         check_reset_options(options, allowed=())
         super().reset(seed=seed)
         self._physics.send()
+        self._release_goal()
         observation = self.simulation.reset(seed=[self.np_random])
         self._physics.receive()
         self._show()
@@ -143,11 +144,12 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
     @property
     def goal(self) -> Array:
-        """The desired goal of the episode, (goal size,), live."""
+        """The desired goal of this episode, (goal size,), live until there is another."""
         return np.asarray(self.simulation.goals[0])
 
     @goal.setter
     def goal(self, goal: ArrayLike) -> None:
+        self._release_goal()
         self.simulation.goals[0] = goal
 
     def render(self) -> Image | None:
@@ -173,6 +175,10 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         """Everything but what belongs to this process; writes into `model` and `data` included."""
         self._physics.send()
         return self.__dict__.copy()
+
+    def _release_goal(self) -> None:
+        """Who kept the goal until now keeps it."""
+        self.simulation.goals = self.simulation.goals.copy()
 
     def _show(self) -> None:
         if self.render_mode == 'human':

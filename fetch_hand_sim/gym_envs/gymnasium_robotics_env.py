@@ -301,6 +301,10 @@ def make_env(task: str, **arguments: Any) -> RobotEnv:
     return (HandReachEnv if is_reach else ManipulateEnv)(task, **arguments)
 
 
+# `gymnasium.make` looks here for what it can make lists of.
+make_env.metadata = RobotEnv.metadata  # type: ignore[attr-defined]
+
+
 def _goal_kind(task: str) -> tuple[str, str]:
     """What the reference calls `target_position` and `target_rotation`."""
     position = 'random' if task_spec(task).position_counts else 'ignore'

@@ -94,10 +94,10 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
         reward = super().compute_reward(achieved_goal, goal, info)[()]
         return reward.astype(np.float32) if self.reward_type == 'sparse' else reward
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+    def attributes(self, name: str) -> tuple[Any, ...]:
         """As `FetchHandVectorEnv`; also what is stated of the task, such as `initial_qpos`."""
         try:
-            return super().call(name, *args, **kwargs)
+            return super().attributes(name)
         except AttributeError:
             if name not in self._single.stated:
                 raise

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.arguments import require_whole
+from fetch_hand_sim.simulation.opengl import start_glfw
 from fetch_hand_sim.simulation.rendering import (
     HEIGHT,
     WIDTH,
@@ -83,6 +83,8 @@ class Pictures:
         """
         if self._scene is None:
             self._scene = Scene(self._simulation.spec.name)
+        # With the thresholds that hold now: goals are drawn as large as they are.
+        self._scene.spec = self._simulation.metric.spec
         frame = simulation_frame(self._simulation, index)
         if mode == 'human':
             self._show(self._scene, frame)
@@ -129,19 +131,17 @@ def _open_window(scene: Scene, width: int, height: int) -> Any:
         RuntimeError: If there is no display.
     """
     try:
-        import glfw
         from gymnasium.envs.mujoco.mujoco_rendering import WindowViewer
+
+        has_display = start_glfw()
     except ImportError as error:
         raise RuntimeError(
             f"render_mode 'human' needs pip install glfw imageio ({error})"
         ) from error
-    with warnings.catch_warnings():
-        # GLFW says it again, without the advice.
-        warnings.simplefilter('ignore')
-        if not glfw.init():
-            raise RuntimeError(
-                "render_mode 'human' needs a display; without one use render_mode='rgb_array'"
-            )
+    if not has_display:
+        raise RuntimeError(
+            "render_mode 'human' needs a display; without one use render_mode='rgb_array'"
+        )
     return WindowViewer(scene.model, scene.data, width, height)
 
 

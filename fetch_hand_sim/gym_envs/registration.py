@@ -105,12 +105,17 @@ def _wrapper_of_batches(wrapper: Any) -> Any:
         return functools.partial(inner, *wrapper.args, **wrapper.keywords)
     if not (isinstance(wrapper, type) and issubclass(wrapper, gymnasium.Wrapper)):
         return wrapper
-    counterpart = getattr(gymnasium.wrappers.vector, wrapper.__name__, None)
-    if counterpart is None or wrapper is not getattr(gymnasium.wrappers, wrapper.__name__, None):
+    name = wrapper.__name__
+    counterpart = getattr(gymnasium.wrappers.vector, name, None)
+    if counterpart is None or wrapper is not getattr(gymnasium.wrappers, name, None):
         raise ValueError(
-            f'{wrapper.__name__} wraps single environments only; for them use '
+            f'{name} wraps single environments only; for them use '
             "gymnasium.make_vec(..., vectorization_mode='sync', wrappers=[...])"
         )
+    if name.startswith('Transform'):
+        # Its function is one of a single environment; the counterpart's is one of the batch.
+        each = getattr(gymnasium.wrappers.vector, f'Vectorize{name}')
+        return functools.partial(each, wrapper=wrapper)
     return counterpart
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from fetch_hand_sim.gym_envs.task_attributes import check_reset_options
 from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Observation
 
@@ -41,10 +42,18 @@ class FetchHandVecEnv(VecEnv):
         super().__init__(
             num_envs, self.batch.single_observation_space, self.batch.single_action_space
         )
+        # Films of `VecVideoRecorder` take their speed from it.
+        self.metadata = dict(self.batch.metadata)
         self._actions: NDArray[np.float32] | None = None
 
     def reset(self) -> Observation:
-        """Starts all episodes, with the seeds that `seed` set."""
+        """Starts all episodes, with the seeds that `seed` set.
+
+        Raises:
+            ValueError: If `set_options` set any; there are none.
+        """
+        for options in self._options:
+            check_reset_options(options, allowed=())
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         observation, _ = self.batch.reset(seed=seeds)
         self._reset_seeds()
@@ -59,10 +68,14 @@ class FetchHandVecEnv(VecEnv):
         """Steps all environments."""
         assert self._actions is not None, 'step_async comes before step_wait'
         observation, reward, _, truncated, info = self.batch.step(self._actions)
-        columns = {**info, 'TimeLimit.truncated': truncated}
-        names = ('is_success', 'diverged', 'TimeLimit.truncated')
-        rows = zip(*(columns[name].tolist() for name in names), strict=True)
-        infos: list[dict[str, Any]] = [dict(zip(names, row, strict=True)) for row in rows]
+        # What an ended episode says of its last step.
+        last = info.get('final_info', info)
+        columns = {
+            name: np.where(truncated, last[name], info[name]) for name in ('is_success', 'diverged')
+        }
+        columns['TimeLimit.truncated'] = truncated
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        infos: list[dict[str, Any]] = [dict(zip(columns, row, strict=True)) for row in rows]
         for index in np.flatnonzero(truncated).tolist():
             infos[index]['terminal_observation'] = info['final_obs'][index]
         return observation, reward.astype(np.float32), truncated, infos
@@ -76,8 +89,8 @@ class FetchHandVecEnv(VecEnv):
         return self.batch.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the environments."""
-        values = self.batch.get_attr(attr_name)
+        """An attribute of the environments; methods are not called."""
+        values = self.batch.attributes(attr_name)
         return [values[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
@@ -87,7 +100,7 @@ class FetchHandVecEnv(VecEnv):
             AttributeError: If there is no such attribute, or it cannot be set.
             ValueError: If a shared one is set for some environments only.
         """
-        values = list(self.batch.get_attr(attr_name))
+        values = list(self.batch.attributes(attr_name))
         for index in self._get_indices(indices):
             values[index] = value
         self.batch.set_attr(attr_name, values)
@@ -99,7 +112,12 @@ class FetchHandVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Calls a method of the environments."""
+        """Calls a method of the environments.
+
+        Raises:
+            AttributeError: If there is none.
+            ValueError: If it is for all of them only: `reset`, `step` or `close`.
+        """
         results = self.batch.call(method_name, *method_args, **method_kwargs)
         return [results[i] for i in self._get_indices(indices)]
 

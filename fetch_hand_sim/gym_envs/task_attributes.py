@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Real
 from typing import Any
 
+import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import ArrayLike
 
 from fetch_hand_sim.simulation import Simulation
@@ -23,6 +26,18 @@ class TaskAttributes:
 
     spec_of_task: TaskSpec
     simulation: Simulation
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How Gymnasium made it; None where somebody else did."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            _check_task(spec)
+        self._spec = spec
 
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
@@ -38,9 +53,17 @@ class TaskAttributes:
 
     def compute_truncated(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
-    ) -> bool:
-        """Whether MuJoCo lost the simulation at the step that gave `info`."""
-        return bool(info and info.get('diverged', False))
+    ) -> Any:
+        """Whether MuJoCo lost the simulation at the step that gave `info`.
+
+        Returns:
+            A boolean; an array (N,) for N infos, or for those of a batch of N.
+        """
+        if info is None or isinstance(info, Mapping):
+            lost = np.asarray((info or {}).get('diverged', False), dtype=bool)
+            return lost if lost.ndim else bool(lost)
+        each = [self.compute_truncated(achieved_goal, desired_goal, one) for one in info]
+        return np.array(each, dtype=bool)
 
     @property
     def dt(self) -> float:
@@ -93,6 +116,20 @@ class TaskAttributes:
         metric = self.simulation.metric
         changed: dict[str, Any] = {name: float(value)}
         self.simulation.metric = replace(metric, spec=replace(metric.spec, **changed))
+
+
+def _check_task(spec: EnvSpec) -> None:
+    """Refuses what was made by the id of one task and is another; only its spec tells.
+
+    Raises:
+        ValueError: If the argument `task` is not that of the id.
+    """
+    registered = gymnasium.registry.get(spec.id)
+    task = spec.kwargs.get('task')
+    if registered is not None and registered.kwargs.get('task', task) != task:
+        raise ValueError(
+            f'{spec.id} is {registered.kwargs["task"]}, not {task}, which has an id of its own'
+        )
 
 
 def check_reset_options(options: Any, allowed: tuple[str, ...]) -> None:

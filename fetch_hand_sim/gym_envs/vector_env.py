@@ -198,9 +198,16 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._elapsed[ended] = 0
         self._ended = np.zeros(self.num_envs, dtype=bool)
         return observation, {
-            **_masked(values, ~ended),
-            **_masked({'final_obs': final, 'final_info': _masked(values, ended)}, ended),
+            **_masked(_only(values, ~ended), ~ended),
+            **_masked(
+                {'final_obs': final, 'final_info': _masked(_only(values, ended), ended)}, ended
+            ),
         }
+
+    @property  # type: ignore[misc]
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The random generator of every environment, (N,), live."""
+        return tuple(self.simulation.generator(i) for i in range(self.num_envs))
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
@@ -224,19 +231,33 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
         Raises:
             AttributeError: If an environment has no such attribute.
+            ValueError: If it is a method for all of them only: `reset`, `step` or `close`.
         """
+        if name in _FOR_ALL:
+            raise ValueError(f'{name} is for all environments of a batch; use it directly')
         if name == 'render':
             return self.render() or (None,) * self.num_envs
+        values = self.attributes(name)
+        if name in _OF_EACH or not callable(values[0]):
+            return values
+        return (values[0](*args, **kwargs),) * self.num_envs
+
+    def attributes(self, name: str) -> tuple[Any, ...]:
+        """An attribute of every environment; of a method the method, which `get_attr` calls.
+
+        Raises:
+            AttributeError: If an environment has no such attribute.
+        """
         if name in _OF_EACH:
             return tuple(_OF_EACH[name](self))
-        shared = getattr(self, _SHARED.get(name, name))
-        return (shared(*args, **kwargs) if callable(shared) else shared,) * self.num_envs
+        return (getattr(self, _SHARED.get(name, name)),) * self.num_envs
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute of every environment.
 
         Raises:
             AttributeError: If an environment has no such attribute.
+            ValueError: As `call`, since a method is called, as `SyncVectorEnv` does.
         """
         return self.call(name)
 
@@ -300,10 +321,13 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 _SETTABLE = ('reward_type', 'distance_threshold', 'rotation_threshold')
 # What each environment has for itself.
 _OF_EACH: dict[str, Callable[[FetchHandVectorEnv], Sequence[Any]]] = {
+    'np_random': lambda batch: batch.np_random,
     'np_random_seed': lambda batch: batch.np_random_seed,
     'goal': lambda batch: list(batch.simulation.goals.copy()),
     'data': lambda batch: [batch.simulation.data(i) for i in range(batch.num_envs)],
 }
+# What one environment of a batch does not do without the others.
+_FOR_ALL = ('reset', 'step', 'close')
 # Names of the single environment for what the batch calls otherwise.
 _SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_observation_space'}
 
@@ -311,6 +335,11 @@ _SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_o
 def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
     """Info as Gymnasium batches it: values (N,) and for whom they count."""
     return {**values, **{f'_{name}': mask.copy() for name in values}}
+
+
+def _only(values: Mapping[str, NDArray[Any]], mask: Flags) -> dict[str, NDArray[Any]]:
+    """Values (N,) of those for whom they count; zero for the others, as Gymnasium has it."""
+    return {name: np.where(mask, rows, np.zeros_like(rows)) for name, rows in values.items()}
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

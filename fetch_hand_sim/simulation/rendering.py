@@ -87,6 +87,8 @@ class SceneRenderer:
         self._renderer.close()
 
     def _update(self, frame: Frame) -> None:
+        # Again: a forked process may have come by a renderer of its parent's.
+        prepare_opengl()
         self._scene.show(frame)
         mujoco.mj_forward(self._scene.model, self._scene.data)
         self._renderer.update_scene(self._scene.data, self._camera, self._options)

@@ -119,7 +119,7 @@ class Scene:
     """A task's robot, object and ghost, posed as frames say.
 
     Attributes:
-        spec: The task.
+        spec: The task, whose thresholds markers show; it may be replaced by one with others.
         model: The compiled `mujoco.MjModel`, for looking at only.
         data: Its `mujoco.MjData`, posed as the last frame.
 

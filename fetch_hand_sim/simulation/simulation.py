@@ -7,6 +7,7 @@ no steps and ends no episodes: whoever drives it decides.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,7 +70,8 @@ class StepResult:
 class Simulation:
     """N copies of one task on a pool of threads; pickled and copied with its state.
 
-    Call `reset` before `step`.
+    Call `reset` before `step`. A forked process has no threads but its own: a batch of several
+    refuses to go on there, and a copy of it goes on.
 
     Args:
         task: One of the thirteen tasks (`msgs_spec.tasks.TASKS`).
@@ -136,6 +138,7 @@ class Simulation:
         self._all = np.arange(num_envs)
         self._is_pushed = False
         self._is_started = np.zeros(num_envs, dtype=np.bool_)
+        self._process = os.getpid()
 
     @property
     def task(self) -> Task:
@@ -163,12 +166,18 @@ class Simulation:
     def write_data(self, index: int, data: Any) -> None:
         """Lets simulation `index` go on from a `mujoco.MjData`, changed by whoever had it."""
         self._task.write_data(index, data)
-        self._is_started[index] = True
 
     def apply_model_changes(self) -> None:
         """Steps with `model` as it is now; the simulation keeps a copy of its own."""
         self._model_may_change = True
         self._task.batch.set_models(self.model)
+
+    def generator(self, index: int) -> np.random.Generator:
+        """The random generator of simulation `index`, live: starts and goals are drawn from it."""
+        generator = self._generators[index]
+        if generator is None:
+            generator = self._generators[index] = seeding.np_random(None)[0]
+        return generator
 
     @property
     def tick_duration(self) -> float:
@@ -356,6 +365,7 @@ class Simulation:
         if not self._is_started.all():
             waiting = np.flatnonzero(~self._is_started).tolist()
             raise ResetNeeded(f'reset comes before the first step: simulations {waiting!s:.60}')
+        self._require_threads()
         self._task.apply_commands(commands)
         try:
             self._task.step()
@@ -398,9 +408,18 @@ class Simulation:
 
     def _start(self, ids: NDArray[np.intp]) -> None:
         """Begins episodes; what MuJoCo warned of before counts no more."""
-        self.goals[ids] = self._task.reset(ids, [self._generator(i) for i in ids.tolist()])
+        self._require_threads()
+        self.goals[ids] = self._task.reset(ids, [self.generator(i) for i in ids.tolist()])
         self._warnings = self._count_warnings()
         self._is_started[ids] = True
+
+    def _require_threads(self) -> None:
+        """Refuses to wait for ever for threads that a forked process does not have."""
+        if self._process != os.getpid() and self._task.batch.nthread > 1:
+            raise RuntimeError(
+                'this process was forked, and the threads of a batch stay behind: make the batch '
+                'here, copy it (copy.deepcopy), or give it num_threads=1'
+            )
 
     def _observation(self, observation: Array, achieved_goal: Array) -> Observation:
         return {
@@ -456,12 +475,6 @@ class Simulation:
         for index, generator in zip(selected.tolist(), fresh, strict=True):
             if generator is not None:
                 self._generators[index] = generator
-
-    def _generator(self, index: int) -> np.random.Generator:
-        generator = self._generators[index]
-        if generator is None:
-            generator = self._generators[index] = seeding.np_random(None)[0]
-        return generator
 
 
 def _generator_from(seed: Any) -> np.random.Generator:

@@ -219,6 +219,12 @@ BROKEN = {
         'FetchPush',
         'one of the thirteen has this name',
     ),
+    'a name that no id can have': (
+        'from dataclasses import replace\nfrom msgs_spec.tasks import TASKS\n'
+        'near = replace(TASKS["FetchPush"], name="Push (near)")\n',
+        'Push (near)',
+        "a name has letters, digits, _, - and . only, not 'Push (near)'",
+    ),
     'another name': (
         'from msgs_spec.tasks import TASKS\nMine = TASKS["FetchPush"]\n',
         'Mine',
@@ -234,12 +240,14 @@ def test_a_broken_package_costs_one_warning_and_its_own_task(kind: str, tmp_path
     info = tmp_path / 'broken_task-1.dist-info'
     info.mkdir()
     (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: broken-task\nVersion: 1\n')
-    entry = f'[fetch_hand_sim_tasks.specification]\n{name} = broken_task:{name}\n'
+    value = f'broken_task:{name if name.isidentifier() else "near"}'
+    entry = f'[fetch_hand_sim_tasks.specification]\n{name} = {value}\n'
     (info / 'entry_points.txt').write_text(entry)
-    result = run(tmp_path, '-c', 'from msgs_spec.tasks import TASKS; print(len(TASKS))')
+    code = 'import fetch_hand_sim; from msgs_spec.tasks import TASKS; print(len(TASKS))'
+    result = run(tmp_path, '-c', code)
     assert result.stdout == '13\n'
     (line,) = result.stderr.splitlines()
-    expected = f'task {name} is left out: broken-task: broken_task:{name}: {reason}'
+    expected = f'task {name} is left out: broken-task: {value}: {reason}'
     assert line == expected
 
 

@@ -59,6 +59,9 @@ class FetchConfig:
         target_range: Half width of the cube in which goals lie.
         target_offset: Added to goals.
         target_in_the_air: Whether half of the goals are above the table.
+
+    Raises:
+        ValueError: If an object can start nowhere.
     """
 
     asset: str
@@ -70,6 +73,14 @@ class FetchConfig:
     target_range: float = 0.15
     target_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     target_in_the_air: bool = False
+
+    def __post_init__(self) -> None:
+        # The corners of the square are farthest.
+        if self.object_start is not None and self.object_range <= _OBJECT_CLEARANCE / np.sqrt(2.0):
+            raise ValueError(
+                f'object_range {self.object_range:g} m leaves no place that is {_OBJECT_CLEARANCE}'
+                ' m away from the gripper, where objects start'
+            )
 
 
 _BOX_START = (1.25, 0.53, 0.4, 1.0, 0.0, 0.0, 0.0)

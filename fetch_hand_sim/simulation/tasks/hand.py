@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.model_tuning import list_geom_pairs, skip_unread_stages
 from fetch_hand_sim.simulation.models import load_spec
-from fetch_hand_sim.simulation.tasks.task import Array, BatchConfig, Task
+from fetch_hand_sim.simulation.tasks.task import Array, BatchConfig, Task, weakly
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import TaskSpec
 
@@ -38,7 +38,7 @@ class HandTask(Task):
         self._xquat = self.output('xquat')
         self._fingertip_sites = fingertip_sites(model)
         self._fingertip_bodies = model.site_bodyid[self._fingertip_sites]
-        self._sensors['fingertip_poses'] = self._fingertip_poses
+        self._sensors['fingertip_poses'] = weakly(self._fingertip_poses)
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
         """Sets the position actuators to absolute joint angles, radians."""

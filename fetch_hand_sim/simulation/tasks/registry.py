@@ -9,7 +9,14 @@ from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, 
 from fetch_hand_sim.simulation.tasks.hand_reach import REACH_ASSET, HandReachTask
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task
 from msgs_spec.foreign_tasks import foreign_simulation
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec, Timing, substeps_per_tick, task_spec
+from msgs_spec.tasks import (
+    DEFAULT_CONTROL_HZ,
+    PHYSICS_TIMESTEP,
+    TaskSpec,
+    Timing,
+    substeps_per_tick,
+    task_spec,
+)
 
 
 def make_task(
@@ -34,13 +41,18 @@ def make_task(
     Raises:
         ValueError: If the task is unknown, the rate is not a whole number of substeps, or the
             package of a task that is none of the thirteen has no simulation of it, or one of
-            another model than it names.
+            another model than it names, or of one that steps by another time.
     """
     spec = task_spec(name, control_hz=control_hz if timing == 'seconds' else DEFAULT_CONTROL_HZ)
     batch = BatchConfig(num_envs, num_threads, substeps_per_tick(control_hz), keeps_data, timing)
     task: Task = _family(spec)(spec, batch)
-    if task.asset != (named := task_asset(name)):
+    if str(task.asset) != (named := task_asset(name)):
         raise ValueError(f'{name} simulates {task.asset}; its ASSET, which is drawn, is {named}')
+    if (timestep := float(task.model.opt.timestep)) != PHYSICS_TIMESTEP:
+        raise ValueError(
+            f'{name}: {task.asset} steps by {timestep:g} s; rates, stamps and logs take '
+            f'{PHYSICS_TIMESTEP:g} s (<option timestep="{PHYSICS_TIMESTEP:g}"/>)'
+        )
     return task
 
 

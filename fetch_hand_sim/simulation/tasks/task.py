@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
+from weakref import WeakMethod
 
 import mujoco
 import numpy as np
@@ -105,7 +106,7 @@ class Task(ABC):
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._joint_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
         # What reads the vectors (N, topic.size) of a topic; families add theirs.
-        self._sensors: dict[str, Callable[[], Array]] = {'joint_states': self._joint_states}
+        self._sensors: dict[str, Callable[[], Array]] = {'joint_states': weakly(self._joint_states)}
         self._observed = observed_topics(spec)
 
     @property
@@ -151,7 +152,13 @@ class Task(ABC):
         self.batch.step(nstep=self.substeps)
 
     def output(self, name: str) -> Array:
-        """Binds a derived field of `MjData`, (N, ...), live and read-only: `xpos`, `cdof`, ..."""
+        """Binds a derived field of `MjData`, (N, ...), live and read-only: `xpos`, `cdof`, ...
+
+        Sensors of the model are off until somebody binds `sensordata`.
+        """
+        if name == 'sensordata':
+            self.model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_SENSOR.value
+            self.batch.set_models(self.model)
         self._outputs[name] = self.batch.bind(name)
         return self._outputs[name]
 
@@ -222,6 +229,21 @@ class Task(ABC):
             ],
             axis=1,
         )
+
+
+def weakly(sensor: Callable[[], Array]) -> Callable[[], Array]:
+    """A method that does not keep its object alive, for an object that keeps the method.
+
+    A task would else wait for the garbage collector, which does not see how large a batch is.
+    """
+    method = WeakMethod(sensor)
+
+    def read() -> Array:
+        bound = method()
+        assert bound is not None, 'only the object itself calls it'
+        return bound()
+
+    return read
 
 
 def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:

@@ -74,7 +74,7 @@ class GambleSimulation(Simulation):
         observation = super().reset(seed, ids)
         for index in self._select(ids).tolist():
             self._over[index] = False
-            self._landing[index] = self._task.sample_goal(index, self._generator(index))
+            self._landing[index] = self._task.sample_goal(index, self.generator(index))
         return self._seen(observation)
 
     def step(self, actions: ArrayLike) -> StepResult:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import subprocess
 import sys
 
@@ -83,6 +84,14 @@ def test_bad_arguments_are_refused(arguments, message):
         make('FetchReach', **arguments)
 
 
+@pytest.mark.parametrize('make_one', [gymnasium.make, gymnasium.make_vec])
+def test_an_id_makes_its_own_task_only(make_one):
+    name = environment_id('FetchReach')
+    with pytest.raises(ValueError, match='FetchReach-v0 is FetchReach, not FetchPush'):
+        make_one(name, task='FetchPush')
+    assert make_one(make_one(name, task='FetchReach').spec).spec.id == name
+
+
 @pytest.mark.parametrize(
     ('arguments', 'error', 'message'),
     [
@@ -129,6 +138,31 @@ def test_a_diverged_episode_is_truncated():
     observation, _, terminated, truncated, info = env.step(np.zeros(4))
     assert (terminated, truncated, info['diverged']) == (False, True, True)
     assert env.observation_space.contains(observation)
+
+
+def test_a_goal_stays_that_of_its_episode():
+    env = make('FetchReach').unwrapped
+    kept, said = [], []
+    for seed in range(3):
+        said.append(env.reset(seed=seed)[0]['desired_goal'])
+        kept.append(env.goal)
+    assert np.array_equal(kept, said)
+    env.goal = kept[0]
+    assert np.array_equal(kept, said)
+    env.goal[:] = 1.0
+    assert env.step(np.zeros(4))[0]['desired_goal'].tolist() == [1.0] * 3
+
+
+def test_looking_at_the_data_starts_no_episode():
+    env = make('FetchPush').unwrapped
+    assert env.data.time > 0.0
+    with pytest.raises(gymnasium.error.ResetNeeded, match='reset comes before the first step'):
+        env.step(np.zeros(4))
+    env.data.qpos[:] += 0.01
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        copy.deepcopy(env).step(np.zeros(4))
+    env.reset(seed=0)
+    env.step(np.zeros(4))
 
 
 def test_the_flat_view_is_the_concatenation():
@@ -233,6 +267,21 @@ def test_rendering_gives_a_picture_or_says_what_it_needs(
     assert result.stdout.strip() in (picture, reason[:80].strip()), result.stderr
 
 
+def test_pictures_show_the_threshold_that_holds(monkeypatch):
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    env = make('FetchReach', render_mode='rgb_array', distance_threshold=0.04).unwrapped
+    env.reset(seed=0)
+    try:
+        before = env.render()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    env.distance_threshold = 0.01
+    after = env.render()
+    assert (before != after).any()
+    env.distance_threshold = 0.04
+    assert (before == env.render()).all()
+
+
 def test_opengl_can_be_chosen_after_mujoco_was_imported(monkeypatch):
     monkeypatch.delenv('MUJOCO_GL', raising=False)
     choice, code = 'import os\nos.environ["MUJOCO_GL"] = "egl"\n', 'import mujoco\n'
@@ -251,6 +300,62 @@ def test_without_opengl_rendering_says_what_it_needs(monkeypatch):
     code = RENDER.format(task='FetchReach', arguments='render_mode="rgb_array"', spread=0)
     result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
     assert result.stdout.startswith('rendering needs OpenGL'), result.stderr
+
+
+RENDER_TWICE = RENDER.replace(
+    'else:',
+    '    try:\n        env.render()\n    except RuntimeError:\n        print("again")\nelse:',
+)
+
+
+def test_a_display_that_does_not_answer_is_none(monkeypatch):
+    for name in ('MUJOCO_GL', 'DISPLAY', 'WAYLAND_DISPLAY'):
+        monkeypatch.delenv(name, raising=False)
+    code = RENDER_TWICE.format(task='FetchReach', arguments='render_mode="rgb_array"', spread=10)
+    command = [sys.executable, '-c', code]
+    without = subprocess.run(command, capture_output=True, text=True)
+    monkeypatch.setenv('DISPLAY', ':4711')
+    gone = subprocess.run(command, capture_output=True, text=True)
+    assert (gone.returncode, gone.stdout) == (0, without.stdout), gone.stderr
+    monkeypatch.setenv('MUJOCO_GL', 'glfw')
+    asked = subprocess.run(command, capture_output=True, text=True)
+    assert asked.returncode == 0, asked.stderr
+    first, second = asked.stdout.splitlines()
+    assert first.startswith('rendering needs OpenGL')
+    assert second == 'again'
+
+
+FORKED = """
+import multiprocessing, gymnasium, fetch_hand_sim
+
+def draw(env):
+    name = env.spec.id
+    for each in (env, gymnasium.make(name, render_mode='rgb_array', width=32, height=32)):
+        each.reset(seed=0)
+        try:
+            each.render()
+        except RuntimeError as error:
+            print(str(error)[:23], flush=True)
+
+env = gymnasium.make('fetch_hand_sim/FetchReach-v0', render_mode='rgb_array', width=32, height=32)
+env.reset(seed=0)
+try:
+    env.render()
+except RuntimeError:
+    print('nothing draws here')
+else:
+    child = multiprocessing.get_context('fork').Process(target=draw, args=(env,))
+    child.start()
+    child.join(60)
+    child.kill()
+"""
+
+
+def test_a_forked_process_does_not_wait_for_the_opengl_of_its_parent(monkeypatch):
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    result = subprocess.run([sys.executable, '-c', FORKED], capture_output=True, text=True)
+    expected = (['this process was forked'] * 2, ['nothing draws here'])
+    assert result.stdout.splitlines() in expected, result.stderr
 
 
 def test_without_a_display_a_window_says_what_it_needs(monkeypatch):

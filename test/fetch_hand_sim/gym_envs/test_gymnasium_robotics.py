@@ -179,6 +179,13 @@ def test_goals_of_the_same_object_can_be_asked_for(make):
         make('HandManipulateEgg-v1', target_rotation='parallel')
 
 
+def test_gymnasium_makes_lists_of_pictures(make):
+    make('FetchReach-v4')
+    env = gymnasium.make('FetchReach-v4', render_mode='rgb_array_list')
+    assert isinstance(env, gymnasium.wrappers.RenderCollection)
+    assert env.unwrapped.render_mode == 'rgb_array'
+
+
 def test_a_batch_takes_and_gives_what_single_environments_do(make):
     make('FetchReach-v4')
     modes = ('sync', 'vector_entry_point')

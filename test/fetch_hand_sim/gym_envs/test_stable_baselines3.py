@@ -14,10 +14,16 @@ from fetch_hand_sim.gym_envs.stable_baselines3 import FetchHandVecEnv
 from support.hindsight import assert_goals_are_exchanged
 
 
-def test_it_equals_a_dummy_vec_env_over_several_episodes():
-    ours = FetchHandVecEnv('HandReach', 3, max_episode_steps=4, reward_type='dense')
+@pytest.mark.parametrize('threshold', [None, 10.0])
+def test_it_equals_a_dummy_vec_env_over_several_episodes(threshold):
+    arguments = {
+        'max_episode_steps': 4,
+        'reward_type': 'dense',
+        'distance_threshold': threshold,
+    }
+    ours = FetchHandVecEnv('HandReach', 3, **arguments)
     name = f'fetch_hand_sim:{environment_id("HandReach")}'
-    members = [lambda: gymnasium.make(name, max_episode_steps=4, reward_type='dense')] * 3
+    members = [lambda: gymnasium.make(name, **arguments)] * 3
     reference = DummyVecEnv(members)
     ours.seed(7)
     reference.seed(7)
@@ -56,6 +62,26 @@ def test_attributes_of_some_environments():
     assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     assert env.has_attr('spec_of_task')
     assert not env.has_attr('colour')
+
+
+def test_what_concerns_all_environments_is_not_done_to_some():
+    env = FetchHandVecEnv('FetchReach', 2)
+    first = env.reset()
+    with pytest.raises(ValueError, match='reset is for all environments of a batch'):
+        env.env_method('reset', indices=[1])
+    # To ask for a method is not to call it.
+    assert all(env.has_attr(name) for name in ('reset', 'step', 'compute_reward'))
+    (reward,) = env.get_attr('compute_reward', indices=0)
+    assert reward(first['achieved_goal'], first['achieved_goal']).tolist() == [0.0, 0.0]
+    assert np.array_equal(env.batch.simulation.observe()['desired_goal'], first['desired_goal'])
+    env.set_options({'goal': [0.0, 0.0, 0.0]})
+    with pytest.raises(ValueError, match="reset option 'goal' is not known; allowed: none"):
+        env.reset()
+
+
+def test_films_are_as_fast_as_the_robots():
+    for rate in (25.0, 50.0):
+        assert FetchHandVecEnv('FetchReach', control_hz=rate).metadata['render_fps'] == rate
 
 
 def test_it_learns_with_hindsight():

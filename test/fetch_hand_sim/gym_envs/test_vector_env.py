@@ -78,6 +78,24 @@ def test_it_equals_gymnasiums_vectorisation_over_several_episodes(task, mode):
     assert ends == (2 if mode is AutoresetMode.NEXT_STEP else 3)
 
 
+@pytest.mark.parametrize('mode', [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_successes_count_for_those_only_that_the_masks_name(mode):
+    arguments = {'max_episode_steps': 3, 'distance_threshold': 10.0}
+    members = [lambda: gymnasium.make(environment_id('FetchReach'), **arguments)] * 2
+    reference = gymnasium.vector.SyncVectorEnv(members, autoreset_mode=mode)
+    pair = make_vec('FetchReach', 2, autoreset_mode=mode, **arguments), reference
+    actions = np.zeros((2, 4), dtype=np.float32)
+    for env in pair:
+        env.reset(seed=0)
+        env.step(actions)
+        env.reset(options={'reset_mask': np.array([True, False])})
+    for _ in range(4):
+        mine, other = (env.step(actions)[4] for env in pair)
+        assert mine.keys() == other.keys()
+        for name in mine.keys() - {'final_obs'}:
+            assert_same(mine[name], other[name])
+
+
 def test_without_autoreset_an_ended_episode_waits_for_its_reset():
     env = make_vec('FetchReach', 2, max_episode_steps=2, autoreset_mode='Disabled')
     env.reset(seed=0)
@@ -189,6 +207,21 @@ def test_seeds_are_told_as_gymnasiums_vectorisation_tells_them():
             assert each.np_random_seed == each.unwrapped.get_attr('np_random_seed') == expected
 
 
+def test_random_generators_are_those_that_are_drawn_from():
+    env = make_vec('FetchReach', 2)
+    members = [lambda: gymnasium.make(environment_id('FetchReach'))] * 2
+    reference = gymnasium.vector.SyncVectorEnv(members)
+    for each in (env, reference):
+        each.reset(seed=5)
+    for mine, other in zip(env.np_random, reference.np_random, strict=True):
+        assert mine.bit_generator.state == other.bit_generator.state
+    kept = [each.bit_generator.state for each in env.get_attr('np_random')]
+    first, _ = env.reset()
+    for generator, state in zip(env.np_random, kept, strict=True):
+        generator.bit_generator.state = state
+    assert_same(env.reset()[0], first)
+
+
 def test_a_seed_that_nobody_gave_is_told_too():
     env = make_vec('FetchReach', 2)
     assert env.np_random_seed == (-1, -1)
@@ -208,6 +241,21 @@ def test_a_diverged_environment_is_truncated_and_starts_again():
     assert not truncated.any()
     assert reward[1] == 0.0
     assert info['_is_success'].tolist() == [True, False, True]
+
+
+def test_what_was_lost_can_be_asked_of_one_step_and_of_many():
+    env = make_vec('FetchPush', 3)
+    observation, _ = env.reset(seed=0)
+    env.unwrapped.simulation.task.batch.bind('qvel')[1, 0] = np.nan
+    truncated, info = env.step(np.zeros((3, 4)))[3:]
+    goals = observation['achieved_goal'], observation['desired_goal']
+    lost = env.unwrapped.compute_truncated
+    assert lost(*goals, info).tolist() == truncated.tolist()
+    infos = [{'diverged': each} for each in truncated]
+    # A list, and an array of objects as replay buffers keep them.
+    for many in (infos, np.array(infos)):
+        assert lost(*goals, many).tolist() == truncated.tolist()
+    assert [lost(*goals, one) for one in ({}, None, infos[1])] == [False, False, True]
 
 
 BAD_RESETS = {
@@ -287,6 +335,23 @@ def test_wrappers_go_around_the_batch():
     assert env.step(np.full((2, 4), 0.5))[4]['episode']['l'].tolist() == [2, 2]
     with pytest.raises(ValueError, match='TimeLimit wraps single environments only'):
         fetch_hand_sim.make_vec(name, 2, wrappers=[gymnasium.wrappers.TimeLimit])
+
+
+def test_functions_of_a_wrapper_of_single_environments_are_asked_of_each():
+    name = environment_id('FetchReach')
+    joined = functools.partial(
+        gymnasium.wrappers.TransformObservation,
+        func=lambda each: np.concatenate([each['observation'], each['desired_goal']]),
+        observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (13,), np.float64),
+    )
+    shaped = functools.partial(gymnasium.wrappers.TransformReward, func=lambda each: max(each, -9))
+    env = fetch_hand_sim.make_vec(name, 2, wrappers=[joined, shaped])
+    first, _ = env.reset(seed=0)
+    assert env.single_observation_space.shape == (13,)
+    assert env.observation_space.contains(first)
+    plain, _ = make_vec('FetchReach', 2).reset(seed=0)
+    assert_same(first[:, 10:], plain['desired_goal'])
+    assert env.step(np.zeros((2, 4), dtype=np.float32))[1].tolist() == [-1.0, -1.0]
 
 
 def test_gymnasium_records_a_film(tmp_path, monkeypatch):

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.scene import Scene
-from fetch_hand_sim.simulation.tasks import registry
+from fetch_hand_sim.simulation.tasks import hand_manipulate, registry
+from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
 from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
 from fetch_hand_sim.simulation.tasks.task import BatchConfig
@@ -52,6 +55,61 @@ def test_a_model_of_its_own_is_the_one_that_is_simulated(monkeypatch):
     monkeypatch.undo()
     monkeypatch.setattr(registry, 'task_asset', lambda name: 'another.xml')
     with pytest.raises(ValueError, match=r'simulates hand/reach.xml; its ASSET, .* is another.xml'):
+        registry.make_task('HandReach')
+
+
+def test_a_model_may_be_named_by_its_path(monkeypatch):
+    class Mine(HandReachTask):
+        ASSET = asset_path('hand/reach.xml')
+
+    monkeypatch.setitem(TASKS, 'Mine', replace(TASKS['HandReach'], name='Mine', reference_id=None))
+    monkeypatch.setattr(registry, 'foreign_simulation', lambda name: Mine)
+    simulation = Simulation('Mine')
+    simulation.reset(seed=0)
+    assert simulation.asset == Mine.ASSET
+    assert Scene('Mine').model.nq == simulation.model.nq
+
+
+def test_sensors_are_on_for_who_reads_them_and_change_no_bit():
+    class Touching(BlockNear):
+        def __init__(self, spec, batch):
+            super().__init__(spec, batch)
+            self.touch = self.output('sensordata')
+
+    states = []
+    for kind in (Touching, BlockNear):
+        task = kind(TASKS[BLOCK], BatchConfig())
+        task.reset(np.arange(1), [np.random.default_rng(0)])
+        for _ in range(10):
+            task.apply_commands(task.resting_commands() + 0.3)
+            task.step()
+        states.append(task.batch.state.tobytes())
+        if isinstance(task, Touching):
+            assert task.touch.shape == (1, 29)
+            assert task.touch.any()
+    assert states[0] == states[1]
+
+
+def test_a_start_that_cannot_be_is_refused_instead_of_looked_for_for_ever(monkeypatch):
+    with pytest.raises(ValueError, match=r'object_range 0.07 m leaves no place that is 0.1 m away'):
+        replace(FETCH_CONFIGS['FetchPush'], object_range=0.07)
+    replace(FETCH_CONFIGS['FetchReach'], object_range=0.0)
+    monkeypatch.setattr(hand_manipulate, '_MOST_TRIES', 3)
+    # No object of 6 cm reaches it.
+    monkeypatch.setattr(hand_manipulate, 'PALM_HEIGHT', 1.0)
+    simulation = Simulation(BLOCK)
+    with pytest.raises(RuntimeError, match=f'{BLOCK}: the object fell off the palm 3 times'):
+        simulation.reset(seed=0)
+
+
+def test_a_model_that_steps_by_another_time_is_refused(monkeypatch):
+    class Finer(HandReachTask):
+        def __init__(self, spec, batch):
+            super().__init__(spec, batch)
+            self.model.opt.timestep = 0.001
+
+    monkeypatch.setattr(registry, '_family', lambda spec: Finer)
+    with pytest.raises(ValueError, match=r'steps by 0.001 s; .* take 0.002 s \(<option timestep'):
         registry.make_task('HandReach')
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks import make_task
 from msgs_spec.rotations import quaternion_from_axis_angle, quaternion_multiply
 from msgs_spec.tasks import TASKS, GoalKind
@@ -144,3 +145,17 @@ def test_goals_that_do_not_fit_are_refused(achieved, desired, message):
     simulation = Simulation('FetchPush')
     with pytest.raises(ValueError, match=message):
         simulation.compute_reward(achieved, desired)
+
+
+@pytest.mark.parametrize('name', ['reward', 'success'])
+def test_what_a_metric_of_its_own_says_holds_for_steps_too(name):
+    def other(self, achieved_goal, desired_goal, info=None):
+        return self.distances(achieved_goal, desired_goal)[0] > 0.01
+
+    mine = type('Mine', (GoalMetric,), {name: other})(TASKS['FetchPush'])
+    goals = random_goals(TASKS['FetchPush'], 20)
+    reward, success = mine.evaluate(*goals)
+    assert np.array_equal(reward, mine.reward(*goals))
+    assert np.array_equal(success, mine.success(*goals))
+    with_it = {'reward': reward, 'success': success}[name]
+    assert np.array_equal(with_it, other(mine, *goals))

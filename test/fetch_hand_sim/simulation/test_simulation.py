@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import copy
+import gc
 import logging
+import subprocess
+import sys
+import weakref
 from typing import Any
 
 import numpy as np
@@ -280,3 +284,48 @@ def test_memory_does_not_grow_with_episodes(task):
 
     before = run_episodes()
     assert run_episodes() - before < 4_000_000, 'bytes that 150 more episodes took'
+
+
+@pytest.mark.parametrize('task', ['FetchPush', 'HandReach', 'HandManipulateEggFull'])
+def test_a_simulation_frees_its_memory_when_nobody_has_it_any_more(task):
+    gc.disable()
+    try:
+        simulation = Simulation(task, num_threads=1)
+        simulation.reset(seed=0)
+        simulation.step(np.zeros((1, simulation.spec.robot.action_size)))
+        physics = weakref.ref(simulation.task)
+        del simulation
+        assert physics() is None
+    finally:
+        gc.enable()
+
+
+FORKED = """
+import copy, multiprocessing
+import numpy as np
+from fetch_hand_sim.simulation import Simulation
+
+def play(simulation):
+    for each in (simulation, copy.deepcopy(simulation)):
+        for call in (lambda: each.step(np.zeros((2, 4))), lambda: each.reset(seed=1)):
+            try:
+                call()
+                print('goes on', flush=True)
+            except RuntimeError as error:
+                print(str(error)[:23], flush=True)
+
+simulation = Simulation('FetchReach', num_envs=2, num_threads=THREADS)
+simulation.reset(seed=0)
+child = multiprocessing.get_context('fork').Process(target=play, args=(simulation,))
+child.start()
+child.join(60)
+child.kill()
+"""
+
+
+@pytest.mark.parametrize(('threads', 'refused'), [(1, 0), (2, 2)])
+def test_threads_that_a_fork_leaves_behind_are_not_waited_for(threads, refused):
+    script = FORKED.replace('THREADS', str(threads))
+    result = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True)
+    expected = ['this process was forked'] * refused + ['goes on'] * (4 - refused)
+    assert result.stdout.splitlines() == expected, result.stderr
