@@ -42,6 +42,7 @@ from msgs_spec.ros import (
     declare_parameters,
     rclpy_profile,
     ros_message_class,
+    seldom,
     set_callback,
 )
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
@@ -275,7 +276,7 @@ class SimNode(Node):
             is_waiting = now - self._ticked_at > _WAITING_PERIOD
         if is_waiting:
             line = waiting_line(robot, self._surroundings())
-            self.get_logger().warning(line, throttle_duration_sec=_WAITING_PERIOD)
+            self.get_logger().warning(line, **seldom(_WAITING_PERIOD))
 
     def _emit(self, tick: Tick, messages: Messages) -> None:
         if self._watch.has_newcomer and self._watch.is_heard():
@@ -359,7 +360,7 @@ class SimNode(Node):
     # Callbacks
 
     def _warn(self, line: str) -> None:
-        self.get_logger().warning(line, throttle_duration_sec=_WARN_PERIOD)
+        self.get_logger().warning(line, **seldom(_WARN_PERIOD))
 
     def _on_commander(self, checkpoint_sha256: str | None) -> None:
         self._has_introduction = True

@@ -24,6 +24,7 @@ from msgs_spec.ros import (
     declare_parameters,
     rclpy_profile,
     ros_message_class,
+    seldom,
     set_callback,
 )
 from msgs_spec.schemas import serialize
@@ -236,9 +237,7 @@ class PolicyNode(Node):
             try:
                 responder.receive(name, data)
             except ValueError as error:
-                self.get_logger().warning(
-                    f'state dropped: {error}', throttle_duration_sec=_WARN_PERIOD
-                )
+                self.get_logger().warning(f'state dropped: {error}', **seldom(_WARN_PERIOD))
 
         return on_message
 
@@ -253,7 +252,7 @@ class PolicyNode(Node):
         try:
             status = EpisodeStatus.from_values(decode_status(message))
         except ValueError as error:
-            self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=_WARN_PERIOD)
+            self.get_logger().warning(f'ignored: {error}', **seldom(_WARN_PERIOD))
             return
         stamp = message_stamp(message)
         # A robot that was started again, or an episode that is replayed again.
