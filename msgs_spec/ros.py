@@ -33,6 +33,9 @@ BEAT = 0.1
 _LAST_WORDS_SECONDS = 1.0
 # In which who is there is found for sure.
 DISCOVERY_TIME = 2.0
+# Seconds after which the graph has forgotten a process that was killed: until then it may stand
+# beside its successor. DDS implementations take 20 s or less.
+MEMORY_OF_THE_GRAPH = 25.0
 # Enough for any node on a busy machine: 0.3 s are usual.
 _DESTROY_SECONDS = 10.0
 

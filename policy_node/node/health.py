@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 from msgs_spec.diagnostics import Increase, Report
+from msgs_spec.ros import MEMORY_OF_THE_GRAPH
 from msgs_spec.tick import EpisodeStatus
 from policy_node.node.responder import Responder
 
@@ -41,6 +43,8 @@ class Health:
         self._tick_duration = 0.0
         self._answered, self._dropped, self._unusable = Increase(), Increase(), Increase()
         self._then: float | None = None
+        # When there was one robot at most.
+        self._alone_at = -math.inf
         self._said: set[str] = set()
 
     def start(self, responder: Responder, status: EpisodeStatus) -> None:
@@ -81,7 +85,10 @@ class Health:
             )
         if robots and missing:
             report.warn(f'no state: nobody publishes {", ".join(missing)}')
-        if robots > 1:
+        if robots <= 1:
+            self._alone_at = now
+        # One that was killed and its successor are one.
+        elif now - self._alone_at > MEMORY_OF_THE_GRAPH:
             report.warn(f'{robots} robots publish here; give each a namespace')
         return report
 

@@ -201,10 +201,20 @@ def test_report_says_what_is_wrong(case, episode):
     responder.inference.add(0.1)
     responder.inference.add(0.1)
     responder.inference.add(0.1)
-    message = health.report(14.0, 2).message
+    message = health.report(14.0, 1).message
     assert 'slow inference: 100.000 ms, a tick is 40.0 ms' in message
-    assert '2 robots publish here' in message
     assert 'no robot publishes episode_status' in health.report(15.0, 0).message
+
+
+def test_a_robot_that_was_killed_and_started_again_is_one_and_two_that_stay_are_two():
+    health = Health('/policy_node')
+    health.report(5.0, 1)
+    # The graph remembers who was killed for up to 20 s.
+    assert [health.report(5.0 + seconds, 2).level for seconds in range(1, 21)] == [Level.OK] * 20
+    assert health.report(26.0, 1).level == Level.OK
+    assert health.report(27.0, 2).level == Level.OK
+    assert '2 robots publish here' in health.report(52.0, 2).message
+    assert '2 robots publish here' in Health('/policy_node').report(5.0, 2).message
 
 
 def diagnostics(*reports):
