@@ -52,13 +52,15 @@ from msgs_spec.ros import (
 )
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import topic, topics
+from msgs_spec.topics import DIAGNOSTICS, topic, topics
 from msgs_spec.transport import keep_discovery_local
 
 _NAME = 'demo'
 _START_TIMEOUT = 60.0
 # What shells add to the number of the signal that ended a command.
 _SIGNALLED = 128
+# Of an endpoint that is discovered before its node is, to rmw.
+_NAMELESS = '_NODE_NAME_UNKNOWN_'
 _COLUMNS = '{:>7}  {:>5}  {:>5}  {:>7}  {:<7}  {}'
 
 
@@ -89,16 +91,24 @@ class Watcher:
         """Who would take part in what this demo starts, in words; '' for nobody."""
         if count_publishers(self._node, 'episode_status'):
             return 'a robot'
-        # One that waits for a robot publishes nothing yet.
-        nodes = self._node.get_node_names_and_namespaces()
-        if ('policy_node', '/') in nodes:
-            return 'policy_node'
+        if waiting := self._waiting_policies():
+            return min(waiting)
         # Its nodes are still to come.
+        nodes = self._node.get_node_names_and_namespaces()
         if nodes.count(('demo', '/')) > 1:
             return 'another demo'
         commands = [each.name for each in topics(self._spec) if each.name.endswith('commands')]
         is_commanded = any(count_publishers(self._node, name) for name in commands)
         return 'who publishes commands' if is_commanded else ''
+
+    def _waiting_policies(self) -> set[str]:
+        """Who waits for a robot, under any name: it commands nobody yet, and reports its health."""
+        listeners = self._node.get_subscriptions_info_by_topic('episode_status')
+        reporters = self._node.get_publishers_info_by_topic(DIAGNOSTICS.name)
+        waiting, reporting = (
+            {each.node_name for each in endpoints} for endpoints in (listeners, reporters)
+        )
+        return {name for name in waiting & reporting if name != _NAMELESS}
 
     def spin(self) -> None:
         """Serves callbacks for a moment."""

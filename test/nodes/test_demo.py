@@ -54,6 +54,7 @@ def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, 
     [
         ([*SIM_NODE, *ros_args(task='HandReach')], 'a robot'),
         (POLICY_NODE, 'policy_node'),
+        ([*POLICY_NODE, '--ros-args', '-r', '__node:=actor'], 'actor'),
     ],
 )
 def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path):
@@ -61,7 +62,8 @@ def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path)
     start_process(*node)
     with client(task_spec('FetchReach')) as connection:
         names = connection.node.get_node_names
-        connection.spin_until(lambda: {'sim_node', 'policy_node'} & set(names()), 'the other')
+        others = {'sim_node', 'policy_node', 'actor'}
+        connection.spin_until(lambda: others & set(names()), 'the other')
     command = (sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting')
     code, output = finish(start_process(*command, '--episodes', '1', cwd=tmp_path), timeout=60.0)
     assert code == 1
