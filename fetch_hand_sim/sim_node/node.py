@@ -216,10 +216,14 @@ class SimNode(Node):
         )
 
     def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Lets nothing move until there is a commander who hears everything."""
-        watch, runner = self._watch, self._robot.runner
-        # Steps are taken meanwhile, and may be all there are.
-        while not (stop or runner.is_done or (watch.commanders.names and watch.is_heard())):
+        """Lets nothing move until there is a commander who hears everything.
+
+        A step begins the first episode without one, and then it goes on as any other.
+        """
+        watch = self._watch
+        while not (watch.commanders.names and watch.is_heard()):
+            if stop or self._robot.runner.has_started:
+                return
             loop.wait(BEAT)
             watch.update()
             if self._robot.is_reset_due:

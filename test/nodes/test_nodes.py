@@ -307,6 +307,22 @@ def test_a_robot_that_was_stepped_begins_an_episode_before_anybody_commands(
         )
 
 
+def test_a_robot_that_was_stepped_goes_on_when_told_to_before_anybody_commands(
+    start_process: Start,
+) -> None:
+    start_process(*SIM_NODE, *ros_args(wait_for_commands=True))
+    with client(REACH) as robot:
+        robot.subscribe('/clock')
+        assert robot.call(SetBool, 'sim_node/pause', data=True).success
+        assert robot.call(SetBool, 'sim_node/pause', data=False).success
+        robot.spin(0.5)
+        assert len(robot.stamps('/clock')) == 1, 'without a step it waits'
+        assert robot.call(SetBool, 'sim_node/pause', data=True).success
+        assert robot.call(Trigger, 'sim_node/step').success
+        assert robot.call(SetBool, 'sim_node/pause', data=False).message == 'running at 1.000 s'
+        robot.spin_until(lambda: len(robot.stamps('/clock')) > 5, 'ticks')
+
+
 def test_steps_may_be_all_there_is_of_a_run_that_waits_for_commands(start_process: Start) -> None:
     arguments = ros_args(episodes=1, mode='lockstep', wait_for_commands=True)
     sim = start_process(*SIM_NODE, *arguments)
