@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
@@ -191,6 +192,8 @@ def _declare(node: Node, spec: ParameterSpec, given: Parameter | None) -> Any:
         except ValueError as error:
             raise UsageError(str(error)) from None
     value = node.declare_parameter(spec.name, spec.default, descriptor(spec)).value
+    if spec.is_path:
+        return os.path.expanduser(value)
     return float(value) if spec.type == 'double' else value
 
 

@@ -288,7 +288,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument('--episodes', type=count, default=5, help='how many; default: %(default)s')
     parser.add_argument('--seed', type=seed, default=0, help='of the first; default: %(default)s')
     parser.add_argument(
-        '--episode-dir', default='episodes', help='where they are logged; default: %(default)s'
+        '--episode-dir',
+        type=os.path.expanduser,
+        default='episodes',
+        help='where they are logged; default: %(default)s',
     )
     parser.add_argument(
         '--policy',

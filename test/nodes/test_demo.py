@@ -23,12 +23,15 @@ from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
         pytest.param(signal.SIGHUP, 129, marks=pytest.mark.release),
     ],
 )
-def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, tmp_path):
+def test_the_demo_logs_episodes_and_stops_in_order(
+    number, code, start_process, ros_environment, tmp_path
+):
     command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting']
     # Which a parameter file would have as a number and a comment.
     directory = '20261125 #1'
-    options = ('--episodes', '100', '--episode-dir', directory)
-    demo = start_process(*command, *options, cwd=tmp_path)
+    options = ('--episodes', '100', f'--episode-dir=~/{directory}')
+    environment = ros_environment | {'HOME': str(tmp_path)}
+    demo = start_process(*command, *options, env=environment)
     assert demo.stdout.readline().split() == [
         'episode',
         'seed',
