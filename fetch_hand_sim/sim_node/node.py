@@ -295,7 +295,7 @@ class SimNode(Node):
             self._report_episode(tick.status)
 
     def _report_episode(self, status: EpisodeStatus) -> None:
-        if self._recorder is None:
+        if self._recorder is None or self._recorder.has_failed:
             self.get_logger().info(_episode_line(status))
         if self._robot.runner.current.has_diverged:
             count = self._robot.runner.simulation.divergences
