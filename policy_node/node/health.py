@@ -12,8 +12,9 @@ from msgs_spec.tick import EpisodeStatus
 from policy_node.node.responder import Responder
 
 # Seconds without a complete observation after which the report says so. A robot that is paused
-# says that once a second.
+# says that once a second; one in slow motion is at most that many times slower than real time.
 _SILENCE = 2.0
+_SLOWEST = 100.0
 
 
 def read_pause(message: Any, namespace: str) -> bool | None:
@@ -133,6 +134,10 @@ class Health:
             )
         if robots == 0:
             report.warn('no robot publishes episode_status')
-        elif age is not None and age > _SILENCE and not is_paused:
+        elif age is not None and age > self._longest_silence(responder) and not is_paused:
             report.warn(f'no state: the last one is {age:.0f} s old')
         return report
+
+    def _longest_silence(self, responder: Responder) -> float:
+        """Seconds without an observation that are nothing to worry about at the robot's pace."""
+        return max(_SILENCE, 2.0 * min(responder.interval, _SLOWEST * self._tick_duration))

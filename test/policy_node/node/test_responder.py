@@ -217,6 +217,19 @@ def test_a_robot_that_was_killed_and_started_again_is_one_and_two_that_stay_are_
     assert '2 robots publish here' in Health('/policy_node').report(5.0, 2).message
 
 
+def test_a_robot_in_slow_motion_is_not_called_silent(episode):
+    status, ticks = episode
+    now = [0.0]
+    responder, health = Responder(resting(), status, Wire(), lambda: now[0]), Health('/policy_node')
+    health.start(responder, status)
+    for tick in ticks:
+        feed(responder, tick)
+        for _ in range(4):
+            now[0] += 1.0
+            assert health.report(now[0], 1).level == Level.OK
+    assert health.report(now[0] + 5.0, 1).message == 'no state: the last one is 9 s old'
+
+
 def diagnostics(*reports):
     return deserialize('diagnostic_msgs/msg/DiagnosticArray', encode_reports(*reports))
 
