@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -143,6 +144,7 @@ class Demo:
         self._directory = Path(options.episode_dir)
         self._known = set(self._episodes())
         self._outcomes: list[EpisodeOutcome] = []
+        self._log: Path | None = None
 
     def run(self, stop: StopSignals) -> int:
         """Runs the demo and returns the exit code."""
@@ -162,6 +164,7 @@ class Demo:
         began = time.monotonic()
         # What the nodes print is shown if something goes wrong.
         with tempfile.NamedTemporaryFile('w+', prefix='demo_', suffix='.log') as logs:
+            self._log = Path(logs.name)
             policy = start_node('policy_node', {'policy': commander}, logs)
             sim = start_node('sim_node', self._sim_parameters(), logs)
             try:
@@ -219,8 +222,15 @@ class Demo:
         if self._directory.is_dir():
             yield from (p for p in self._directory.iterdir() if not p.name.startswith('.'))
 
+    def _logged(self) -> list[Path]:
+        """New episodes that the robot says it logged: others may log in the same directory."""
+        found = sorted(set(self._episodes()) - self._known)
+        said = self._log.read_bytes() if found and self._log else b''
+        # No digit may follow, of a longer seed.
+        return [p for p in found if re.search(rb', %b(?!\d)' % re.escape(os.fsencode(p)), said)]
+
     def _print_new_rows(self, console: Console | None = None) -> None:
-        for path in sorted(set(self._episodes()) - self._known):
+        for path in self._logged():
             self._known.add(path)
             try:
                 episode = read_episode(path)

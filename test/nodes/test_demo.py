@@ -12,6 +12,7 @@ import pytest
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import read_summary
 from msgs_spec.tasks import task_spec
+from policy_node.training import generate_episodes
 from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
 
 
@@ -50,6 +51,22 @@ def test_the_demo_logs_episodes_and_stops_in_order(
     assert read_summary(paths[0]).is_complete
     # The robot had time to close what it was logging.
     assert not [path for path in paths if path.name.startswith('.')]
+
+
+def test_the_demo_counts_no_episodes_of_others_in_its_directory(
+    start_process, tmp_path, tmp_path_factory
+):
+    elsewhere = tmp_path_factory.mktemp('elsewhere')
+    options = ['--policy', 'resting', '--task', 'FetchReach', '--episodes=1', '--first-seed=7']
+    assert generate_episodes.main([*options, '--output', str(elsewhere)]) == 0
+    (other,) = elsewhere.iterdir()
+    command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting']
+    demo = start_process(*command, '--episodes', '1', '--episode-dir', tmp_path)
+    assert demo.stdout.readline().startswith('episode')
+    other.rename(tmp_path / other.name)
+    code, output = finish(demo)
+    assert code == 0 and 'FetchReach: 0 of 1 episodes succeeded' in output
+    assert other.name not in output
 
 
 @pytest.mark.parametrize(
