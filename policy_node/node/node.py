@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -43,6 +44,8 @@ _WARN_PERIOD = 1.0
 # missing are; discovery takes a moment.
 _PATIENCE = 3.0
 _SERVED_AT_ONCE = 1000
+# Seconds for which a robot counts as paused: one that is says so once a second.
+_PAUSE_HOLDS = 3.0
 _ANY_TASK = next(iter(TASKS.values()))
 
 
@@ -65,7 +68,7 @@ class PolicyNode(Node):
         self._answered_status: EpisodeStatus | None = None
         self._commands: Publisher | None = None
         self._of_robot: list[Publisher | Subscription] = []
-        self._is_paused = False
+        self._paused_until = -math.inf
         self._is_replaced = False
         self._health = Health(self.get_fully_qualified_name())
         self._diagnostics = self._publisher(DIAGNOSTICS)
@@ -265,7 +268,7 @@ class PolicyNode(Node):
     def _on_diagnostics(self, message: Any) -> None:
         is_paused = read_pause(message, self.get_namespace())
         if is_paused is not None:
-            self._is_paused = is_paused
+            self._paused_until = time.monotonic() + _PAUSE_HOLDS if is_paused else -math.inf
 
     def _report_when_due(self, missing: Sequence[str] = ()) -> None:
         now = time.monotonic()
@@ -274,7 +277,8 @@ class PolicyNode(Node):
         self._report_due = max(self._report_due + REPORT_PERIOD, now)
         robots = self.count_publishers(self._status_name)
         elsewhere = [] if robots or now < self._elsewhere_from else self._robots_elsewhere()
-        report = self._health.report(now, robots, self._is_paused, elsewhere, missing)
+        is_paused = now < self._paused_until
+        report = self._health.report(now, robots, is_paused, elsewhere, missing)
         self._diagnostics.publish(encode_reports(report))
         for line in self._health.news(report):
             self.get_logger().warning(line)
