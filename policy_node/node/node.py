@@ -34,7 +34,7 @@ from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, STATE, QosSpec, TopicSpec, topic
 from policy_node.node import NODE_NAME
 from policy_node.node.commander import Commander
-from policy_node.node.health import Health, read_pause
+from policy_node.node.health import Health, Pace, read_pace
 from policy_node.node.responder import Responder
 from policy_node.policies.loading import TaskMissing, load_policy
 from policy_node.policies.policy import LoadedPolicy
@@ -44,8 +44,8 @@ _WARN_PERIOD = 1.0
 # missing are; discovery takes a moment.
 _PATIENCE = 3.0
 _SERVED_AT_ONCE = 1000
-# Seconds for which a robot counts as paused: one that is says so once a second.
-_PAUSE_HOLDS = 3.0
+# Seconds for which it holds what a robot says of its pace, or that it is paused: once a second.
+_PACE_HOLDS = 3.0
 _ANY_TASK = next(iter(TASKS.values()))
 
 
@@ -68,7 +68,8 @@ class PolicyNode(Node):
         self._answered_status: EpisodeStatus | None = None
         self._commands: Publisher | None = None
         self._of_robot: list[Publisher | Subscription] = []
-        self._paused_until = -math.inf
+        self._pace: Pace | None = None
+        self._pace_until = -math.inf
         self._is_replaced = False
         self._health = Health(self.get_fully_qualified_name())
         self._diagnostics = self._publisher(DIAGNOSTICS)
@@ -266,9 +267,9 @@ class PolicyNode(Node):
         self._status, self._status_stamp = status, stamp
 
     def _on_diagnostics(self, message: Any) -> None:
-        is_paused = read_pause(message, self.get_namespace())
-        if is_paused is not None:
-            self._paused_until = time.monotonic() + _PAUSE_HOLDS if is_paused else -math.inf
+        pace = read_pace(message, self.get_namespace())
+        if pace is not None:
+            self._pace, self._pace_until = pace, time.monotonic() + _PACE_HOLDS
 
     def _report_when_due(self, missing: Sequence[str] = ()) -> None:
         now = time.monotonic()
@@ -277,8 +278,8 @@ class PolicyNode(Node):
         self._report_due = max(self._report_due + REPORT_PERIOD, now)
         robots = self.count_publishers(self._status_name)
         elsewhere = [] if robots or now < self._elsewhere_from else self._robots_elsewhere()
-        is_paused = now < self._paused_until
-        report = self._health.report(now, robots, is_paused, elsewhere, missing)
+        pace = self._pace if now < self._pace_until else None
+        report = self._health.report(now, robots, pace, elsewhere, missing)
         self._diagnostics.publish(encode_reports(report))
         for line in self._health.news(report):
             self.get_logger().warning(line)

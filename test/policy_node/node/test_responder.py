@@ -18,7 +18,7 @@ from msgs_spec.tasks import task_spec
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import topic
 from policy_node.node.commander import Commander
-from policy_node.node.health import Health, read_pause
+from policy_node.node.health import Health, Pace, read_pace
 from policy_node.node.responder import Responder
 from policy_node.node.stamp_join import StampJoin
 from policy_node.policies.loading import load_policy
@@ -240,11 +240,37 @@ def test_a_paused_robot_is_not_called_silent(case, episode):
     health.start(responder, episode[0])
     feed(responder, ticks[0])
     message = diagnostics(Report('/arm/sim_node', 'FetchReach', {'paused': 'True'}, 'is paused'))
-    assert read_pause(message, '/arm') is True
-    assert read_pause(message, '/') is None and read_pause(message, '/arm2') is None
-    report = health.report(30.0, 1, is_paused=True)
+    pace = read_pace(message, '/arm')
+    assert pace and pace.is_paused
+    assert read_pace(message, '/') is None and read_pace(message, '/arm2') is None
+    report = health.report(30.0, 1, pace)
     assert (report.level, report.message) == (Level.OK, 'FetchReach: the robot is paused')
-    assert health.report(31.0, 1, is_paused=False).level == Level.WARN
+    assert health.report(31.0, 1).level == Level.WARN
+
+
+@pytest.mark.parametrize(
+    ('values', 'period'),
+    [
+        ({'mode': 'lockstep', 'rate asked (Hz)': '-'}, math.inf),
+        ({'mode': 'realtime', 'rate asked (Hz)': '5.00'}, 0.2),
+        ({'mode': 'realtime', 'rate asked (Hz)': '100.00'}, 0.01),
+        ({'mode': 'realtime', 'rate asked (Hz)': '-'}, 0.0),
+        ({'rate asked (Hz)': '0.00'}, 0.0),
+    ],
+)
+def test_slow_inference_is_that_at_the_pace_of_the_robot(case, episode, values, period):
+    responder, _, ticks = case
+    health = Health('/policy_node')
+    health.start(responder, episode[0])
+    feed(responder, ticks[0])
+    responder.inference.add(0.06)
+    responder.inference.add(0.06)
+    report = Report('/sim_node', 'FetchReach', {'paused': 'False', **values}, 'runs')
+    pace = read_pace(diagnostics(report), '/')
+    assert pace == Pace(is_paused=False, period=period)
+    message = health.report(8.0, 1, pace).message
+    late = 'slow inference: 60.000 ms, a tick is 10.0 ms; commands come late'
+    assert (message == late) == (period == 0.01), message
 
 
 def test_robots_of_other_namespaces_are_named_where_there_is_none():
