@@ -384,6 +384,9 @@ class SimNode(Node):
                 self._robot.set_real_time_factor(float(change.value))
             elif change.name == 'seed':
                 self._robot.runner.set_next_seed(int(change.value))
+                if not self._robot.runner.has_started:
+                    # What is latched says the seed of the first episode.
+                    self._publish(self._robot.waiting_status())
             elif change.name == 'command_timeout':
                 self._robot.buffer.timeout = float(change.value)
 
