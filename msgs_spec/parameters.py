@@ -38,6 +38,8 @@ class ParameterSpec:
         read_only: Whether it is fixed once the node runs.
         check: Raises ValueError for what type and limits cannot tell.
         former: What it was called; still taken, with a warning.
+        is_path: Whether it names a file or folder, so that `~` stands for the home directory: no
+            shell replaces it within `<name>:=<value>`.
     """
 
     name: str
@@ -52,6 +54,7 @@ class ParameterSpec:
     read_only: bool = True
     check: Callable[[float], object] | None = None
     former: str = ''
+    is_path: bool = False
 
     @property
     def allowed(self) -> str:
@@ -175,6 +178,7 @@ SIM_NODE = (
         'string',
         '',
         'Directory for episode logs; empty logs nothing.',
+        is_path=True,
     ),
     ParameterSpec(
         'log_compiled_model',
@@ -211,7 +215,7 @@ POLICY_NODE = (
 
 
 REPLAY_NODE = (
-    ParameterSpec('path', 'string', '', 'Episode: bag directory or MCAP file.'),
+    ParameterSpec('path', 'string', '', 'Episode: bag directory or MCAP file.', is_path=True),
     ParameterSpec(
         'rate',
         'double',

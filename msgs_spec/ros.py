@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from importlib import import_module
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol
@@ -19,6 +21,7 @@ from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory
 
 if TYPE_CHECKING:
     from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+    from rclpy.clock import Clock
     from rclpy.executors import Executor
     from rclpy.node import Node
     from rclpy.parameter import Parameter
@@ -31,12 +34,33 @@ BEAT = 0.1
 _LAST_WORDS_SECONDS = 1.0
 # In which who is there is found for sure.
 DISCOVERY_TIME = 2.0
+# Seconds after which the graph has forgotten a process that was killed: until then it may stand
+# beside its successor. DDS implementations take 20 s or less.
+MEMORY_OF_THE_GRAPH = 25.0
 # Enough for any node on a busy machine: 0.3 s are usual.
 _DESTROY_SECONDS = 10.0
 
 
 class NodeFailure(CommandError):
     """The node cannot go on; the message is one line that says why."""
+
+
+def seldom(seconds: float) -> dict[str, Any]:
+    """Arguments of a logger for a line that it says at most once in so many seconds.
+
+    By rclpy's default, the system's clock, one that is set back would silence the line until that
+    time comes again.
+    """
+    return {'throttle_duration_sec': seconds, 'throttle_time_source_type': _steady_clock()}
+
+
+@cache
+def _steady_clock() -> Clock:
+    """Always the same: a logger takes no other for a line that it has said before."""
+    from rclpy.clock import Clock
+    from rclpy.clock_type import ClockType
+
+    return Clock(clock_type=ClockType.STEADY_TIME)
 
 
 def ros_message_class(type_name: str) -> Any:
@@ -168,6 +192,8 @@ def _declare(node: Node, spec: ParameterSpec, given: Parameter | None) -> Any:
         except ValueError as error:
             raise UsageError(str(error)) from None
     value = node.declare_parameter(spec.name, spec.default, descriptor(spec)).value
+    if spec.is_path:
+        return os.path.expanduser(value)
     return float(value) if spec.type == 'double' else value
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -52,13 +53,15 @@ from msgs_spec.ros import (
 )
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import topic, topics
+from msgs_spec.topics import DIAGNOSTICS, topic, topics
 from msgs_spec.transport import keep_discovery_local
 
 _NAME = 'demo'
 _START_TIMEOUT = 60.0
 # What shells add to the number of the signal that ended a command.
 _SIGNALLED = 128
+# Of an endpoint that is discovered before its node is, to rmw.
+_NAMELESS = '_NODE_NAME_UNKNOWN_'
 _COLUMNS = '{:>7}  {:>5}  {:>5}  {:>7}  {:<7}  {}'
 
 
@@ -89,16 +92,24 @@ class Watcher:
         """Who would take part in what this demo starts, in words; '' for nobody."""
         if count_publishers(self._node, 'episode_status'):
             return 'a robot'
-        # One that waits for a robot publishes nothing yet.
-        nodes = self._node.get_node_names_and_namespaces()
-        if ('policy_node', '/') in nodes:
-            return 'policy_node'
+        if waiting := self._waiting_policies():
+            return min(waiting)
         # Its nodes are still to come.
+        nodes = self._node.get_node_names_and_namespaces()
         if nodes.count(('demo', '/')) > 1:
             return 'another demo'
         commands = [each.name for each in topics(self._spec) if each.name.endswith('commands')]
         is_commanded = any(count_publishers(self._node, name) for name in commands)
         return 'who publishes commands' if is_commanded else ''
+
+    def _waiting_policies(self) -> set[str]:
+        """Who waits for a robot, under any name: it commands nobody yet, and reports its health."""
+        listeners = self._node.get_subscriptions_info_by_topic('episode_status')
+        reporters = self._node.get_publishers_info_by_topic(DIAGNOSTICS.name)
+        waiting, reporting = (
+            {each.node_name for each in endpoints} for endpoints in (listeners, reporters)
+        )
+        return {name for name in waiting & reporting if name != _NAMELESS}
 
     def spin(self) -> None:
         """Serves callbacks for a moment."""
@@ -133,6 +144,7 @@ class Demo:
         self._directory = Path(options.episode_dir)
         self._known = set(self._episodes())
         self._outcomes: list[EpisodeOutcome] = []
+        self._log: Path | None = None
 
     def run(self, stop: StopSignals) -> int:
         """Runs the demo and returns the exit code."""
@@ -152,6 +164,7 @@ class Demo:
         began = time.monotonic()
         # What the nodes print is shown if something goes wrong.
         with tempfile.NamedTemporaryFile('w+', prefix='demo_', suffix='.log') as logs:
+            self._log = Path(logs.name)
             policy = start_node('policy_node', {'policy': commander}, logs)
             sim = start_node('sim_node', self._sim_parameters(), logs)
             try:
@@ -209,8 +222,15 @@ class Demo:
         if self._directory.is_dir():
             yield from (p for p in self._directory.iterdir() if not p.name.startswith('.'))
 
+    def _logged(self) -> list[Path]:
+        """New episodes that the robot says it logged: others may log in the same directory."""
+        found = sorted(set(self._episodes()) - self._known)
+        said = self._log.read_bytes() if found and self._log else b''
+        # No digit may follow, of a longer seed.
+        return [p for p in found if re.search(rb', %b(?!\d)' % re.escape(os.fsencode(p)), said)]
+
     def _print_new_rows(self, console: Console | None = None) -> None:
-        for path in sorted(set(self._episodes()) - self._known):
+        for path in self._logged():
             self._known.add(path)
             try:
                 episode = read_episode(path)
@@ -278,7 +298,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument('--episodes', type=count, default=5, help='how many; default: %(default)s')
     parser.add_argument('--seed', type=seed, default=0, help='of the first; default: %(default)s')
     parser.add_argument(
-        '--episode-dir', default='episodes', help='where they are logged; default: %(default)s'
+        '--episode-dir',
+        type=os.path.expanduser,
+        default='episodes',
+        help='where they are logged; default: %(default)s',
     )
     parser.add_argument(
         '--policy',

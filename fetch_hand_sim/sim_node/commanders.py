@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-# Seconds after which the graph has forgotten a process that was killed: until then it may stand
-# beside its successor. DDS implementations take 20 s or less.
-_MEMORY_OF_THE_GRAPH = 25.0
+from msgs_spec.ros import MEMORY_OF_THE_GRAPH
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +85,7 @@ class CommanderWatch:
             for each in self._endpoints
             if (each.node, each.topic) == (node, topic) and not self._why_unheard(each)
         ]
-        return len(heard) if heard and min(heard) > _MEMORY_OF_THE_GRAPH else min(len(heard), 1)
+        return len(heard) if heard and min(heard) > MEMORY_OF_THE_GRAPH else min(len(heard), 1)
 
     def _why_unheard(self, endpoint: Endpoint) -> str:
         """Why messages of a publisher never arrive, or ''."""

@@ -57,7 +57,7 @@ class Health:
         # How much each counter has grown since the last report, by its name.
         self._growth: defaultdict[str, Increase] = defaultdict(Increase)
         self._growth['simulated'].since(robot.runner.stamp_ns)
-        self._asked_before: float | None = None
+        self._pace_before: tuple[float | None, int] = (None, 0)
         self.real_time_factor = 0.0
 
     def report(self, surroundings: Surroundings, now: float) -> Report:
@@ -141,10 +141,10 @@ class Health:
         missed = growth['missed'].since(robot.schedule.pacer.missed_ticks)
         asked = robot.schedule.asked_rate if robot.runner.has_started else None
         # Only a whole period at one pace tells.
-        asked_before, self._asked_before = self._asked_before, asked
+        pace_before, self._pace_before = self._pace_before, (asked, robot.schedule.changes)
         if missed:
             report.warn(f'{missed:.0f} ticks missed')
-        elif asked and asked == asked_before and rate < (1.0 - _RATE_TOLERANCE) * asked:
+        elif asked and self._pace_before == pace_before and rate < (1.0 - _RATE_TOLERANCE) * asked:
             report.warn(f'{rate:.1f} ticks per second, not the {asked:.1f} asked for')
         rejected = growth['rejected'].since(robot.buffer.rejected.total())
         if rejected:

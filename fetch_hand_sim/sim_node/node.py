@@ -42,6 +42,7 @@ from msgs_spec.ros import (
     declare_parameters,
     rclpy_profile,
     ros_message_class,
+    seldom,
     set_callback,
 )
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
@@ -215,10 +216,14 @@ class SimNode(Node):
         )
 
     def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Lets nothing move until there is a commander who hears everything."""
-        watch, runner = self._watch, self._robot.runner
-        # Steps are taken meanwhile, and may be all there are.
-        while not (stop or runner.is_done or (watch.commanders.names and watch.is_heard())):
+        """Lets nothing move until there is a commander who hears everything.
+
+        A step begins the first episode without one, and then it goes on as any other.
+        """
+        watch = self._watch
+        while not (watch.commanders.names and watch.is_heard()):
+            if stop or self._robot.runner.has_started:
+                return
             loop.wait(BEAT)
             watch.update()
             if self._robot.is_reset_due:
@@ -275,7 +280,7 @@ class SimNode(Node):
             is_waiting = now - self._ticked_at > _WAITING_PERIOD
         if is_waiting:
             line = waiting_line(robot, self._surroundings())
-            self.get_logger().warning(line, throttle_duration_sec=_WAITING_PERIOD)
+            self.get_logger().warning(line, **seldom(_WAITING_PERIOD))
 
     def _emit(self, tick: Tick, messages: Messages) -> None:
         if self._watch.has_newcomer and self._watch.is_heard():
@@ -290,7 +295,7 @@ class SimNode(Node):
             self._report_episode(tick.status)
 
     def _report_episode(self, status: EpisodeStatus) -> None:
-        if self._recorder is None:
+        if self._recorder is None or self._recorder.has_failed:
             self.get_logger().info(_episode_line(status))
         if self._robot.runner.current.has_diverged:
             count = self._robot.runner.simulation.divergences
@@ -359,7 +364,7 @@ class SimNode(Node):
     # Callbacks
 
     def _warn(self, line: str) -> None:
-        self.get_logger().warning(line, throttle_duration_sec=_WARN_PERIOD)
+        self.get_logger().warning(line, **seldom(_WARN_PERIOD))
 
     def _on_commander(self, checkpoint_sha256: str | None) -> None:
         self._has_introduction = True
@@ -379,6 +384,9 @@ class SimNode(Node):
                 self._robot.set_real_time_factor(float(change.value))
             elif change.name == 'seed':
                 self._robot.runner.set_next_seed(int(change.value))
+                if not self._robot.runner.has_started:
+                    # What is latched says the seed of the first episode.
+                    self._publish(self._robot.waiting_status())
             elif change.name == 'command_timeout':
                 self._robot.buffer.timeout = float(change.value)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 
 class RealTimePacer:
     """Says when the next tick is due. Times are seconds of any steady clock.
@@ -17,6 +19,7 @@ class RealTimePacer:
     def __init__(self, tick_duration: float, real_time_factor: float, now: float) -> None:
         self._tick_duration = tick_duration
         self._due = now
+        self._began = -math.inf
         self.missed_ticks = 0
         self.real_time_factor = real_time_factor
 
@@ -36,6 +39,7 @@ class RealTimePacer:
         skipped, so the robot never runs faster than asked to catch up.
         """
         period = self.period
+        self._began = now
         self._due += period
         if period and self._due <= now:
             missed = int((now - self._due) / period) + 1
@@ -43,5 +47,5 @@ class RealTimePacer:
             self._due += missed * period
 
     def restart(self, now: float) -> None:
-        """Makes the next tick due now, after a pause."""
-        self._due = now
+        """Makes the next tick due now, after a pause; not sooner than a period after the last."""
+        self._due = max(now, self._began + self.period)

@@ -16,12 +16,19 @@ class TickSchedule:
     Args:
         mode: `realtime` follows the pacer, `lockstep` the commands.
         pacer: With its first tick due at the start.
+
+    Attributes:
+        mode: As above.
+        pacer: As above.
+        is_paused: Whether there are no ticks.
+        changes: How often it was paused, told to go on, or given a pace.
     """
 
     def __init__(self, mode: Mode, pacer: RealTimePacer) -> None:
         self.mode = mode
         self.pacer = pacer
         self.is_paused = False
+        self.changes = 0
 
     @property
     def waits_for_commands(self) -> bool:
@@ -55,9 +62,11 @@ class TickSchedule:
     def set_paused(self, paused: bool, now: float) -> None:
         """Pauses or goes on; what was missed meanwhile is not made up for."""
         self.is_paused = paused
+        self.changes += 1
         self.pacer.restart(now)
 
     def set_real_time_factor(self, factor: float, now: float) -> None:
         """Changes the pace from now on."""
         self.pacer.real_time_factor = factor
+        self.changes += 1
         self.pacer.restart(now)

@@ -38,6 +38,7 @@ from msgs_spec.ros import (
     declare_parameters,
     rclpy_profile,
     ros_message_class,
+    seldom,
 )
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
@@ -203,7 +204,7 @@ class VisualizationNode(Node):
         try:
             picture = self._camera.render(scene, tick.frame)
         except RuntimeError as error:
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
+            self.get_logger().error(str(error), **seldom(10.0))
             return
         frame_id = self._prefix + _CAMERA_FRAME
         camera, fovy = self._camera, float(scene.model.vis.global_.fovy)

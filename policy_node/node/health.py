@@ -2,30 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from msgs_spec.diagnostics import Increase, Report
+from msgs_spec.ros import MEMORY_OF_THE_GRAPH
 from msgs_spec.tick import EpisodeStatus
 from policy_node.node.responder import Responder
 
 # Seconds without a complete observation after which the report says so. A robot that is paused
-# says that once a second.
+# says that once a second; one in slow motion is at most that many times slower than real time.
 _SILENCE = 2.0
+_SLOWEST = 100.0
 
 
-def read_pause(message: Any, namespace: str) -> bool | None:
-    """Whether the robot of a namespace is paused, from a message on `/diagnostics`.
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """What a robot says of its pace.
+
+    Attributes:
+        is_paused: Whether it has none.
+        period: Seconds of wall time that it leaves a commander at each tick; infinite where it
+            waits for commands, 0 where it is as fast as possible.
+    """
+
+    is_paused: bool
+    period: float
+
+
+def read_pace(message: Any, namespace: str) -> Pace | None:
+    """Returns the pace of the robot of a namespace, from a message on `/diagnostics`.
 
     Returns:
         None if the message is none of that robot's.
     """
     for status in message.status:
         if status.name.rpartition('/')[0] == namespace.rstrip('/'):
-            for pair in status.values:
-                if pair.key == 'paused':
-                    return bool(pair.value == 'True')
+            values = {pair.key: pair.value for pair in status.values}
+            if 'paused' in values:
+                return Pace(values['paused'] == 'True', _period(values))
     return None
+
+
+def _period(values: Mapping[str, str]) -> float:
+    if values.get('mode') == 'lockstep':
+        return math.inf
+    try:
+        return 1.0 / float(values.get('rate asked (Hz)', ''))
+    except (ValueError, ZeroDivisionError):
+        return 0.0
 
 
 class Health:
@@ -41,6 +68,8 @@ class Health:
         self._tick_duration = 0.0
         self._answered, self._dropped, self._unusable = Increase(), Increase(), Increase()
         self._then: float | None = None
+        # When there was one robot at most.
+        self._alone_at = -math.inf
         self._said: set[str] = set()
 
     def start(self, responder: Responder, status: EpisodeStatus) -> None:
@@ -57,7 +86,7 @@ class Health:
         self,
         now: float,
         robots: int,
-        is_paused: bool = False,
+        pace: Pace | None = None,
         elsewhere: Sequence[str] = (),
         missing: Sequence[str] = (),
     ) -> Report:
@@ -66,14 +95,14 @@ class Health:
         Args:
             now: Seconds of the responder's clock.
             robots: How many publish `episode_status`.
-            is_paused: Whether the robot says that it is paused.
+            pace: What the robot says of its pace; None counts as real time.
             elsewhere: Namespaces of other robots, told where there is none here.
             missing: Topics of the robot that nobody publishes, so that it cannot be answered.
         """
         if self._responder is None:
             report = Report(self._name, '', {'robots': str(robots)}, 'waits for a robot')
         else:
-            report = self._report(self._responder, now, robots, is_paused)
+            report = self._report(self._responder, now, robots, pace)
         if robots == 0 and elsewhere:
             report.warn(
                 f'no robot here: there is one in {", ".join(elsewhere)}; join it with '
@@ -81,7 +110,10 @@ class Health:
             )
         if robots and missing:
             report.warn(f'no state: nobody publishes {", ".join(missing)}')
-        if robots > 1:
+        if robots <= 1:
+            self._alone_at = now
+        # One that was killed and its successor are one.
+        elif now - self._alone_at > MEMORY_OF_THE_GRAPH:
             report.warn(f'{robots} robots publish here; give each a namespace')
         return report
 
@@ -92,7 +124,10 @@ class Health:
         self._said = set(kinds)
         return fresh
 
-    def _report(self, responder: Responder, now: float, robots: int, is_paused: bool) -> Report:
+    def _report(
+        self, responder: Responder, now: float, robots: int, robot_pace: Pace | None
+    ) -> Report:
+        given = robot_pace or Pace(is_paused=False, period=self._tick_duration)
         seconds = now - self._then if self._then is not None else 0.0
         self._then = now
         answered = self._answered.since(responder.answered)
@@ -111,7 +146,7 @@ class Health:
             'observation age (s)': '-' if age is None else f'{age:.3f}',
         }
         task = responder.commander.spec.name
-        pace = 'the robot is paused' if is_paused else f'{rate:.1f} commands per second'
+        pace = 'the robot is paused' if given.is_paused else f'{rate:.1f} commands per second'
         report = Report(self._name, task, values, f'{task}: {pace}')
         dropped = self._dropped.since(responder.join.dropped)
         if dropped:
@@ -119,13 +154,17 @@ class Health:
         unusable = self._unusable.since(responder.unusable)
         if unusable:
             report.warn(f'unusable messages: {unusable:.0f}')
-        if inference['p50'] != '-' and float(inference['p50']) > 1e3 * self._tick_duration:
+        if inference['p50'] != '-' and float(inference['p50']) > 1e3 * given.period > 0.0:
             report.warn(
-                f'slow inference: {inference["p50"]} ms, a tick is '
-                f'{1e3 * self._tick_duration:.1f} ms; commands come late'
+                f'slow inference: {inference["p50"]} ms, a tick is {1e3 * given.period:.1f} ms; '
+                'commands come late'
             )
         if robots == 0:
             report.warn('no robot publishes episode_status')
-        elif age is not None and age > _SILENCE and not is_paused:
+        elif age is not None and age > self._longest_silence(responder) and not given.is_paused:
             report.warn(f'no state: the last one is {age:.0f} s old')
         return report
+
+    def _longest_silence(self, responder: Responder) -> float:
+        """Seconds without an observation that are nothing to worry about at the robot's pace."""
+        return max(_SILENCE, 2.0 * min(responder.interval, _SLOWEST * self._tick_duration))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -24,6 +25,7 @@ from msgs_spec.ros import (
     declare_parameters,
     rclpy_profile,
     ros_message_class,
+    seldom,
     set_callback,
 )
 from msgs_spec.schemas import serialize
@@ -32,7 +34,7 @@ from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, STATE, QosSpec, TopicSpec, topic
 from policy_node.node import NODE_NAME
 from policy_node.node.commander import Commander
-from policy_node.node.health import Health, read_pause
+from policy_node.node.health import Health, Pace, read_pace
 from policy_node.node.responder import Responder
 from policy_node.policies.loading import TaskMissing, load_policy
 from policy_node.policies.policy import LoadedPolicy
@@ -42,6 +44,8 @@ _WARN_PERIOD = 1.0
 # missing are; discovery takes a moment.
 _PATIENCE = 3.0
 _SERVED_AT_ONCE = 1000
+# Seconds for which it holds what a robot says of its pace, or that it is paused: once a second.
+_PACE_HOLDS = 3.0
 _ANY_TASK = next(iter(TASKS.values()))
 
 
@@ -64,7 +68,8 @@ class PolicyNode(Node):
         self._answered_status: EpisodeStatus | None = None
         self._commands: Publisher | None = None
         self._of_robot: list[Publisher | Subscription] = []
-        self._is_paused = False
+        self._pace: Pace | None = None
+        self._pace_until = -math.inf
         self._is_replaced = False
         self._health = Health(self.get_fully_qualified_name())
         self._diagnostics = self._publisher(DIAGNOSTICS)
@@ -236,9 +241,7 @@ class PolicyNode(Node):
             try:
                 responder.receive(name, data)
             except ValueError as error:
-                self.get_logger().warning(
-                    f'state dropped: {error}', throttle_duration_sec=_WARN_PERIOD
-                )
+                self.get_logger().warning(f'state dropped: {error}', **seldom(_WARN_PERIOD))
 
         return on_message
 
@@ -253,7 +256,7 @@ class PolicyNode(Node):
         try:
             status = EpisodeStatus.from_values(decode_status(message))
         except ValueError as error:
-            self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=_WARN_PERIOD)
+            self.get_logger().warning(f'ignored: {error}', **seldom(_WARN_PERIOD))
             return
         stamp = message_stamp(message)
         # A robot that was started again, or an episode that is replayed again.
@@ -264,9 +267,9 @@ class PolicyNode(Node):
         self._status, self._status_stamp = status, stamp
 
     def _on_diagnostics(self, message: Any) -> None:
-        is_paused = read_pause(message, self.get_namespace())
-        if is_paused is not None:
-            self._is_paused = is_paused
+        pace = read_pace(message, self.get_namespace())
+        if pace is not None:
+            self._pace, self._pace_until = pace, time.monotonic() + _PACE_HOLDS
 
     def _report_when_due(self, missing: Sequence[str] = ()) -> None:
         now = time.monotonic()
@@ -275,7 +278,8 @@ class PolicyNode(Node):
         self._report_due = max(self._report_due + REPORT_PERIOD, now)
         robots = self.count_publishers(self._status_name)
         elsewhere = [] if robots or now < self._elsewhere_from else self._robots_elsewhere()
-        report = self._health.report(now, robots, self._is_paused, elsewhere, missing)
+        pace = self._pace if now < self._pace_until else None
+        report = self._health.report(now, robots, pace, elsewhere, missing)
         self._diagnostics.publish(encode_reports(report))
         for line in self._health.news(report):
             self.get_logger().warning(line)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -35,6 +36,7 @@ class Responder:
         unusable: Messages that could not be read, or held a value that is not finite.
         inference: Wall time from a complete observation to its command.
         received_at: When the last observation was complete, seconds of the clock.
+        interval: Seconds between the last two; infinite before.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class Responder:
         self.unusable = 0
         self.inference = Durations()
         self.received_at: float | None = None
+        self.interval = math.inf
 
     def receive(self, name: str, data: bytes) -> None:
         """Takes one message; the one that completes a tick is answered.
@@ -90,7 +93,10 @@ class Responder:
         self._unsent = None
 
     def _answer(self, observation: dict[str, NDArray[np.float64]]) -> None:
-        self.received_at = began = self._clock()
+        began = self._clock()
+        if self.received_at is not None:
+            self.interval = began - self.received_at
+        self.received_at = began
         command = self.commander.command(observation)
         self.inference.add(self._clock() - began)
         self._unsent = self._commands.encode(0, command)

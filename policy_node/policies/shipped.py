@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def actor_path(name_or_path: str | Path, besides: Sequence[str] = ()) -> Path:
     shipped = shipped_actors()
     if str(name_or_path) in shipped:
         return shipped[str(name_or_path)]
-    path, reason = Path(name_or_path), ''
+    path, reason = Path(os.path.expanduser(name_or_path)), ''
     try:
         if path.is_file():
             return path

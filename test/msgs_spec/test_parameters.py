@@ -150,6 +150,12 @@ def test_a_node_refuses_what_is_not_allowed_in_our_words(name, value, line, make
     assert '\n' not in str(error.value)
 
 
+def test_a_folder_in_the_home_directory_is_found_there(make_node, monkeypatch):
+    monkeypatch.setenv('HOME', '/home/somebody')
+    values = declare_parameters(make_node(episode_dir='~/episodes'), SIM_NODE)
+    assert values['episode_dir'] == '/home/somebody/episodes'
+
+
 def test_a_mistyped_parameter_is_named_with_the_nearest(make_node, capfd):
     node = make_node(tsak='FetchPush', seed=3, nonsense=1, checkpoint='random', use_sim_time=False)
     values = declare_parameters(node, SIM_NODE)

@@ -12,6 +12,7 @@ import pytest
 from fetch_hand_sim.commands.node_processes import start_node, stop_node
 from fetch_hand_sim.episode_log import read_summary
 from msgs_spec.tasks import task_spec
+from policy_node.training import generate_episodes
 from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
 
 
@@ -23,12 +24,15 @@ from support.graph import POLICY_NODE, SIM_NODE, client, finish, ros_args
         pytest.param(signal.SIGHUP, 129, marks=pytest.mark.release),
     ],
 )
-def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, tmp_path):
+def test_the_demo_logs_episodes_and_stops_in_order(
+    number, code, start_process, ros_environment, tmp_path
+):
     command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting']
     # Which a parameter file would have as a number and a comment.
     directory = '20261125 #1'
-    options = ('--episodes', '100', '--episode-dir', directory)
-    demo = start_process(*command, *options, cwd=tmp_path)
+    options = ('--episodes', '100', f'--episode-dir=~/{directory}')
+    environment = ros_environment | {'HOME': str(tmp_path)}
+    demo = start_process(*command, *options, env=environment)
     assert demo.stdout.readline().split() == [
         'episode',
         'seed',
@@ -49,11 +53,28 @@ def test_the_demo_logs_episodes_and_stops_in_order(number, code, start_process, 
     assert not [path for path in paths if path.name.startswith('.')]
 
 
+def test_the_demo_counts_no_episodes_of_others_in_its_directory(
+    start_process, tmp_path, tmp_path_factory
+):
+    elsewhere = tmp_path_factory.mktemp('elsewhere')
+    options = ['--policy', 'resting', '--task', 'FetchReach', '--episodes=1', '--first-seed=7']
+    assert generate_episodes.main([*options, '--output', str(elsewhere)]) == 0
+    (other,) = elsewhere.iterdir()
+    command = [sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting']
+    demo = start_process(*command, '--episodes', '1', '--episode-dir', tmp_path)
+    assert demo.stdout.readline().startswith('episode')
+    other.rename(tmp_path / other.name)
+    code, output = finish(demo)
+    assert code == 0 and 'FetchReach: 0 of 1 episodes succeeded' in output
+    assert other.name not in output
+
+
 @pytest.mark.parametrize(
     ('node', 'who'),
     [
         ([*SIM_NODE, *ros_args(task='HandReach')], 'a robot'),
         (POLICY_NODE, 'policy_node'),
+        ([*POLICY_NODE, '--ros-args', '-r', '__node:=actor'], 'actor'),
     ],
 )
 def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path):
@@ -61,7 +82,8 @@ def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path)
     start_process(*node)
     with client(task_spec('FetchReach')) as connection:
         names = connection.node.get_node_names
-        connection.spin_until(lambda: {'sim_node', 'policy_node'} & set(names()), 'the other')
+        others = {'sim_node', 'policy_node', 'actor'}
+        connection.spin_until(lambda: others & set(names()), 'the other')
     command = (sys.executable, '-m', 'fetch_hand_sim', 'demo', '--policy', 'resting')
     code, output = finish(start_process(*command, '--episodes', '1', cwd=tmp_path), timeout=60.0)
     assert code == 1

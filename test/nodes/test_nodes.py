@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -305,6 +307,33 @@ def test_a_robot_that_was_stepped_begins_an_episode_before_anybody_commands(
             lambda: (robot.statuses()[-1].episode, robot.statuses()[-1].phase) == (1, 'reset'),
             'the next episode',
         )
+
+
+def test_a_robot_that_was_stepped_goes_on_when_told_to_before_anybody_commands(
+    start_process: Start,
+) -> None:
+    start_process(*SIM_NODE, *ros_args(wait_for_commands=True))
+    with client(REACH) as robot:
+        robot.subscribe('/clock')
+        assert robot.call(SetBool, 'sim_node/pause', data=True).success
+        assert robot.call(SetBool, 'sim_node/pause', data=False).success
+        robot.spin(0.5)
+        assert len(robot.stamps('/clock')) == 1, 'without a step it waits'
+        assert robot.call(SetBool, 'sim_node/pause', data=True).success
+        assert robot.call(Trigger, 'sim_node/step').success
+        assert robot.call(SetBool, 'sim_node/pause', data=False).message == 'running at 1.000 s'
+        robot.spin_until(lambda: len(robot.stamps('/clock')) > 5, 'ticks')
+
+
+def test_a_seed_set_while_the_robot_waits_is_told(start_process: Start) -> None:
+    start_process(*SIM_NODE, *ros_args(wait_for_commands=True))
+    with client(REACH) as robot:
+        seed = Parameter(name='seed', value=ParameterValue(type=2, integer_value=9))
+        robot.call(SetParameters, 'sim_node/set_parameters', parameters=[seed])
+        # Also whoever comes late.
+        robot.subscribe('episode_status')
+        robot.spin_until(lambda: bool(robot.statuses()), 'status')
+        assert (robot.statuses()[-1].phase, robot.statuses()[-1].seed) == ('waiting', 9)
 
 
 def test_steps_may_be_all_there_is_of_a_run_that_waits_for_commands(start_process: Start) -> None:

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from std_srvs.srv import SetBool
@@ -101,6 +102,26 @@ def test_a_paused_robot_is_no_silent_one_and_acting_needs_no_torch(start_process
         assert abs(reports[-1].header.stamp.sec - time.time()) < 10.0
     assert 'no state' not in end(policy)
     end(sim)
+
+
+def test_a_pause_ends_with_its_robot(start_process: Start) -> None:
+    policy = start_process(*POLICY_NODE)
+    sim = _answered_robot(start_process, REACH)
+    with client(REACH) as robot:
+        robot.subscribe('/diagnostics')
+        assert robot.call(SetBool, 'sim_node/pause', data=True).success
+        paused = 'FetchReach: the robot is paused'
+        robot.spin_until(lambda: _last_report(robot) == paused, 'the pause')
+        end(sim)
+        # What follows, such as a replay, need not say that it is not paused.
+        robot.node.create_publisher(DiagnosticArray, 'episode_status', 1)
+        robot.spin_until(lambda: _last_report(robot).startswith('no state: '), 'a report')
+    end(policy)
+
+
+def _last_report(robot: Client) -> str:
+    reports = robot.reports('/policy_node')
+    return str(reports[-1].message) if reports else ''
 
 
 def test_a_policy_of_another_rate_is_refused_while_another_acts(start_process: Start) -> None:

@@ -171,9 +171,11 @@ def test_a_disk_that_is_full_from_the_start(start_process, mount):
 
 def test_episodes_that_were_asked_for_and_not_logged_are_a_failure(start_process, mount):
     disk = mount('size=8m')
-    arguments = ros_args(episode_dir=disk, episodes=1, real_time_factor=0.0)
+    arguments = ros_args(episode_dir=disk, episodes=3, real_time_factor=0.0)
     code, output = finish(start_process(*SIM_NODE, *arguments))
     assert code == 1 and 'Traceback' not in output
+    # What is not logged is still said.
+    assert 'episode 2 seed 2: 50 steps, return' in output
     assert output.splitlines()[-1] == f'sim_node: not all episodes are in {disk}'
 
 

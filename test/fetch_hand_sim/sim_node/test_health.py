@@ -130,6 +130,31 @@ def test_report_says_what_went_wrong_in_the_robot(make, monkeypatch, problem, le
     assert text in report.message
 
 
+def test_a_period_with_a_pause_or_another_pace_in_it_is_not_judged(make):
+    case = make()
+    health = Health(case.robot, '/sim_node', case.clock.now)
+    case.robot.tick_when_due()
+    health.report(FINE, case.clock.now)
+
+    def pass_a_second():
+        for _ in range(25):
+            case.clock.now += case.robot.wait()
+            case.robot.tick_when_due()
+        return health.report(FINE, case.clock.now)
+
+    assert pass_a_second().level is Level.OK
+    case.robot.pause(True)
+    case.clock.now += 0.5
+    case.robot.pause(False)
+    assert pass_a_second().level is Level.OK
+    case.robot.set_real_time_factor(0.1)
+    case.clock.now += 0.3
+    case.robot.set_real_time_factor(1.0)
+    assert pass_a_second().level is Level.OK
+    case.clock.now += 1.0
+    assert '0.0 ticks per second, not the 25.0 asked' in health.report(FINE, case.clock.now).message
+
+
 def test_report_counts_rejections_by_reason(make):
     case = make()
     case.robot.tick()

@@ -178,10 +178,34 @@ def test_real_time_factor_changes_while_running(make, factor):
     case = make()
     case.robot.tick_when_due()
     case.robot.set_real_time_factor(factor)
-    case.robot.tick_when_due()
-    assert case.robot.wait() == pytest.approx(0.04 / factor)
+    for _ in range(2):
+        assert case.robot.wait() == pytest.approx(0.04 / factor)
+        case.clock.now += case.robot.wait()
+        case.robot.tick_when_due()
+    assert case.robot.schedule.pacer.missed_ticks == 0
     case.robot.set_real_time_factor(0.0)
     assert case.robot.wait() == 0.0
+
+
+def _change_pace(robot):
+    robot.set_real_time_factor(0.08)
+
+
+def _pause_for_a_moment(robot):
+    robot.pause(True)
+    robot.pause(False)
+
+
+@pytest.mark.parametrize('meddle', [_change_pace, _pause_for_a_moment])
+def test_a_robot_that_is_meddled_with_ticks_no_faster_than_asked(make, meddle):
+    case = make(factor=0.08)
+    for _ in range(32):
+        if case.robot.wait() <= 0.0:
+            case.robot.tick_when_due()
+        case.clock.now += 0.125
+        meddle(case.robot)
+    # 4 s at 2 ticks per second.
+    assert len(case.ticks) == 8
 
 
 def test_the_last_tick_can_be_heard_again_with_the_same_bytes(make):

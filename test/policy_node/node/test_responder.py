@@ -18,7 +18,7 @@ from msgs_spec.tasks import task_spec
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import topic
 from policy_node.node.commander import Commander
-from policy_node.node.health import Health, read_pause
+from policy_node.node.health import Health, Pace, read_pace
 from policy_node.node.responder import Responder
 from policy_node.node.stamp_join import StampJoin
 from policy_node.policies.loading import load_policy
@@ -201,10 +201,33 @@ def test_report_says_what_is_wrong(case, episode):
     responder.inference.add(0.1)
     responder.inference.add(0.1)
     responder.inference.add(0.1)
-    message = health.report(14.0, 2).message
+    message = health.report(14.0, 1).message
     assert 'slow inference: 100.000 ms, a tick is 40.0 ms' in message
-    assert '2 robots publish here' in message
     assert 'no robot publishes episode_status' in health.report(15.0, 0).message
+
+
+def test_a_robot_that_was_killed_and_started_again_is_one_and_two_that_stay_are_two():
+    health = Health('/policy_node')
+    health.report(5.0, 1)
+    # The graph remembers who was killed for up to 20 s.
+    assert [health.report(5.0 + seconds, 2).level for seconds in range(1, 21)] == [Level.OK] * 20
+    assert health.report(26.0, 1).level == Level.OK
+    assert health.report(27.0, 2).level == Level.OK
+    assert '2 robots publish here' in health.report(52.0, 2).message
+    assert '2 robots publish here' in Health('/policy_node').report(5.0, 2).message
+
+
+def test_a_robot_in_slow_motion_is_not_called_silent(episode):
+    status, ticks = episode
+    now = [0.0]
+    responder, health = Responder(resting(), status, Wire(), lambda: now[0]), Health('/policy_node')
+    health.start(responder, status)
+    for tick in ticks:
+        feed(responder, tick)
+        for _ in range(4):
+            now[0] += 1.0
+            assert health.report(now[0], 1).level == Level.OK
+    assert health.report(now[0] + 5.0, 1).message == 'no state: the last one is 9 s old'
 
 
 def diagnostics(*reports):
@@ -217,11 +240,37 @@ def test_a_paused_robot_is_not_called_silent(case, episode):
     health.start(responder, episode[0])
     feed(responder, ticks[0])
     message = diagnostics(Report('/arm/sim_node', 'FetchReach', {'paused': 'True'}, 'is paused'))
-    assert read_pause(message, '/arm') is True
-    assert read_pause(message, '/') is None and read_pause(message, '/arm2') is None
-    report = health.report(30.0, 1, is_paused=True)
+    pace = read_pace(message, '/arm')
+    assert pace and pace.is_paused
+    assert read_pace(message, '/') is None and read_pace(message, '/arm2') is None
+    report = health.report(30.0, 1, pace)
     assert (report.level, report.message) == (Level.OK, 'FetchReach: the robot is paused')
-    assert health.report(31.0, 1, is_paused=False).level == Level.WARN
+    assert health.report(31.0, 1).level == Level.WARN
+
+
+@pytest.mark.parametrize(
+    ('values', 'period'),
+    [
+        ({'mode': 'lockstep', 'rate asked (Hz)': '-'}, math.inf),
+        ({'mode': 'realtime', 'rate asked (Hz)': '5.00'}, 0.2),
+        ({'mode': 'realtime', 'rate asked (Hz)': '100.00'}, 0.01),
+        ({'mode': 'realtime', 'rate asked (Hz)': '-'}, 0.0),
+        ({'rate asked (Hz)': '0.00'}, 0.0),
+    ],
+)
+def test_slow_inference_is_that_at_the_pace_of_the_robot(case, episode, values, period):
+    responder, _, ticks = case
+    health = Health('/policy_node')
+    health.start(responder, episode[0])
+    feed(responder, ticks[0])
+    responder.inference.add(0.06)
+    responder.inference.add(0.06)
+    report = Report('/sim_node', 'FetchReach', {'paused': 'False', **values}, 'runs')
+    pace = read_pace(diagnostics(report), '/')
+    assert pace == Pace(is_paused=False, period=period)
+    message = health.report(8.0, 1, pace).message
+    late = 'slow inference: 60.000 ms, a tick is 10.0 ms; commands come late'
+    assert (message == late) == (period == 0.01), message
 
 
 def test_robots_of_other_namespaces_are_named_where_there_is_none():

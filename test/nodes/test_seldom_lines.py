@@ -1,0 +1,27 @@
+"""Lines that may come often and are said now and then."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from rclpy.clock_type import ClockType
+
+from msgs_spec.ros import seldom
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_a_line_is_said_again_after_its_time_whatever_the_system_clock_does(node):
+    assert seldom(0.2)['throttle_time_source_type'].clock_type is ClockType.STEADY_TIME
+    said = []
+    for pause in (0.0, 0.0, 0.3):
+        time.sleep(pause)
+        said.append(node.get_logger().warning('line', **seldom(0.2)))
+    assert said == [True, False, True]
+
+
+def test_no_line_depends_on_the_system_clock():
+    for package in ('msgs_spec', 'fetch_hand_sim', 'policy_node'):
+        for path in (ROOT / package).rglob('*.py'):
+            assert 'throttle_duration_sec=' not in path.read_text(), path
