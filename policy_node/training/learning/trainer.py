@@ -139,7 +139,11 @@ class Trainer:
         origin = state.extra.get('init_from', {})
         self._saver.folder = replace(self._saver.folder, init_from=origin)
         self._let_critic_learn_first()
-        self._saver.keep_no_worse(self.counters)
+        measured_otherwise = self._saver.keep_no_worse(self.counters)
+        if measured_otherwise is not None and self.workers.is_first:
+            actor, info = measured_otherwise
+            outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
+            self._saver.keep_best(outcomes, actor, self.counters, info.env_steps)
         # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
         self.experience.generator = self._seed(self.counters.env_steps)
         limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)

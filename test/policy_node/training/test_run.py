@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,14 +129,37 @@ def test_a_best_actor_that_is_newer_than_the_checkpoint_stays(tmp_path: Path) ->
     great = {**info.success, 'last_step': 1.0, 'mean_return': -1.0}
     checkpoint.save(best, actor, replace(info, success=great))
     saved = best.read_bytes()
-    for episodes, kept in ((9, False), (8, True)):
-        settings = small(total_steps=2_400, evaluation_episodes=episodes)
-        trainer = Trainer(settings, tmp_path, Workers())
-        trainer.resume(tmp_path / STATE)
-        assert (trainer.counters.best_success == 1.0) is kept, 'one of fewer episodes says little'
-        if kept:
-            trainer.train()
-            assert best.read_bytes() == saved
+    trainer = Trainer(small(total_steps=2_400), tmp_path, Workers())
+    trainer.resume(tmp_path / STATE)
+    assert trainer.counters.best_success == 1.0
+    trainer.train()
+    assert best.read_bytes() == saved
+
+
+@pytest.mark.parametrize('change', [{'evaluation_episodes': 9}, {'success_rule': 'paper'}])
+def test_a_best_actor_that_was_measured_otherwise_is_measured_anew(
+    tmp_path: Path, change: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A few lucky episodes, or a more lenient rule, would stand above all that is to come."""
+    trainer = Trainer(small(total_steps=2_000), tmp_path, Workers())
+    trainer.train()
+    best = tmp_path / 'best.safetensors'
+    actor, info = checkpoint.load(best)
+    lucky = {**info.success, 'last_step': 1.0, 'mean_return': -1.0}
+    checkpoint.save(best, actor, replace(info, success=lucky))
+    trainer.counters.best_success, trainer.counters.best_return = 1.0, -1.0
+    trainer.save()
+    trainer = Trainer(small(total_steps=2_400, **change), tmp_path, Workers())
+    trainer.resume(tmp_path / STATE)
+    assert 'was measured otherwise, and is measured anew' in capsys.readouterr().err
+    found = checkpoint.read_info(best)
+    assert trainer.counters.best_success == found.success['last_step'] < 1.0
+    assert trainer.counters.best_return == found.success['mean_return'] < -1.0
+    assert (found.success['episodes'], found.success['rule']) == (
+        trainer.config.evaluation_episodes,
+        trainer.config.success_rule,
+    )
+    assert found.env_steps == info.env_steps, 'it is the actor that it was'
 
 
 def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(
