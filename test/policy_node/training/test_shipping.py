@@ -92,6 +92,21 @@ def test_json_and_actor_are_of_one_run(run: Path, tmp_path: Path) -> None:
     assert json.loads((tmp_path / 'actors' / 'FetchReach.json').read_text())['episodes'] == 2
 
 
+def test_an_actor_of_another_rate_replaces_none(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """However often it succeeds there, robots at the rate of the one before have none then."""
+    actors = tmp_path / 'actors'
+    assert ship(run, actors, 2) == 0
+    before = {file.name: file.read_bytes() for file in actors.iterdir()}
+    tensors, metadata = read_tensors(run / 'best.safetensors')
+    write_tensors(run / 'best.safetensors', tensors, metadata | {'control_hz': '50.0'})
+    assert ship(run, actors, 4) == 2
+    assert 'acts at 25 Hz, this one at 50 Hz: name another folder' in capsys.readouterr().err
+    assert {file.name: file.read_bytes() for file in actors.iterdir()} == before
+    assert ship(run, tmp_path / 'faster', 2) == 0
+
+
 def test_an_actor_that_says_nothing_of_its_recipe_is_shipped_whole(
     run: Path, tmp_path: Path
 ) -> None:
