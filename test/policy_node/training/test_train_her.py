@@ -370,10 +370,11 @@ def test_a_dropped_object_met_no_goal_where_a_drop_is_lost(tmp_path: Path) -> No
 
 def test_evaluation_sees_nothing_of_what_training_may_change(tmp_path: Path) -> None:
     """The same actor gets the same evaluation, whatever the rewards and draws of training are."""
-    task, small = 'HandManipulatePenRotate', {'num_envs': 2, 'evaluation_episodes': 2}
+    task, small = 'HandManipulatePenFull', {'num_envs': 2, 'evaluation_episodes': 2}
     changes = {'reward_rotation': 20.0, 'reward_distance': 0.1, 'noise_spread': 1.0, 'gamma': 0.5}
     changes |= {'first_distance': 9.0, 'first_rotation': 9.0}
-    changes |= {'ticks_after_drop': 2, 'goals': 'next=1', 'episode_weights': 'energy'}
+    changes |= {'ticks_after_drop': 2, 'goals': 'next=1'}
+    changes |= {'moved_share': 0.5, 'episode_weights': 'energy'}
     results = []
     for extra in ({}, changes):
         torch.manual_seed(0)
