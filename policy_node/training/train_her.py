@@ -165,6 +165,8 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
         )
     if config.subgoal_every:
         raise ValueError('subgoal_every excludes --from-episodes: nobody gave them subgoals')
+    if config.gamble:
+        raise ValueError('gamble excludes --from-episodes: gambles in them ended nothing')
     from policy_node.training.learning.logged_episodes import read_experience
 
     task = task_spec(config.task, control_hz=config.control_hz)

@@ -495,6 +495,10 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
             [*PPO, '--task', 'FetchReach', '--from-episodes', '.'],
             'algorithm ppo excludes --from-episodes',
         ),
+        (
+            ['--task', 'FetchReach', '--gamble', '--from-episodes', '.'],
+            'gamble excludes --from-episodes',
+        ),
         (['--task', 'FetchReach', '--strategy', 'past'], "strategy 'past'; allowed: "),
         (['--resume', 'nowhere'], 'nowhere is no folder of a run to go on with'),
     ],
