@@ -194,6 +194,9 @@ class Trainer:
         with ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,)) as executor:
             submit = executor.submit if self.config.overlap else _run_now
             collected = self._collect_first(submit)
+            if collected is None:
+                self.save()
+                return self._stop_reason or 'another worker stopped'
             while True:
                 before = time.monotonic()
                 self._absorb(collected)
@@ -221,15 +224,20 @@ class Trainer:
                     return reason
                 self._saver.save_when_due(self.learner, self.experience, self.counters)
 
-    def _collect_first(self, submit: Callable[..., Future[Collected]]) -> Collected:
-        """Fills the replay of a resumed run that has lost it, then collects the first cycle."""
+    def _collect_first(self, submit: Callable[..., Future[Collected]]) -> Collected | None:
+        """Fills the replay of a resumed run that has lost it, then collects the first cycle.
+
+        None where the run is stopped before: it has nothing to learn from yet.
+        """
         while True:
             actor, random, _ = self._request(may_evaluate=False)
             collected = self._collect_or_explain(submit(self._collect, actor, random, None))
             filled = self.experience.transitions >= self._refill
-            if not self.workers.any(not filled and not self._stop_reason):
+            if not self.workers.any(not filled):
                 return collected
             self.experience.replay.add(collected.episodes)
+            if self.workers.any(bool(self._stop_reason)):
+                return None
 
     def _request(self, may_evaluate: bool = True) -> tuple[Actor, bool, Actor | None]:
         """What to collect next: with which actor, whether at random, and which to evaluate."""

@@ -24,7 +24,7 @@ from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.replay import EpisodeReplay
+from policy_node.training.learning.replay import EpisodeReplay, Episodes
 from policy_node.training.learning.replay_file import load_replay, save_replay
 from policy_node.training.learning.run import lock_run
 from policy_node.training.learning.run_log import read_progress
@@ -100,6 +100,30 @@ def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(
     said = capsys.readouterr().err
     assert 'is no replay of this run' in said
     assert '2,000 steps fill the replay before learning goes on' in said
+
+
+def test_a_run_that_is_stopped_while_its_replay_fills_has_learnt_nothing_from_a_part(
+    tmp_path: Path,
+) -> None:
+    Trainer(small(total_steps=2_000), tmp_path, Workers()).train()
+    (tmp_path / 'replay.safetensors').unlink()
+    trainer = Trainer(small(total_steps=2_400), tmp_path, Workers())
+    trainer.resume(tmp_path / STATE)
+    collect = trainer.collector.collect
+
+    def stopped(policy: Actor, random: bool = False) -> tuple[Episodes, float]:
+        trainer.stop('interrupted')
+        return collect(policy, random)
+
+    trainer.collector.collect = stopped  # type: ignore[method-assign]
+    log = StopAfter(trainer, 100)
+    assert (trainer.train(log), log.rows) == ('interrupted', [])
+    again = Trainer(small(total_steps=2_400), tmp_path, Workers())
+    again.resume(tmp_path / STATE)
+    assert (again.counters.env_steps, again.counters.updates) == (2_000, 20)
+    assert again.experience.transitions == 400, 'what was collected needs not be collected again'
+    again.train(log)
+    assert [(row['env_steps'], row['updates']) for row in log.rows] == [(2_400, 24)]
 
 
 @pytest.mark.parametrize('damaged', [True, False])
