@@ -237,6 +237,12 @@ def test_a_run_that_is_stopped_does_not_wait_for_an_evaluation(tmp_path: Path) -
     assert log.rows[-1].get('eval_success') is None
 
 
+def test_whoever_may_read_a_run_may_read_its_replay(tmp_path: Path) -> None:
+    Trainer(small(total_steps=400), tmp_path, Workers()).save()
+    state, replay = tmp_path / STATE, tmp_path / 'replay.safetensors'
+    assert replay.stat().st_mode == state.stat().st_mode
+
+
 def test_the_newest_episodes_are_kept_in_order(tmp_path: Path) -> None:
     def replay() -> EpisodeReplay:
         return EpisodeReplay(8, ticks=5, observation_size=3, goal_size=2, action_size=1)
