@@ -21,6 +21,7 @@ from policy_node.training.learning.run_folder import (
 from policy_node.training.learning.run_log import draw_curve, read_progress
 from policy_node.training.learning.state_checks import is_finite
 from policy_node.training.learning.training_state import TrainingState, read_state, write_state
+from policy_node.training.policy_options import require_writable
 
 # What decides which of two actors is better, the first first.
 _BETTER = ('success_gymnasium', 'mean_return')
@@ -54,6 +55,7 @@ def ship(
         ValueError: If there is no such actor, no log beside it, a file of either folder is damaged,
             the shipped actor acts at another rate, or it was evaluated on more episodes: a few may
             all succeed by chance.
+        UsageError: If the folder takes no file.
     """
     actor, info = checkpoint.load(run / name)
     progress, has_state = _progress_of(run), (run / STATE_FILE).is_file()
@@ -70,6 +72,7 @@ def ship(
             f'the actor in {actors} was evaluated on {old["episodes"]} episodes, this one would be '
             f'on {episodes}: give --episodes {old["episodes"]} or more'
         )
+    require_writable(target)
     simulation = Simulation(
         info.task,
         num_envs=min(num_envs, episodes),

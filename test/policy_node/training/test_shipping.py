@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from policy_node.policies.tensor_file import read_tensors, write_tensors
+from policy_node.training.benchmark.jobs import BEST_ARM, Job
+from policy_node.training.benchmark.reporting import ship_all
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import RunLog
@@ -82,6 +84,20 @@ def test_a_damaged_run_changes_no_actor(
     error = capsys.readouterr().err
     assert name in error and error.count('\n') == 1
     assert not actors.exists()
+
+
+def test_a_folder_that_takes_no_actor_is_refused_before_any_episode(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    actors = tmp_path / 'actors'
+    actors.touch()
+    monkeypatch.setattr('policy_node.training.evaluation.shipping.evaluate', None)
+    assert ship(run, actors, 2) == 2
+    error = capsys.readouterr().err
+    assert 'FetchReach.safetensors cannot be written: ' in error and error.count('\n') == 1
+    job = Job(BEST_ARM, recipe_config('FetchReach', 'best', **SMALL), run)
+    assert not ship_all([job], actors, 2)
+    assert 'is not shipped: ' in capsys.readouterr().err
 
 
 def test_json_and_actor_are_of_one_run(run: Path, tmp_path: Path) -> None:
