@@ -520,6 +520,9 @@ def test_bad_usage_is_one_line_and_exit_status_2(
         (['--recipe', 'paper'], 'is a run of best, not of paper'),
         (['--output', 'elsewhere'], '--output excludes --resume: the run goes on in '),
         (['--set', 'init_from=FetchReach'], '--init-from excludes --resume'),
+        (['--quantiles', '5'], 'has networks of quantiles 1, which stay; not 5'),
+        (['--condition', 'horizon'], 'has networks of condition none, which stay; not horizon'),
+        (['--subgoal-every', '5'], 'has networks of subgoal_every 0, which stay; not 5'),
     ],
 )
 def test_what_a_run_that_goes_on_cannot_change(
@@ -529,6 +532,15 @@ def test_what_a_run_that_goes_on_cannot_change(
     assert main(['--resume', str(tmp_path), *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1
+
+
+def test_lengths_of_actions_mean_what_they_meant(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """With a longer `longest_hold` what held for three ticks would be learnt from as for twenty."""
+    Trainer(small_config(longest_hold=3), tmp_path, Workers()).save()
+    assert main(['--resume', str(tmp_path), '--longest-hold', '20']) == 2
+    assert 'has networks of longest_hold 3, which stay; not 20' in capsys.readouterr().err
 
 
 def test_a_folder_with_a_run_is_not_overwritten(
