@@ -33,7 +33,10 @@ _NAME = 'train_her'
 # Fields that say which recipe there is to start from.
 _OWN_OPTIONS = ('task', 'recipe')
 # What networks are made of, and what their values and the replay are of: they stay with a run.
-_NETWORK_FIELDS = 'hidden_sizes layer_norm goal_features algorithm critics norm advantage'.split()
+_NETWORK_FIELDS = (
+    'hidden_sizes layer_norm goal_features algorithm critics quantiles norm advantage condition '
+    'longest_hold subgoal_every'
+).split()
 _EXPERIENCE_FIELDS = 'control_hz reward_type discount gamble'.split()
 # A process that a signal ended returns 128 + its number, as shells say it.
 EXIT_SIGNAL = 128
@@ -165,6 +168,8 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
         )
     if config.subgoal_every:
         raise ValueError('subgoal_every excludes --from-episodes: nobody gave them subgoals')
+    if config.gamble:
+        raise ValueError('gamble excludes --from-episodes: gambles in them ended nothing')
     from policy_node.training.learning.logged_episodes import read_experience
 
     task = task_spec(config.task, control_hz=config.control_hz)

@@ -79,7 +79,7 @@ def ship_all(jobs: Sequence[Job], actors: Path, episodes: int) -> bool:
             continue
         try:
             ship(job.folder, actors, episodes=episodes)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, CommandError) as error:
             complain('benchmark', f'{job.name} is not shipped: {error}')
             whole = False
     return whole

@@ -13,7 +13,7 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.training.evaluation.episodes import FIRST_SEED
 from policy_node.training.learning.actor_critic import ActorCritic
 from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.config_rules import unusual_networks
+from policy_node.training.learning.config_rules import DEFAULTS
 from policy_node.training.learning.config_values import config_from_dict
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.hindsight import RewardFunction
@@ -27,6 +27,8 @@ from policy_node.training.learning.training_state import load_state, read_state
 _LAST_TICKS = 20
 # Shares of an episode at which values are compared with returns.
 _SHARES = (0.0, 0.25, 0.5)
+# Fields by which a critic says something else than what an action is worth; quantiles have a mean.
+_OTHER_VALUES = ('algorithm', 'longest_hold', 'advantage', 'subgoal_every', 'condition')
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +80,8 @@ def _read_config(file: Path) -> tuple[TrainConfig, float]:
     """The configuration of a run, and how far its goals have narrowed."""
     state = read_state(file)
     config = config_from_dict(state.extra['config'])
-    odd = unusual_networks(config)
-    odd += [f'condition {config.condition}'] if config.condition != 'none' else []
+    found = {name: getattr(config, name) for name in _OTHER_VALUES}
+    odd = [f'{name} {value}' for name, value in found.items() if value != DEFAULTS[name]]
     if odd:
         raise ValueError(f'{file.parent} has other values than of actions: {", ".join(odd)}')
     # Nothing is learnt from here.

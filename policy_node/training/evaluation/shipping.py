@@ -21,6 +21,7 @@ from policy_node.training.learning.run_folder import (
 from policy_node.training.learning.run_log import draw_curve, read_progress
 from policy_node.training.learning.state_checks import is_finite
 from policy_node.training.learning.training_state import TrainingState, read_state, write_state
+from policy_node.training.policy_options import require_writable
 
 # What decides which of two actors is better, the first first.
 _BETTER = ('success_gymnasium', 'mean_return')
@@ -52,12 +53,16 @@ def ship(
 
     Raises:
         ValueError: If there is no such actor, no log beside it, a file of either folder is damaged,
-            or the shipped actor was evaluated on more episodes: a few may all succeed by chance.
+            the shipped actor acts at another rate, or it was evaluated on more episodes: a few may
+            all succeed by chance.
+        UsageError: If the folder takes no file.
     """
     actor, info = checkpoint.load(run / name)
     progress, has_state = _progress_of(run), (run / STATE_FILE).is_file()
     state = read_state(run / STATE_FILE) if has_state else None
     shipped, digest = actors / f'{info.task}.json', checkpoint.checkpoint_hash(run / name)
+    target = actors / f'{info.task}.safetensors'
+    _require_rate(target, info.control_hz)
     old = _evaluation_in(shipped)
     if (old.get('run_sha256'), old.get('episodes')) == (digest, episodes):
         print(f'ship_actor: the actor in {actors} is this one; nothing changed')
@@ -67,6 +72,7 @@ def ship(
             f'the actor in {actors} was evaluated on {old["episodes"]} episodes, this one would be '
             f'on {episodes}: give --episodes {old["episodes"]} or more'
         )
+    require_writable(target)
     simulation = Simulation(
         info.task,
         num_envs=min(num_envs, episodes),
@@ -80,7 +86,6 @@ def ship(
         return False
     recipe = info.config.get('recipe', 'an unknown')
     title = f'{info.task}, {recipe} recipe, seed {info.seed}'
-    target = actors / f'{info.task}.safetensors'
     command = commands_of(run) or info.command
     checkpoint.save(target, actor, replace(info, success=summary, command=command))
     report = {
@@ -102,6 +107,22 @@ def ship(
     write_file(shipped, (json.dumps(report, indent=2) + '\n').encode())
     print(f'ship_actor: {target} is the actor of {run} now')
     return True
+
+
+def _require_rate(target: Path, control_hz: float) -> None:
+    """Refuses to replace an actor by one for other robots, whatever its success there.
+
+    Raises:
+        ValueError: If the one that is there acts at another rate, or is damaged.
+    """
+    if not target.is_file():
+        return
+    there = checkpoint.read_info(target).control_hz
+    if there != control_hz:
+        raise ValueError(
+            f'{target} acts at {there:g} Hz, this one at {control_hz:g} Hz: name another folder '
+            'with --actors'
+        )
 
 
 def _evaluation_in(file: Path) -> dict[str, Any]:

@@ -151,7 +151,8 @@ class ConfigFields:
     """Share of an average of actor weights kept each cycle; the average is what is evaluated and
     saved, as best and as latest. 0 evaluates the actor itself."""
     gamma: float = 0.98
-    """Discount; targets are clipped to [-1/(1-gamma), 0]."""
+    """Discount; targets are clipped to [-1/(1-gamma), 0], as in the paper's code also those of
+    dense rewards, which lie below -1 where a pose is far from its goal."""
     discount: str = 'tick'
     """What `gamma` discounts: one `tick`, or `time`: 40 ms, whatever a tick is. A tick's reward is
     then that for its share of 40 ms, so that values are as large at every rate."""

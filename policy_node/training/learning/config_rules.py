@@ -238,6 +238,8 @@ def _contradictions_of_values(config: ConfigFields) -> Iterator[str]:
         yield f'learning_starts needs replay_transitions of {config.learning_starts} or more'
     if config.correction != 'none' and config.n_step == 1:
         yield f'correction {config.correction} needs n_step above 1'
+    if config.episode_weights != DEFAULTS['episode_weights'] and config.moved_share == 0.0:
+        yield f'episode_weights {config.episode_weights} needs moved_share above 0'
     truncates = config.aggregate == 'truncated' and config.quantiles > 1
     if config.aggregate != 'mean' and config.critics == 1 and not truncates:
         yield f'aggregate {config.aggregate} needs critics above 1'
@@ -264,6 +266,9 @@ def _contradictions_of_goals(config: ConfigFields) -> Iterator[str]:
         yield 'goal_choice uncertain needs critics above 1'
     if config.narrows and (conditioned or config.reward_type == 'dense'):
         yield 'first_distance and first_rotation need reward_type sparse and condition none'
+    shares = config.reward_distance, config.reward_rotation
+    if shares != (1.0, 1.0) and config.reward_type == 'dense':
+        yield 'reward_distance and reward_rotation need reward_type sparse'
     if config.reward_grades and (conditioned or config.reward_type == 'dense'):
         yield 'reward_grades needs reward_type sparse and condition none'
     if config.narrow_above > 0 and not config.narrows:
@@ -322,6 +327,9 @@ def _contradictions_of_task(config: ConfigFields, spec: TaskSpec) -> Iterator[st
     for name in ('reward_rotation', 'first_rotation'):
         if spec.rotation_threshold is None and getattr(config, name) != 1.0:
             yield f'{name}: goals of {config.task} have no rotation'
+    for name in ('reward_distance', 'first_distance'):
+        if not spec.position_counts and getattr(config, name) != 1.0:
+            yield f'{name}: the position of goals of {config.task} does not count'
     poses = spec.position_counts and spec.rotation_threshold is not None
     if config.reward_apart > 0 and not (config.reward_grades and poses):
         yield 'reward_apart needs reward_grades, and goals of position and rotation'

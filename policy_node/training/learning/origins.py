@@ -29,6 +29,10 @@ def steps_behind(run: dict[str, Any]) -> int:
 def _run_of(part: dict[str, Any], steps: int) -> object:
     """What is the same for all actors of a run: its folder, where one is named."""
     name = part.get('name', '')
-    if name.endswith('.safetensors') and ',' not in name:
-        return str(Path(name).parent)
+    if name and ',' not in name:
+        if name.endswith('.safetensors'):
+            return str(Path(name).parent)
+        # A run by its folder has no file to tell the sum of.
+        if 'sha256' not in part:
+            return str(Path(name))
     return part.get('sha256') or name, steps

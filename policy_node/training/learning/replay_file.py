@@ -25,7 +25,11 @@ def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:
     partial = path.with_name(f'.{path.name}.partial')
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
+        partial.touch()
+        mode = partial.stat().st_mode
         save_file(tensors, partial)
+        # That library makes files for their owner alone; the others of a run are as umask says.
+        partial.chmod(mode)
         os.replace(partial, path)
     except (OSError, SafetensorError) as error:
         partial.unlink(missing_ok=True)

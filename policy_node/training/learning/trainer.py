@@ -139,7 +139,11 @@ class Trainer:
         origin = state.extra.get('init_from', {})
         self._saver.folder = replace(self._saver.folder, init_from=origin)
         self._let_critic_learn_first()
-        self._saver.keep_no_worse(self.counters)
+        measured_otherwise = self._saver.keep_no_worse(self.counters)
+        if measured_otherwise is not None and self.workers.is_first:
+            actor, info = measured_otherwise
+            outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
+            self._saver.keep_best(outcomes, actor, self.counters, info.env_steps)
         # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
         self.experience.generator = self._seed(self.counters.env_steps)
         limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
@@ -190,6 +194,9 @@ class Trainer:
         with ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,)) as executor:
             submit = executor.submit if self.config.overlap else _run_now
             collected = self._collect_first(submit)
+            if collected is None:
+                self.save()
+                return self._stop_reason or 'another worker stopped'
             while True:
                 before = time.monotonic()
                 self._absorb(collected)
@@ -217,15 +224,20 @@ class Trainer:
                     return reason
                 self._saver.save_when_due(self.learner, self.experience, self.counters)
 
-    def _collect_first(self, submit: Callable[..., Future[Collected]]) -> Collected:
-        """Fills the replay of a resumed run that has lost it, then collects the first cycle."""
+    def _collect_first(self, submit: Callable[..., Future[Collected]]) -> Collected | None:
+        """Fills the replay of a resumed run that has lost it, then collects the first cycle.
+
+        None where the run is stopped before: it has nothing to learn from yet.
+        """
         while True:
             actor, random, _ = self._request(may_evaluate=False)
             collected = self._collect_or_explain(submit(self._collect, actor, random, None))
             filled = self.experience.transitions >= self._refill
-            if not self.workers.any(not filled and not self._stop_reason):
+            if not self.workers.any(not filled):
                 return collected
             self.experience.replay.add(collected.episodes)
+            if self.workers.any(bool(self._stop_reason)):
+                return None
 
     def _request(self, may_evaluate: bool = True) -> tuple[Actor, bool, Actor | None]:
         """What to collect next: with which actor, whether at random, and which to evaluate."""

@@ -55,9 +55,20 @@ def test_a_critic_that_promises_too_much_is_told(
     assert 'value promised' in capsys.readouterr().out
 
 
+@pytest.mark.parametrize('critics', [1, 2])
+def test_quantiles_promise_their_mean(tmp_path: Path, critics: int) -> None:
+    many = {'quantiles': 5, 'critics': critics, 'aggregate': 'truncated'}
+    run = saved_run(tmp_path, value=-3.0, **many)
+    assert [promise.value for promise in measure(run, episodes=2)] == pytest.approx([-3.0] * 3)
+
+
 @pytest.mark.parametrize(
     ('changes', 'message'),
-    [({'condition': 'threshold'}, 'condition threshold'), (None, 'is no file')],
+    [
+        ({'condition': 'threshold'}, 'condition threshold'),
+        ({'subgoal_every': 10}, 'subgoal_every 10'),
+        (None, 'is no file'),
+    ],
 )
 def test_what_has_no_such_values_is_refused(
     tmp_path: Path,

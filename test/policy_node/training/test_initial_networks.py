@@ -103,6 +103,9 @@ def test_a_run_starts_from_the_mean_of_several(tmp_path: Path, block_run: Path) 
     ]
     parts[0]['env_steps'] = 250
     assert steps_behind({'env_steps': 5, 'init_from': {'env_steps': 0, 'mean_of': parts}}) == 305
+    # A run that is named by its folder is the run of the actors in it.
+    parts.append({'name': './runs/a', 'env_steps': 320})
+    assert steps_behind({'env_steps': 5, 'init_from': {'env_steps': 0, 'mean_of': parts}}) == 325
     # 200 steps each, all from one run of 400, which counts once.
     assert steps_behind({'env_steps': 200, 'init_from': origin}) == 200 + 400 + 2 * 200
 

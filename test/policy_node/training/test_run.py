@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.replay import EpisodeReplay
+from policy_node.training.learning.replay import EpisodeReplay, Episodes
 from policy_node.training.learning.replay_file import load_replay, save_replay
 from policy_node.training.learning.run import lock_run
 from policy_node.training.learning.run_log import read_progress
@@ -101,6 +102,30 @@ def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(
     assert '2,000 steps fill the replay before learning goes on' in said
 
 
+def test_a_run_that_is_stopped_while_its_replay_fills_has_learnt_nothing_from_a_part(
+    tmp_path: Path,
+) -> None:
+    Trainer(small(total_steps=2_000), tmp_path, Workers()).train()
+    (tmp_path / 'replay.safetensors').unlink()
+    trainer = Trainer(small(total_steps=2_400), tmp_path, Workers())
+    trainer.resume(tmp_path / STATE)
+    collect = trainer.collector.collect
+
+    def stopped(policy: Actor, random: bool = False) -> tuple[Episodes, float]:
+        trainer.stop('interrupted')
+        return collect(policy, random)
+
+    trainer.collector.collect = stopped  # type: ignore[method-assign]
+    log = StopAfter(trainer, 100)
+    assert (trainer.train(log), log.rows) == ('interrupted', [])
+    again = Trainer(small(total_steps=2_400), tmp_path, Workers())
+    again.resume(tmp_path / STATE)
+    assert (again.counters.env_steps, again.counters.updates) == (2_000, 20)
+    assert again.experience.transitions == 400, 'what was collected needs not be collected again'
+    again.train(log)
+    assert [(row['env_steps'], row['updates']) for row in log.rows] == [(2_400, 24)]
+
+
 @pytest.mark.parametrize('damaged', [True, False])
 def test_a_replay_that_is_no_multiple_of_an_episode_is_full_with_whole_ones(
     tmp_path: Path, damaged: bool
@@ -128,14 +153,37 @@ def test_a_best_actor_that_is_newer_than_the_checkpoint_stays(tmp_path: Path) ->
     great = {**info.success, 'last_step': 1.0, 'mean_return': -1.0}
     checkpoint.save(best, actor, replace(info, success=great))
     saved = best.read_bytes()
-    for episodes, kept in ((9, False), (8, True)):
-        settings = small(total_steps=2_400, evaluation_episodes=episodes)
-        trainer = Trainer(settings, tmp_path, Workers())
-        trainer.resume(tmp_path / STATE)
-        assert (trainer.counters.best_success == 1.0) is kept, 'one of fewer episodes says little'
-        if kept:
-            trainer.train()
-            assert best.read_bytes() == saved
+    trainer = Trainer(small(total_steps=2_400), tmp_path, Workers())
+    trainer.resume(tmp_path / STATE)
+    assert trainer.counters.best_success == 1.0
+    trainer.train()
+    assert best.read_bytes() == saved
+
+
+@pytest.mark.parametrize('change', [{'evaluation_episodes': 9}, {'success_rule': 'paper'}])
+def test_a_best_actor_that_was_measured_otherwise_is_measured_anew(
+    tmp_path: Path, change: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A few lucky episodes, or a more lenient rule, would stand above all that is to come."""
+    trainer = Trainer(small(total_steps=2_000), tmp_path, Workers())
+    trainer.train()
+    best = tmp_path / 'best.safetensors'
+    actor, info = checkpoint.load(best)
+    lucky = {**info.success, 'last_step': 1.0, 'mean_return': -1.0}
+    checkpoint.save(best, actor, replace(info, success=lucky))
+    trainer.counters.best_success, trainer.counters.best_return = 1.0, -1.0
+    trainer.save()
+    trainer = Trainer(small(total_steps=2_400, **change), tmp_path, Workers())
+    trainer.resume(tmp_path / STATE)
+    assert 'was measured otherwise, and is measured anew' in capsys.readouterr().err
+    found = checkpoint.read_info(best)
+    assert trainer.counters.best_success == found.success['last_step'] < 1.0
+    assert trainer.counters.best_return == found.success['mean_return'] < -1.0
+    assert (found.success['episodes'], found.success['rule']) == (
+        trainer.config.evaluation_episodes,
+        trainer.config.success_rule,
+    )
+    assert found.env_steps == info.env_steps, 'it is the actor that it was'
 
 
 def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(
@@ -187,6 +235,12 @@ def test_a_run_that_is_stopped_does_not_wait_for_an_evaluation(tmp_path: Path) -
     log = StopAfter(trainer, 3)
     assert trainer.train(log) == 'interrupted'
     assert log.rows[-1].get('eval_success') is None
+
+
+def test_whoever_may_read_a_run_may_read_its_replay(tmp_path: Path) -> None:
+    Trainer(small(total_steps=400), tmp_path, Workers()).save()
+    state, replay = tmp_path / STATE, tmp_path / 'replay.safetensors'
+    assert replay.stat().st_mode == state.stat().st_mode
 
 
 def test_the_newest_episodes_are_kept_in_order(tmp_path: Path) -> None:

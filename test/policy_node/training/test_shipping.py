@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from policy_node.policies.tensor_file import read_tensors, write_tensors
+from policy_node.training.benchmark.jobs import BEST_ARM, Job
+from policy_node.training.benchmark.reporting import ship_all
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import RunLog
@@ -84,12 +86,41 @@ def test_a_damaged_run_changes_no_actor(
     assert not actors.exists()
 
 
+def test_a_folder_that_takes_no_actor_is_refused_before_any_episode(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    actors = tmp_path / 'actors'
+    actors.touch()
+    monkeypatch.setattr('policy_node.training.evaluation.shipping.evaluate', None)
+    assert ship(run, actors, 2) == 2
+    error = capsys.readouterr().err
+    assert 'FetchReach.safetensors cannot be written: ' in error and error.count('\n') == 1
+    job = Job(BEST_ARM, recipe_config('FetchReach', 'best', **SMALL), run)
+    assert not ship_all([job], actors, 2)
+    assert 'is not shipped: ' in capsys.readouterr().err
+
+
 def test_json_and_actor_are_of_one_run(run: Path, tmp_path: Path) -> None:
     """A curve without the success while exploring, as of a log from elsewhere, is drawn too."""
     rows = (run / 'progress.csv').read_text().splitlines()
     (run / 'progress.csv').write_text('env_steps,updates\n400,4\n')
     assert len(rows) > 1 and ship(run, tmp_path / 'actors', 2) == 0
     assert json.loads((tmp_path / 'actors' / 'FetchReach.json').read_text())['episodes'] == 2
+
+
+def test_an_actor_of_another_rate_replaces_none(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """However often it succeeds there, robots at the rate of the one before have none then."""
+    actors = tmp_path / 'actors'
+    assert ship(run, actors, 2) == 0
+    before = {file.name: file.read_bytes() for file in actors.iterdir()}
+    tensors, metadata = read_tensors(run / 'best.safetensors')
+    write_tensors(run / 'best.safetensors', tensors, metadata | {'control_hz': '50.0'})
+    assert ship(run, actors, 4) == 2
+    assert 'acts at 25 Hz, this one at 50 Hz: name another folder' in capsys.readouterr().err
+    assert {file.name: file.read_bytes() for file in actors.iterdir()} == before
+    assert ship(run, tmp_path / 'faster', 2) == 0
 
 
 def test_an_actor_that_says_nothing_of_its_recipe_is_shipped_whole(

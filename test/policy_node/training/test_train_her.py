@@ -370,10 +370,11 @@ def test_a_dropped_object_met_no_goal_where_a_drop_is_lost(tmp_path: Path) -> No
 
 def test_evaluation_sees_nothing_of_what_training_may_change(tmp_path: Path) -> None:
     """The same actor gets the same evaluation, whatever the rewards and draws of training are."""
-    task, small = 'HandManipulatePenRotate', {'num_envs': 2, 'evaluation_episodes': 2}
+    task, small = 'HandManipulatePenFull', {'num_envs': 2, 'evaluation_episodes': 2}
     changes = {'reward_rotation': 20.0, 'reward_distance': 0.1, 'noise_spread': 1.0, 'gamma': 0.5}
     changes |= {'first_distance': 9.0, 'first_rotation': 9.0}
-    changes |= {'ticks_after_drop': 2, 'goals': 'next=1', 'episode_weights': 'energy'}
+    changes |= {'ticks_after_drop': 2, 'goals': 'next=1'}
+    changes |= {'moved_share': 0.5, 'episode_weights': 'energy'}
     results = []
     for extra in ({}, changes):
         torch.manual_seed(0)
@@ -494,6 +495,10 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
             [*PPO, '--task', 'FetchReach', '--from-episodes', '.'],
             'algorithm ppo excludes --from-episodes',
         ),
+        (
+            ['--task', 'FetchReach', '--gamble', '--from-episodes', '.'],
+            'gamble excludes --from-episodes',
+        ),
         (['--task', 'FetchReach', '--strategy', 'past'], "strategy 'past'; allowed: "),
         (['--resume', 'nowhere'], 'nowhere is no folder of a run to go on with'),
     ],
@@ -515,6 +520,9 @@ def test_bad_usage_is_one_line_and_exit_status_2(
         (['--recipe', 'paper'], 'is a run of best, not of paper'),
         (['--output', 'elsewhere'], '--output excludes --resume: the run goes on in '),
         (['--set', 'init_from=FetchReach'], '--init-from excludes --resume'),
+        (['--quantiles', '5'], 'has networks of quantiles 1, which stay; not 5'),
+        (['--condition', 'horizon'], 'has networks of condition none, which stay; not horizon'),
+        (['--subgoal-every', '5'], 'has networks of subgoal_every 0, which stay; not 5'),
     ],
 )
 def test_what_a_run_that_goes_on_cannot_change(
@@ -524,6 +532,15 @@ def test_what_a_run_that_goes_on_cannot_change(
     assert main(['--resume', str(tmp_path), *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1
+
+
+def test_lengths_of_actions_mean_what_they_meant(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """With a longer `longest_hold` what held for three ticks would be learnt from as for twenty."""
+    Trainer(small_config(longest_hold=3), tmp_path, Workers()).save()
+    assert main(['--resume', str(tmp_path), '--longest-hold', '20']) == 2
+    assert 'has networks of longest_hold 3, which stay; not 20' in capsys.readouterr().err
 
 
 def test_a_folder_with_a_run_is_not_overwritten(
