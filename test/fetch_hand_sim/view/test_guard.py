@@ -83,7 +83,7 @@ def test_the_token_admits_and_leaves_the_address():
     guard = Guard(TOKEN)
     assert refusal(guard, f'/?token={TOKEN}', Host='robot.example') is None
     cookie = guard.admission(f'/?token={TOKEN}')
-    assert 'HttpOnly' in cookie and 'SameSite=Strict' in cookie
+    assert 'HttpOnly' in cookie and 'SameSite=Lax' in cookie
     assert refusal(guard, '/', Host='robot.example', Cookie=cookie.partition(';')[0]) is None
 
 

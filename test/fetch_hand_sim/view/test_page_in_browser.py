@@ -12,7 +12,9 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import closing, contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from urllib.parse import urlsplit
 
 import mujoco
@@ -251,6 +253,42 @@ def test_a_file_is_played_and_the_timeline_moves_it(browser, start_process, tmp_
     wait_for(
         browser, lambda picture: difference(picture[scene], early[scene]) > 0.005, 'later frame'
     )
+
+
+@contextmanager
+def other_site(page: str):
+    """Serves one page to this machine; yields its port."""
+
+    class Answer(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header('Content-Type', 'text/html')
+            self.end_headers()
+            self.wfile.write(page.encode())
+
+        def log_message(self, *arguments: object) -> None:
+            """Says nothing."""
+
+    with ThreadingHTTPServer(('127.0.0.1', 0), Answer) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield server.server_address[1]
+        server.shutdown()
+
+
+def test_the_address_may_be_a_link_in_a_chat(browser, start_process, tmp_path):
+    """Browsers keep strict cookies from what a link on another site leads to."""
+    path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
+    address = urlsplit(address_of(start_process(*VIEW, path, '--host', '0.0.0.0')))
+    url = f'http://127.0.0.1:{address.port}/?{address.query}'
+    with other_site(f'<a href="{url}">the robot</a>') as port:
+        browser.open(f'http://localhost:{port}/')
+        browser.run("document.querySelector('a').click()")
+        end = time.monotonic() + PATIENCE
+        while browser.run('location.port + location.search') != str(address.port):
+            assert time.monotonic() < end
+            browser.wait(0.2)
+        browser.wait(1.0)
+        assert browser.run("document.querySelectorAll('canvas').length") > 0
 
 
 def test_the_list_opens_the_episode_that_is_clicked(browser, start_process, tmp_path):
