@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark.final import read_final
 from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
@@ -41,12 +42,14 @@ def area_in_time(curve: Curve, run: Mapping[str, Any], seconds: float) -> float:
     ended.
 
     Args:
-        curve: Its evaluations.
+        curve: Its evaluations, steps in units of 40 ms.
         run: Its row of `runs.csv`.
         seconds: Processor time.
     """
     share = max(seconds, _SHORTEST) / max(run['processor_seconds'], _SHORTEST)
-    return _mean_until(share * float(curve.env_steps[-1]), curve.env_steps, curve.success)
+    # Beyond the last evaluation too: its time is that of the whole run.
+    steps = run['simulated_seconds'] * DEFAULT_CONTROL_HZ
+    return _mean_until(share * steps, curve.env_steps, curve.success)
 
 
 def _mean_until(end: float, env_steps: Array, success: Array) -> float:

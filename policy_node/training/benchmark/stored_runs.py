@@ -35,6 +35,7 @@ Rows = list[dict[str, Any]]
 _NUMBERS = {
     RUNS: (
         'seed',
+        'simulated_seconds',
         'area',
         'final_success',
         'final_episodes',

@@ -105,7 +105,15 @@ def test_the_area_is_the_mean_success_over_the_budget() -> None:
 def test_the_area_in_time_is_that_of_the_share_of_a_run(seconds: float, area: float) -> None:
     """The run took 20 s: 10 s are its first half, and after 40 s it is still where it ended."""
     curve = Curve(np.array([100.0, 200.0, 400.0]), np.array([0.0, 1.0, 1.0]), 10)
-    assert area_in_time(curve, {'processor_seconds': 20.0}, seconds) == pytest.approx(area)
+    run = {'processor_seconds': 20.0, 'simulated_seconds': 400 / 25}
+    assert area_in_time(curve, run, seconds) == pytest.approx(area)
+
+
+def test_a_run_in_its_own_time_has_the_area_of_its_budget() -> None:
+    """Also one that was evaluated for the last time before its end."""
+    curve = Curve(np.array([100.0, 200.0, 300.0]), np.array([0.0, 1.0, 0.5]), 10)
+    run = {'processor_seconds': 20.0, 'simulated_seconds': 400 / 25}
+    assert area_in_time(curve, run, 20.0) == pytest.approx(area_under(curve, 400))
 
 
 def run(area: float, steps: int | str, final: float) -> dict[str, object]:
@@ -247,6 +255,7 @@ def stored_runs(folder: Path, jobs: list[Job], machine: str = 'A', seconds: floa
     for job in jobs:
         run = {
             'env_steps': 400,
+            'simulated_seconds': 16.0,
             'area': 0.5,
             'steps_to_0.9': '',
             'final_success': 0.5,
