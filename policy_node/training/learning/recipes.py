@@ -194,9 +194,10 @@ def _finetune(task: str) -> dict[str, Any]:
         'total_steps': 4_000_000,
         'evaluation_episodes': 300,
     }
-    if task == 'HandManipulateBlockFull':
+    if task == 'HandManipulateBlockFull' or 'Pen' in task:
         # As the shipped networks are.
         values['hidden_sizes'] = (512, 512, 512)
     if 'Pen' in task:
-        values |= {'ticks_after_drop': 3, 'drop_is_lost': True}
+        coarser = {'reward_grades': '.5,1,1.5,2.5'}
+        values |= {'ticks_after_drop': 3, 'drop_is_lost': True} | coarser
     return values
