@@ -103,8 +103,8 @@ class Guard:
         """Returns the cookie for whoever came with the token in the address, or None."""
         if self.token is None or not self._matches(parse_qs(urlsplit(target).query).get('token')):
             return None
-        # A strict one would be kept from the redirect that a link in a chat leads to. Sockets, which
-        # alone command, ask for the page's origin besides.
+        # A strict one would be kept from the redirect that a link in a chat leads to. Sockets, with
+        # which alone one commands, ask for the page's origin besides.
         return f'{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax'
 
     def _has_token(self, target: str, headers: Headers) -> bool:
