@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fetch_hand_sim.commands.picture_size import picture_size
-from fetch_hand_sim.datasets.minari import export_minari, why_apart
+from fetch_hand_sim.datasets import lerobot_columns, minari
 from fetch_hand_sim.datasets.parquet import export_parquet
 from fetch_hand_sim.datasets.writing import ByTask
 from fetch_hand_sim.episode_log import (
@@ -118,12 +118,8 @@ def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: s
         return f'no step was taken, and {_TITLES[to]} needs one'
     if not others:
         return ''
-    rates = episode.record.control_hz, others[0].record.control_hz
-    if to == 'lerobot' and rates[0] != rates[1]:
-        of = others[0].path
-        return f'{rates[0]:g} Hz, and {rates[1]:g} Hz in {of}; a LeRobot dataset has one rate'
-    why = why_apart(episode, others[0]) if to == 'minari' else ''
-    return why and f'{why}; a Minari dataset has one environment'
+    why_apart = {'minari': minari.why_apart, 'lerobot': lerobot_columns.why_apart}[to]
+    return why_apart(episode, others[0])
 
 
 def _export(options: argparse.Namespace, by_task: dict[str, list[EpisodeArrays]]) -> dict[str, str]:
@@ -134,7 +130,7 @@ def _export(options: argparse.Namespace, by_task: dict[str, list[EpisodeArrays]]
     if options.to == 'lerobot':
         found = _export_lerobot(options, by_task)
         return {task: f'LeRobot dataset {path}' for task, path in found.items()}
-    ids = export_minari(by_task, options.output, options.name)
+    ids = minari.export_minari(by_task, options.output, options.name)
     return {task: f'Minari dataset {each} in {options.output}' for task, each in ids.items()}
 
 

@@ -50,7 +50,8 @@ def export_lerobot(
     `next.reward`, `next.success` and `next.done`. All float32, as LeRobot's policies take them.
 
     Args:
-        by_task: Episodes, at least one of each task, each with a step and of one rate.
+        by_task: Episodes, at least one of each task, each with a step, and none that is apart from
+            the first of its task, see `lerobot_columns.why_apart`.
         directory: Where to write.
         camera: Whose films are part of it; None for none.
 
@@ -105,8 +106,8 @@ class _Dataset:
             parquet.write_table(pyarrow.concat_tables(tables), self._file(_DATA, **where))
             added = [self._row(each, where) for each in group]
             if self.camera is not None:
-                paths = [episodes[row['episode_index']].path for row in added]
-                colors += self._film(self.camera, paths, added, where)
+                shown = [episodes[row['episode_index']] for row in added]
+                colors += self._film(self.camera, shown, added, where)
             rows += added
         table = pyarrow.Table.from_pylist(rows)
         parquet.write_table(table, self._file(_EPISODES, chunk_index=0, file_index=0))
@@ -130,11 +131,15 @@ class _Dataset:
         }
 
     def _film(
-        self, camera: Camera, paths: Sequence[Path], rows: Sequence[Row], where: dict[str, int]
+        self,
+        camera: Camera,
+        episodes: Sequence[EpisodeArrays],
+        rows: Sequence[Row],
+        where: dict[str, int],
     ) -> list[Histogram]:
         """Writes the film of some episodes and adds to their rows where it is."""
         path = self._file(_FILM, video_key=camera.key, **where)
-        colors = write_episodes(path, paths, camera, self.rate)
+        colors = write_episodes(path, episodes, camera, self.rate)
         begins = accumulate((row['length'] for row in rows), initial=0)
         for row, begin, histogram in zip(rows, begins, colors, strict=False):
             end = begin + row['length']

@@ -5,7 +5,6 @@ Names and types are those of lerobot 0.4.4 (`lerobot/utils/constants.py`, `datas
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,14 @@ QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 _OBJECT = 'object'
 # What counts frames, in the episode and over the whole dataset.
 _COUNTS = ('frame_index', 'episode_index', 'index', 'task_index')
+
+
+def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
+    """Returns why an episode cannot be in the dataset of another of its task, '' if it can."""
+    rate, other = episode.record.control_hz, first.record.control_hz
+    if rate == other:
+        return ''
+    return f'{rate:g} Hz, and {other:g} Hz in {first.path}; a LeRobot dataset has one rate'
 
 
 def features(spec: TaskSpec) -> dict[str, dict[str, Any]]:
@@ -84,7 +91,7 @@ def frames(episode: EpisodeArrays, episode_index: int, first_index: int) -> Colu
     }
 
 
-def statistics(values: NDArray[Any], quantiles: Sequence[float] = QUANTILES) -> dict[str, Any]:
+def statistics(values: NDArray[Any]) -> dict[str, Any]:
     """What policies normalise with, of frames (n,) or (n, size); each a list."""
     rows = values.reshape(len(values), -1)
     numbers = rows.astype(np.float64)
@@ -97,7 +104,7 @@ def statistics(values: NDArray[Any], quantiles: Sequence[float] = QUANTILES) -> 
         **{
             quantile_name(share): quantile.tolist()
             for share, quantile in zip(
-                quantiles, np.quantile(numbers, quantiles, axis=0), strict=True
+                QUANTILES, np.quantile(numbers, QUANTILES, axis=0), strict=True
             )
         },
     }

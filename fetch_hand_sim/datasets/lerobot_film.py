@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.datasets.lerobot_columns import QUANTILES, quantile_name
+from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.films.film import Picture, write_film
 from fetch_hand_sim.films.pictures import Studio
-from fetch_hand_sim.films.recording import load_recording
+from fetch_hand_sim.films.recording import recording_of
 
 _LEVELS = 256
 # Pictures from one that can be shown without another to the next, as lerobot encodes them.
@@ -61,7 +62,7 @@ class Camera:
 
 
 def write_episodes(
-    path: Path, episodes: Sequence[Path], camera: Camera, rate: float
+    path: Path, episodes: Sequence[EpisodeArrays], camera: Camera, rate: float
 ) -> list[Histogram]:
     """Writes a film of the frames of episodes but their last, which no action follows.
 
@@ -85,10 +86,10 @@ def write_episodes(
 
 
 def _counted(
-    studio: Studio, episodes: Sequence[Path], histograms: Sequence[Histogram]
+    studio: Studio, episodes: Sequence[EpisodeArrays], histograms: Sequence[Histogram]
 ) -> Iterator[Picture]:
-    for path, histogram in zip(episodes, histograms, strict=True):
-        recording = load_recording(path)
+    for episode, histogram in zip(episodes, histograms, strict=True):
+        recording = recording_of(episode)
         for index in range(len(recording.frames) - 1):
             picture = studio.plain(recording, index)
             for channel, row in enumerate(histogram):

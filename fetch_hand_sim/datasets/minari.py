@@ -48,7 +48,9 @@ def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
     one, other = episode.record, first.record
     for name in _OF_THE_ENVIRONMENT:
         if getattr(one, name) != getattr(other, name):
-            return f'{name} {getattr(one, name)}, and {getattr(other, name)} in {first.path}'
+            here, there = getattr(one, name), getattr(other, name)
+            why = f'{name} {here}, and {there} in {first.path}'
+            return f'{why}; a Minari dataset has one environment'
     return ''
 
 

@@ -52,10 +52,18 @@ def load_recording(path: Path) -> Recording:
     Raises:
         EpisodeReadError: If it cannot be read; the message is one line.
     """
-    arrays = load_episode(path)
+    return recording_of(load_episode(path))
+
+
+def recording_of(arrays: EpisodeArrays) -> Recording:
+    """Adds to an episode what its file holds of how things stood.
+
+    Raises:
+        EpisodeReadError: If it cannot be read; the message is one line.
+    """
     ticks = len(arrays) + 1
     task = arrays.record.task
-    messages = read_messages(path)
+    messages = read_messages(arrays.path)
     joints = _vectors(messages, task, 'joint_states', ticks)[:, : len(task.robot.joints)]
     poses = _object_poses(messages, arrays, ticks)
     achieved, desired = arrays.observations['achieved_goal'], arrays.goals
