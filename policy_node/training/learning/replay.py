@@ -106,6 +106,11 @@ class EpisodeReplay:
         """Steps per episode."""
         return self._ring.ticks
 
+    def bytes_of(self, count: int) -> int:
+        """Memory that so many episodes take, of which it holds `capacity` at most."""
+        whole = sum(getattr(self._ring, name).nbytes for name in Episodes.__slots__)
+        return int(whole) * min(count, self.capacity) // self.capacity
+
     def newest(self, count: int) -> Episodes:
         """Copies of the newest episodes, the newest last; all if there are fewer than `count`."""
         number = min(count, self._size)

@@ -20,6 +20,7 @@ from policy_node.training.learning.initial_networks import (
     InitialNetworks,
     read_initial_networks,
 )
+from policy_node.training.learning.memory import available_memory, why_too_large
 from policy_node.training.learning.replay import Episodes
 from policy_node.training.learning.run_folder import COMMAND_FILE, LOCK_FILE, STATE_FILE
 from policy_node.training.learning.run_log import RunLog, draw_curve, read_progress
@@ -85,6 +86,8 @@ def train_run(
             raise UsageError(str(error)) from None
         except (MemoryError, RuntimeError) as error:
             raise _without_memory(error) from None
+        if why := _too_large(trainer):
+            complain(NAME, why)
         try:
             ending = _train(trainer, output, command)
         except (TrainingError, OSError) as error:
@@ -113,6 +116,15 @@ def _without_memory(error: MemoryError | RuntimeError) -> Exception:
         return error
     fields = 'replay_transitions, num_envs and hidden_sizes decide how much is needed'
     return UsageError(f'not enough memory; {fields}: {one_line(error)}')
+
+
+def _too_large(trainer: Trainer) -> str:
+    """Warns of a replay that this worker's memory will not hold, which ends a run hours later."""
+    replay = trainer.experience.replay
+    left = max(trainer.config.total_steps - trainer.counters.env_steps, 0)
+    episodes = len(replay) + trainer.workers.share(left) // replay.ticks
+    needed = replay.bytes_of(episodes) - replay.bytes_of(len(replay))
+    return why_too_large(needed, available_memory())
 
 
 def _train(trainer: Trainer, output: Path, command: str) -> Ending:

@@ -16,8 +16,10 @@ from safetensors.numpy import load_file, save_file
 
 from policy_node.policies import files
 from policy_node.policies.tensor_file import read_tensors, write_tensors
+from policy_node.training.learning import run as run_module
 from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.initial_networks import read_initial_networks
+from policy_node.training.learning.memory import available_memory
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.trainer import Trainer
@@ -285,3 +287,22 @@ def test_a_run_larger_than_the_memory_is_one_line(
     assert main([*arguments, '--set', field, '--output', str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert 'not enough memory; replay_transitions, num_envs and' in error and error.count('\n') == 1
+
+
+def test_a_replay_that_will_outgrow_the_memory_is_said_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # A step of FetchReach is 10 + 3 + 4 numbers of 4 bytes; an episode has one observation more and
+    # a goal.
+    whole = 16 * (51 * 13 + 3 + 50 * 4) * 4
+    arguments = ['--task', 'FetchReach', '--steps', '800', '--set', 'num_envs=2']
+    arguments += ['--threads', '1', '--torch-threads', '1', '--set', 'updates_per_cycle=1']
+    for available, warns in ((whole, False), (whole - 1, True), (None, False)):
+        monkeypatch.setattr(run_module, 'available_memory', lambda available=available: available)
+        assert main([*arguments, '--output', str(tmp_path / str(available))]) == 0
+        assert ('a smaller replay_transitions would fit' in capsys.readouterr().err) == warns
+
+
+def test_memory_that_can_be_taken_is_known_here() -> None:
+    available = available_memory()
+    assert available is not None and 10**7 < available < 10**14
