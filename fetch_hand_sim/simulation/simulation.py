@@ -188,9 +188,9 @@ class Simulation:
         """Starts simulations again.
 
         Args:
-            seed: One seed (simulation i takes seed + i), one per reset simulation, or None: the
-                random generators go on. The same seed gives the reference's draws. Instead of a
-                seed there may be a generator, which is used from then on.
+            seed: One seed (simulation i takes seed + i), one per simulation of `ids`, in their
+                order, or None: the random generators go on. The same seed gives the reference's
+                draws. Instead of a seed there may be a generator, which is used from then on.
             ids: Which simulations: indices or a boolean mask (N,); None for all.
 
         Returns:
@@ -203,7 +203,7 @@ class Simulation:
         selected = self._select(ids)
         self._seed(selected, seed)
         if selected.size:
-            self._start(selected)
+            self._start(np.sort(selected))
         return self.observe()
 
     def step(self, actions: ArrayLike) -> StepResult:
@@ -265,7 +265,7 @@ class Simulation:
         `gymnasium` success rule tells q from -q.
 
         Args:
-            goals: (n, goal size) for the n simulations of `ids`.
+            goals: (n, goal size) for the n simulations of `ids`, in their order.
             ids: Which simulations; None for all.
 
         Raises:
@@ -443,6 +443,7 @@ class Simulation:
         return array
 
     def _select(self, ids: ArrayLike | None) -> NDArray[np.intp]:
+        """The simulations of `ids`, in the order in which they are named."""
         if ids is None:
             return self._all
         selected = np.asarray(ids)
@@ -458,7 +459,8 @@ class Simulation:
         unique = np.unique(selected)
         if unique[0] < 0 or unique[-1] >= self.num_envs or unique.size != selected.size:
             raise ValueError(f'ids must be distinct and in [0, {self.num_envs}), not {ids!r}')
-        return unique.astype(np.intp)
+        # As given: seeds and goals come in this order.
+        return selected.astype(np.intp)
 
     def _seed(self, selected: NDArray[np.intp], seed: Seeds) -> None:
         if seed is None:

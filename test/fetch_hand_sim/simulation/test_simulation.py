@@ -94,6 +94,16 @@ def test_a_partial_reset_leaves_the_others_alone(task):
         assert observation[name][3].tobytes() == values[0].tobytes()
 
 
+def test_seeds_and_goals_come_in_the_order_of_the_simulations():
+    simulation = Simulation('FetchPush', num_envs=3, num_threads=1)
+    expected = simulation.reset(seed=[5, 0, 6])
+    observation = simulation.reset(seed=[6, 5], ids=[2, 0])
+    for name, values in expected.items():
+        assert observation[name].tobytes() == values.tobytes()
+    simulation.set_goal([[1.3, 0.7, 0.6], [1.2, 0.8, 0.5]], ids=[2, 0])
+    assert simulation.goals[[2, 0]].tolist() == [[1.3, 0.7, 0.6], [1.2, 0.8, 0.5]]
+
+
 def test_without_a_seed_the_generators_go_on():
     simulation = Simulation('FetchPush', num_envs=2)
     goals = [simulation.reset(seed=0)['desired_goal'], simulation.reset()['desired_goal']]
