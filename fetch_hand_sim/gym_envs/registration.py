@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from typing import Any, NoReturn
 
 import gymnasium
+from gymnasium.envs.registration import (
+    EnvSpec,
+    find_highest_version,
+    get_env_id,
+    parse_env_id,
+)
 from gymnasium.vector import VectorEnv
 
 from fetch_hand_sim.gym_envs.goal_env import import_goal_env
@@ -41,14 +48,14 @@ def _register(name: str, entry_point: str, vector_entry_point: str, **arguments:
     )
 
 
-def make(name: str, **arguments: Any) -> gymnasium.Env[Any, Any]:
+def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
     """`gymnasium.make` with episodes as long in seconds at every rate.
 
     Gymnasium itself limits steps by what is registered, the number at 25 Hz: with `control_hz` it
     needs `max_episode_steps` too.
 
     Args:
-        name: The id.
+        name: The id, or what `spec` of an environment says.
         **arguments: As `gymnasium.make` and `FetchHandEnv` have them.
 
     Raises:
@@ -57,17 +64,31 @@ def make(name: str, **arguments: Any) -> gymnasium.Env[Any, Any]:
     return gymnasium.make(name, **_with_length(name, arguments))
 
 
-def _with_length(name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+def _with_length(name: str | EnvSpec, arguments: dict[str, Any]) -> dict[str, Any]:
     """Arguments with as many steps per episode as fill its time, unless they say how many."""
-    task = gymnasium.spec(name.rpartition(':')[2]).kwargs.get('task')
-    rate = arguments.get('control_hz', DEFAULT_CONTROL_HZ)
-    if task is None or rate == DEFAULT_CONTROL_HZ or 'max_episode_steps' in arguments:
+    rate = arguments.get('control_hz')
+    if rate is None or arguments.get('max_episode_steps') is not None:
         return arguments
-    return {'max_episode_steps': task_spec(task, control_hz=rate).episode_ticks, **arguments}
+    known = (name if isinstance(name, EnvSpec) else _spec_of(name)).kwargs
+    if 'task' not in known or rate == known.get('control_hz', DEFAULT_CONTROL_HZ):
+        return arguments
+    ticks = task_spec(known['task'], control_hz=rate).episode_ticks
+    return {**arguments, 'max_episode_steps': ticks}
+
+
+def _spec_of(name: str) -> EnvSpec:
+    """What is registered under an id, as `gymnasium.make` reads it: [module:]id[-v...]."""
+    module, _, short = name.rpartition(':')
+    if module:
+        import_module(module)
+    namespace, bare, version = parse_env_id(short)
+    if version is None:
+        version = find_highest_version(namespace, bare)
+    return gymnasium.spec(get_env_id(namespace, bare, version))
 
 
 def make_vec(
-    name: str,
+    name: str | EnvSpec,
     num_envs: int = 1,
     wrappers: Sequence[Callable[[Any], VectorEnv[Any, Any, Any]]] = (),
     **arguments: Any,
@@ -77,7 +98,7 @@ def make_vec(
     Episodes are as long in seconds at every rate, as those of `make`.
 
     Args:
-        name: The id.
+        name: The id, or what `spec` of an environment says.
         num_envs: Number of copies.
         wrappers: What goes around the batch, the innermost first: wrappers of
             `gymnasium.wrappers.vector`, or those of single environments that have one of the same

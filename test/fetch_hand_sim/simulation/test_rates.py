@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -100,6 +101,8 @@ def test_environments_are_truncated_after_the_seconds_of_an_episode():
         assert fetch_hand_sim.make(name, control_hz=rate).spec.max_episode_steps == ticks
     short = fetch_hand_sim.make(f'fetch_hand_sim:{name}', control_hz=250, max_episode_steps=3)
     assert short.spec.max_episode_steps == 3
+    unsaid = fetch_hand_sim.make(name, control_hz=250, max_episode_steps=None)
+    assert unsaid.spec.max_episode_steps == 500
     env, ended = fetch_hand_sim.make_vec(name, num_envs=2, control_hz=12.5), []
     env.reset(seed=0)
     for _ in range(25):
@@ -107,3 +110,24 @@ def test_environments_are_truncated_after_the_seconds_of_an_episode():
         ended.append(truncated.all())
     assert ended == [False] * 24 + [True]
     env.close()
+
+
+def test_make_takes_whatever_gymnasium_takes(tmp_path, monkeypatch):
+    name = environment_id('FetchReach')
+    slow = fetch_hand_sim.make(name, control_hz=12.5)
+    assert fetch_hand_sim.make(slow.spec).spec.max_episode_steps == 25
+    assert fetch_hand_sim.make(slow.spec, control_hz=25).spec.max_episode_steps == 50
+    assert fetch_hand_sim.make_vec(slow.spec, 2).spec.max_episode_steps == 25
+    with pytest.warns(UserWarning, match='latest versioned environment'):
+        unversioned = fetch_hand_sim.make(name.removesuffix('-v0'), control_hz=12.5)
+    assert unversioned.spec.max_episode_steps == 25
+    # An id that only the module before the colon registers.
+    (tmp_path / 'somebodys_ids.py').write_text(
+        "import gymnasium\ngymnasium.register('Somebodys-v0', 'gymnasium.envs.classic_control:"
+        "CartPoleEnv')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        assert fetch_hand_sim.make('somebodys_ids:Somebodys-v0').spec.id == 'Somebodys-v0'
+    finally:
+        gymnasium.registry.pop('Somebodys-v0', None)
