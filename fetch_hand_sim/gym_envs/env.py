@@ -130,7 +130,11 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         self._show()
         diverged = bool(result.diverged[0])
         info = {'is_success': float(result.success[0]), 'diverged': diverged}
-        return _first(result.observation), float(result.reward[0]), False, diverged, info
+        observation, reward = _first(result.observation), result.reward[0]
+        if self.rewards_otherwise:
+            goals = observation['achieved_goal'], observation['desired_goal']
+            reward = self.compute_reward(*goals, info)
+        return observation, float(reward), False, diverged, info
 
     @property
     def model(self) -> Any:

@@ -129,7 +129,9 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         """Advances one tick, with the reference's types: sparse rewards and successes float32."""
         observation, reward, terminated, truncated, info = super().step(action)
         info['is_success'] = np.float32(info['is_success'])
-        return observation, self._as_reference(np.float64(reward)), terminated, truncated, info
+        if not self.rewards_otherwise:
+            reward = self._as_reference(np.float64(reward))
+        return observation, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
         """Reward of goals of any batch shape: float32 if sparse, a number for a single goal."""

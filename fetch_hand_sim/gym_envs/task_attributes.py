@@ -42,8 +42,20 @@ class TaskAttributes:
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
     ) -> Any:
-        """Reward of goals of any batch shape (..., goal size)."""
+        """Reward of goals of any batch shape (..., goal size).
+
+        A subclass may have another; its steps are rewarded by it.
+        """
         return self.simulation.compute_reward(achieved_goal, desired_goal, info)
+
+    @property
+    def rewards_otherwise(self) -> bool:
+        """Whether a subclass, or who has the object, brought a `compute_reward` of its own.
+
+        Steps then ask it, as those of Gymnasium-Robotics do: hindsight has the same rewards.
+        """
+        module = getattr(type(self).compute_reward, '__module__', '')
+        return 'compute_reward' in self.__dict__ or not module.startswith('fetch_hand_sim.')
 
     def compute_terminated(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any

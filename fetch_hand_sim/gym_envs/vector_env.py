@@ -16,7 +16,7 @@ from fetch_hand_sim.episodes.robot_episode import has_ended
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures, check_render_mode
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
-from fetch_hand_sim.simulation import Observation, Simulation
+from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.arguments import require_whole
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
 from msgs_spec.arrays import Array
@@ -171,7 +171,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
                 f'episodes {np.flatnonzero(started).tolist()} have ended; reset them first'
             )
         result = self.simulation.step(clip_actions(np.asarray(actions)))
-        observation, reward = result.observation, result.reward
+        observation, reward = result.observation, self._rewards(result)
         success, diverged = result.success, result.diverged & ~started
         if started.any():
             observation = self.simulation.reset(ids=started)
@@ -185,6 +185,14 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             observation, info = self._start_next(observation, info, truncated)
         terminated = np.zeros(self.num_envs, dtype=bool)
         return observation, reward, terminated, truncated.copy(), info
+
+    def _rewards(self, result: StepResult) -> Array:
+        """Rewards (N,) of a step."""
+        if not self.rewards_otherwise:
+            return result.reward
+        info = {'is_success': result.success.astype(np.float64), 'diverged': result.diverged}
+        goals = result.observation['achieved_goal'], result.observation['desired_goal']
+        return np.asarray(self.compute_reward(*goals, info), dtype=np.float64)
 
     def _start_next(
         self, last: Observation, info: dict[str, Any], ended: Flags

@@ -14,7 +14,9 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3 import DDPG, HerReplayBuffer
 
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
+from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv
 from fetch_hand_sim.gym_envs.registration import environment_id
+from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import TASKS
 from support.hindsight import assert_goals_are_exchanged
@@ -38,6 +40,29 @@ def test_gymnasiums_checker_is_content(task):
     assert env.spec.id == f'fetch_hand_sim/{task}-v0'
     assert env.spec.max_episode_steps == TASKS[task].episode_ticks
     check_env(env.unwrapped, skip_render_check=True)
+
+
+class Rewarded:
+    """A reward of somebody's own, of any batch shape."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info=None):
+        return -2.0 * np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+
+
+@pytest.mark.parametrize('base', [FetchHandEnv, FetchEnv, FetchHandVectorEnv])
+def test_steps_are_rewarded_by_the_compute_reward_of_a_subclass(base):
+    env = type('Mine', (Rewarded, base), {})('FetchReach')
+    env.reset(seed=0)
+    observation, reward, *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
+    goals = observation['achieved_goal'], observation['desired_goal']
+    assert reward == env.compute_reward(*goals, info) and -1.0 < reward < 0.0
+
+
+def test_steps_are_rewarded_by_the_compute_reward_that_an_environment_was_given():
+    env = make('FetchReach')
+    env.unwrapped.compute_reward = lambda achieved_goal, desired_goal, info: 7.0
+    env.reset(seed=0)
+    assert env.step(np.zeros(4, np.float32))[1] == 7.0
 
 
 @pytest.mark.parametrize('task', ['FetchSlide', 'HandManipulatePenRotate'])
