@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import select
 import shlex
 import signal
 import sys
@@ -153,7 +154,7 @@ def run_command(name: str, run: Callable[[], int]) -> int:
         except KeyboardInterrupt:
             return EXIT_INTERRUPTED
         except BrokenPipeError:
-            _discard_output()
+            _discard_output(sys.stdout.fileno())
             return EXIT_CLOSED_PIPE
         except ImportError:
             # What becomes of KeyboardInterrupt in the initialisation of many a library.
@@ -249,8 +250,25 @@ def _stopping_is_said(name: str) -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _discard_output() -> None:
-    """Lets Python flush stdout at its end without an error, although the pipe is closed."""
+def discard_unread_output() -> None:
+    """Lets what this process prints go nowhere, where its terminal or pipe has been closed.
+
+    For commands that have more to do than to print: writing there would be an error.
+    """
+    for number in (1, 2):
+        if _is_unread(number):
+            _discard_output(number)
+
+
+def _is_unread(number: int) -> bool:
+    """Whether nobody reads what is written to a file descriptor any more."""
+    poll = select.poll()
+    poll.register(number, 0)
+    return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
+
+
+def _discard_output(number: int) -> None:
+    """Lets Python flush a stream at its end without an error, although it is closed."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, sys.stdout.fileno())
+    os.dup2(nowhere, number)
     os.close(nowhere)

@@ -119,6 +119,24 @@ def test_a_closed_output_ends_quietly(flush):
     assert process.wait(20) == 141
 
 
+@pytest.mark.parametrize('open_pair', [pty.openpty, os.pipe])
+def test_what_nobody_reads_goes_nowhere_where_a_command_has_more_to_do(open_pair):
+    code = (
+        'import sys\n'
+        'from msgs_spec.command_line import discard_unread_output\n'
+        'sys.stdin.readline()\n'
+        'discard_unread_output()\n'
+        'for stream in (sys.stdout, sys.stderr): print("line", file=stream, flush=True)\n'
+    )
+    reader, writer = open_pair()
+    streams = {'stdin': subprocess.PIPE, 'stdout': writer, 'stderr': writer, 'text': True}
+    process = subprocess.Popen([sys.executable, '-c', code], **streams)
+    os.close(writer)
+    os.close(reader)
+    process.communicate('\n', timeout=20)
+    assert process.returncode == 0
+
+
 # Extras
 
 

@@ -11,7 +11,13 @@ from pathlib import Path
 from types import FrameType
 
 from fetch_hand_sim.episodes.context import source_revision
-from msgs_spec.command_line import CommandError, UsageError, complain, require_extra
+from msgs_spec.command_line import (
+    CommandError,
+    UsageError,
+    complain,
+    discard_unread_output,
+    require_extra,
+)
 from policy_node.policies.files import one_line
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.devices import choose_device
@@ -182,7 +188,10 @@ def _initial_networks(config: TrainConfig) -> InitialNetworks:
 
 @contextlib.contextmanager
 def _stop_on_signals(trainer: Trainer) -> Iterator[list[int]]:
-    """Ctrl-C and SIGTERM end the run after the cycle; a second one ends it at once.
+    """Ctrl-C, SIGTERM and SIGHUP end the run after the cycle; a second one ends it at once.
+
+    But not a second SIGHUP: a closed terminal sends one, and the shell in it another; so after the
+    first they are ignored. Where they are from the start, as `nohup` has it, that stays so.
 
     Yields:
         A list that will hold the number of the signal.
@@ -192,14 +201,18 @@ def _stop_on_signals(trainer: Trainer) -> Iterator[list[int]]:
     def handle(number: int, frame: FrameType | None) -> None:
         del frame
         received.append(number)
-        complain(NAME, 'stopping after this cycle; once more stops at once')
         trainer.stop(f'stopped by {signal.Signals(number).name}')
-        signal.signal(number, signal.SIG_DFL)
+        signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
+        discard_unread_output()
+        complain(NAME, 'stopping after this cycle; once more stops at once')
 
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        numbers.remove(signal.SIGHUP)
     before = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield received
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if number != signal.SIGHUP or number not in received:
+                signal.signal(number, handler)

@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from msgs_spec.command_line import discard_unread_output
+
 COLUMNS = (
     'seconds',
     'env_steps',
@@ -89,7 +91,8 @@ class RunLog:
 
     def close(self) -> None:
         """Ends the live line and closes the files."""
-        if self._console.is_terminal:
+        discard_unread_output()
+        if self._live.is_started:
             self._live.stop()
         self._file.close()
         if self._board is not None:
@@ -105,6 +108,8 @@ class RunLog:
             f'train {row["train_success"] or 0:.2f}  eval {self._last_eval or "-"}  '
             f'{_clock(seconds)}  ETA {self._remaining(row)}'
         )
+        # A run does not end because nobody watches it any more.
+        discard_unread_output()
         if self._console.is_terminal:
             self._live.update(Text(line))
         elif time.monotonic() - self._last_plain > _PLAIN_INTERVAL:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -26,7 +27,7 @@ from policy_node.training.learning.distributed import Workers
 from policy_node.training.learning.recipes import recipe_config
 from policy_node.training.learning.replay import EpisodeReplay, Episodes
 from policy_node.training.learning.replay_file import load_replay, save_replay
-from policy_node.training.learning.run import lock_run
+from policy_node.training.learning.run import _stop_on_signals, lock_run
 from policy_node.training.learning.run_log import read_progress
 from policy_node.training.learning.trainer import Trainer
 from policy_node.training.train_her import main
@@ -282,9 +283,11 @@ def start_run(tmp_path: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
     command = [sys.executable, '-m', 'policy_node.training.train_her', *arguments]
     started = []
 
-    def start() -> subprocess.Popen[str]:
-        pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'text': True}
-        started.append(process := subprocess.Popen(command, **pipes))
+    def start(output: int = subprocess.PIPE) -> subprocess.Popen[str]:
+        streams = {'stdout': output, 'stderr': output, 'text': True}
+        # No line that moves: nobody reads a terminal of these tests.
+        environment = {**os.environ, 'TERM': 'dumb'}
+        started.append(process := subprocess.Popen(command, env=environment, **streams))
         deadline = time.monotonic() + 90
         log = run / 'progress.csv'
         while not log.is_file() or log.read_text().count('\n') < 3:
@@ -298,7 +301,7 @@ def start_run(tmp_path: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
         process.communicate()
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_is_answered_at_once_and_keeps_the_run(
     tmp_path: Path, start_run: Callable[[], subprocess.Popen[str]], number: signal.Signals
 ) -> None:
@@ -316,6 +319,41 @@ def test_a_signal_is_answered_at_once_and_keeps_the_run(
     counters = json.loads(read_tensors(run / STATE)[1]['counters'])
     assert counters['env_steps'] == steps >= 800 and counters['updates'] == steps / 100
     assert (run / 'replay.safetensors').is_file() and (run / 'curve.png').is_file()
+
+
+def test_a_closed_terminal_keeps_the_run(
+    tmp_path: Path, start_run: Callable[..., subprocess.Popen[str]]
+) -> None:
+    terminal, its_other_end = pty.openpty()
+    process = start_run(its_other_end)
+    os.close(its_other_end)
+    os.close(terminal)
+    log, deadline = tmp_path / 'run' / 'progress.csv', time.monotonic() + 90
+    wanted = len(read_progress(log)) + 3
+    while len(read_progress(log)) < wanted:
+        assert process.poll() is None and time.monotonic() < deadline, 'it ended with its terminal'
+        time.sleep(0.05)
+    # The terminal sends it, then the shell does.
+    while process.poll() is None:
+        assert time.monotonic() < deadline
+        process.send_signal(signal.SIGHUP)
+        time.sleep(0.01)
+    assert process.returncode == 128 + signal.SIGHUP
+    run = tmp_path / 'run'
+    steps = read_progress(log)[-1]['env_steps']
+    assert json.loads(read_tensors(run / STATE)[1]['counters'])['env_steps'] == steps
+    assert (run / 'replay.safetensors').is_file() and (run / 'curve.png').is_file()
+
+
+def test_what_nohup_ignores_stays_ignored(tmp_path: Path) -> None:
+    trainer = Trainer(small(), tmp_path, Workers())
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with _stop_on_signals(trainer) as received:
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert received == [] and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_the_lock_of_a_killed_run_is_stale(
