@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,13 +42,19 @@ class NumpyActor:
         self._values = {name: values.astype(np.float64) for name, values in tensors.items()}
 
     def predict(
-        self, observation: Observation, *, deterministic: bool = True
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
         """Returns the action for one observation or a batch.
 
         Args:
             observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
                 in the units of the task; other keys are ignored.
+            state: Ignored; there is no recurrent state.
+            episode_start: Ignored, likewise.
             deterministic: Ignored: the policy has no noise.
 
         Returns:
@@ -56,7 +63,7 @@ class NumpyActor:
         Raises:
             ValueError: If a part is missing or has the wrong length.
         """
-        del deterministic
+        del state, episode_start, deterministic
         shape = self.shape
         # Rounded to float32 first, as in training.
         state = observation_part(observation, 'observation', shape.observation_size)

@@ -58,10 +58,14 @@ class OnnxActor:
         self._check_sizes(path)
 
     def predict(
-        self, observation: Observation, *, deterministic: bool = True
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
         """Returns the action (..., action size) in [-1, 1] for one observation or a batch."""
-        del deterministic
+        del state, episode_start, deterministic
         sizes = (self.info.shape.observation_size, self.info.goal_size)
         pairs = zip(INPUTS, sizes, strict=True)
         parts = {name: observation_part(observation, name, size) for name, size in pairs}

@@ -58,10 +58,14 @@ class RandomPolicy:
         self._generator = np.random.default_rng(seed)
 
     def predict(
-        self, observation: Observation, *, deterministic: bool = True
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
         """Returns actions (..., action size) in [-1, 1], whatever the observation."""
-        del deterministic
+        del state, episode_start, deterministic
         shape = _action_shape(observation, self._action_size)
         return self._generator.uniform(-1.0, 1.0, shape).astype(np.float32), None
 
@@ -73,10 +77,14 @@ class RestingPolicy:
         self._action_size = action_size
 
     def predict(
-        self, observation: Observation, *, deterministic: bool = True
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
         """Returns zeros (..., action size), whatever the observation."""
-        del deterministic
+        del state, episode_start, deterministic
         return np.zeros(_action_shape(observation, self._action_size), np.float32), None
 
 

@@ -65,10 +65,14 @@ class StableBaselines3Policy:
         self._policy = policy
 
     def predict(
-        self, observation: Observation, *, deterministic: bool = True
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
         """Returns actions (..., action size) in [-1, 1] for one observation or a batch."""
-        action, state = self._policy.predict(dict(observation), deterministic=deterministic)
+        action, state = self._policy.predict(dict(observation), state, episode_start, deterministic)
         return action, state
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +32,18 @@ def test_shipped_actors_answer_as_torch_does(task: str) -> None:
         wanted, _ = actor.predict(observation)
         assert action.shape == wanted.shape and action.dtype == np.float32
         np.testing.assert_allclose(action, wanted, atol=5e-4)
+
+
+@pytest.mark.parametrize('name', ['FetchReach', 'random', 'resting'])
+def test_policies_are_asked_as_stable_baselines3_asks(name: str) -> None:
+    policy: Any = load_policy(name, 'FetchReach').policy
+    observation = observations(task_spec('FetchReach'), 2)
+    # As its `evaluate_policy` does.
+    starts = np.ones(2, dtype=bool)
+    action, state = policy.predict(
+        observation, state=None, episode_start=starts, deterministic=True
+    )
+    assert action.shape == (2, 4) and state is None
 
 
 @pytest.mark.parametrize('task', ['FetchSlide', 'HandReach', 'HandManipulateBlockFull'])
