@@ -15,7 +15,13 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol, Self
 
-from msgs_spec.command_line import EXIT_FAILURE, EXIT_SUCCESS, CommandError, complain
+from msgs_spec.command_line import (
+    EXIT_FAILURE,
+    EXIT_SUCCESS,
+    CommandError,
+    complain,
+    discard_unread_output,
+)
 from msgs_spec.parent_process import end_with_parent
 from policy_node.training.benchmark.final import measure_final
 from policy_node.training.benchmark.jobs import Job
@@ -69,7 +75,7 @@ def run_jobs(
     while True:
         for job in [job for job in waiting if job.is_ready and not stopped]:
             if running < place.limit:
-                print(f'job {numbers[job.name]} of {len(jobs)}: {job.name}', flush=True)
+                _tell(f'job {numbers[job.name]} of {len(jobs)}: {job.name}')
                 waiting.remove(job)
                 place.start(job)
                 running += 1
@@ -81,12 +87,18 @@ def run_jobs(
         stopped |= outcome is Outcome.STOPPED
         if outcome is Outcome.FINISHED:
             left = sum(not other.is_finished for other in jobs)
-            print(f'{job.name} is finished; {left} to go', flush=True)
+            _tell(f'{job.name} is finished; {left} to go')
             if when_finished is not None:
                 when_finished()
     if stopped:
         raise KeyboardInterrupt
     return whole and not waiting
+
+
+def _tell(text: str) -> None:
+    """Says how far jobs are; they do not end because nobody reads it any more."""
+    discard_unread_output()
+    print(text, flush=True)
 
 
 def attempt(job: Job, command: str) -> Outcome:
@@ -109,7 +121,7 @@ def attempt(job: Job, command: str) -> Outcome:
                 raise CommandError(f'it ended before its steps were done: {ending.reason}')
         _measure(job)
     except RunTakenError:
-        print(f'{job.name} is being run by another process', flush=True)
+        _tell(f'{job.name} is being run by another process')
         return Outcome.TAKEN
     except CommandError as error:
         complain('benchmark', f'{job.name}: {error}')
@@ -194,7 +206,7 @@ class Processes:
         """Waits for one of the processes."""
         while not (over := wait(list(self._running), timeout=_STATUS_SECONDS)):
             for job, _ in self._running.values():
-                print(job.status, flush=True)
+                _tell(job.status)
         sentinel = over[0]
         assert isinstance(sentinel, int)
         job, process = self._running.pop(sentinel)
@@ -206,7 +218,7 @@ class Processes:
         if outcome is Outcome.FAILED:
             complain('benchmark', f'{job.name} failed; see {job.folder / LOG_FILE}')
         elif outcome is Outcome.TAKEN:
-            print(f'{job.name} is being run by another process', flush=True)
+            _tell(f'{job.name} is being run by another process')
         return job, outcome
 
 

@@ -9,10 +9,12 @@ import json
 import os
 import shlex
 import signal
+import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -225,6 +227,22 @@ def test_ctrl_c_keeps_what_there_is_and_the_same_command_goes_on(
     assert commands == [shlex.join(['benchmark', *arguments])] * 2
     assert read_curve(first / 'progress.csv').env_steps[-1] == 4_000
     assert 'goes on' not in capsys.readouterr().out
+
+
+def test_jobs_go_on_where_nobody_reads_how_far_they_are() -> None:
+    code = (
+        'import sys\n'
+        'from policy_node.training.benchmark.workers import _tell\n'
+        'sys.stdin.readline()\n'
+        '_tell("line")\n'
+    )
+    reader, writer = os.pipe()
+    streams: dict[str, Any] = {'stdin': subprocess.PIPE, 'stdout': writer, 'text': True}
+    process = subprocess.Popen([sys.executable, '-c', code], **streams)
+    os.close(writer)
+    os.close(reader)
+    process.communicate('\n', timeout=60)
+    assert process.returncode == 0
 
 
 def test_a_job_of_another_process_is_left_alone(
