@@ -220,7 +220,12 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
     )
     with bars:
         bar = bars.add_task(description, total=total)
-        yield lambda count: bars.advance(bar, count)
+        try:
+            yield lambda count: bars.advance(bar, count)
+        finally:
+            # What was counted is not lost with the terminal that it was shown on.
+            if _is_unread(2):
+                discard_unread_output()
 
 
 @contextmanager

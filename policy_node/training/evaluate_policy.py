@@ -9,6 +9,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -91,19 +92,37 @@ def _run(options: argparse.Namespace) -> int:
         'reward_type': options.reward_type,
         'touched_rule': options.success_rule,
     }
-    text = json.dumps(report, indent=2)
     try:
-        if options.json == _STDOUT:
-            print(text, flush=True)
-        else:
-            print_table(report)
-        if options.json not in (None, _STDOUT):
-            write_file(options.json, f'{text}\n'.encode())
-        if options.csv is not None:
-            write_file(options.csv, to_csv(outcomes))
+        try:
+            _show(report, options.json)
+        finally:
+            # Nobody may read the table any more; the files are there for that.
+            _write(report, outcomes, options)
+    except BrokenPipeError:
+        raise
     except OSError as error:
         raise CommandError(f'{error.filename or "output"}: {error.strerror}') from None
     return code
+
+
+def _show(report: dict[str, Any], json_file: Path | None) -> None:
+    """Prints the summary: a table, or JSON where that was asked for without a file."""
+    if json_file == _STDOUT:
+        print(json.dumps(report, indent=2), flush=True)
+    else:
+        print_table(report)
+
+
+def _write(report: dict[str, Any], outcomes: EpisodeOutcomes, options: argparse.Namespace) -> None:
+    """Writes the files that were asked for.
+
+    Raises:
+        OSError: If there is no room for one.
+    """
+    if options.json not in (None, _STDOUT):
+        write_file(options.json, f'{json.dumps(report, indent=2)}\n'.encode())
+    if options.csv is not None:
+        write_file(options.csv, to_csv(outcomes))
 
 
 def _evaluate(

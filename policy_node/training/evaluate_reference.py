@@ -103,14 +103,28 @@ def _run(options: argparse.Namespace) -> int:
         'success': successes / options.episodes,
         'interval_95': [lower, upper],
     }
-    print(f'{spec.reference_id}: {result["success"]:.4f} ({lower:.4f} ... {upper:.4f})')
-    if options.json is not None:
-        text = json.dumps({**report, 'reference': result}, indent=2) + '\n'
-        try:
-            write_file(options.json, text.encode())
-        except OSError as error:
-            raise CommandError(str(error)) from None
+    try:
+        print(
+            f'{spec.reference_id}: {result["success"]:.4f} ({lower:.4f} ... {upper:.4f})',
+            flush=True,
+        )
+    finally:
+        # Nobody may read the line any more; the file is there for that.
+        if options.json is not None:
+            _write(options.json, {**report, 'reference': result})
     return EXIT_SUCCESS
+
+
+def _write(file: Path, report: dict[str, Any]) -> None:
+    """Writes a JSON file.
+
+    Raises:
+        CommandError: If there is no room for it.
+    """
+    try:
+        write_file(file, (json.dumps(report, indent=2) + '\n').encode())
+    except OSError as error:
+        raise CommandError(str(error)) from None
 
 
 def _report_to_add_to(file: Path | None) -> dict[str, Any]:

@@ -137,6 +137,24 @@ def test_what_nobody_reads_goes_nowhere_where_a_command_has_more_to_do(open_pair
     assert process.returncode == 0
 
 
+def test_a_terminal_that_closes_takes_nothing_with_it_but_the_bar():
+    terminal, its_other_end = pty.openpty()
+    body = (
+        'with progress("things", 2) as advance:\n'
+        '    print("begun", flush=True)\n'
+        '    sys.stdin.readline()\n'
+        '    advance(2)\n'
+        'say("done")\n'
+        'return 0'
+    )
+    process = run_script(body, stdin=subprocess.PIPE, stderr=its_other_end)
+    os.close(its_other_end)
+    assert process.stdout.readline() == 'begun\n'
+    os.close(terminal)
+    assert process.communicate('\n', timeout=20)[0] == 'done\n'
+    assert process.returncode == 0
+
+
 # Extras
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -241,6 +242,21 @@ def test_a_result_goes_to_where_a_link_leads(
     assert main([*arguments, '--json', str(link)]) == 0
     assert link.is_symlink() and json.loads(target.read_text())['episodes'] == 2
     assert 'run[/b]' in capsys.readouterr().out.replace('\n', '')
+
+
+def test_files_are_written_where_nobody_reads_the_table(tmp_path: Path) -> None:
+    arguments = ['--policy', 'resting', '--task', 'FetchReach', '--episodes', '2']
+    files = ['--json', str(tmp_path / 'e.json'), '--csv', str(tmp_path / 'e.csv')]
+    command = [sys.executable, '-m', 'policy_node.training.evaluate_policy', *arguments, *files]
+    reader, writer = os.pipe()
+    os.close(reader)
+    result = subprocess.run(
+        command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120, check=False
+    )
+    os.close(writer)
+    assert result.returncode != 0 and 'Traceback' not in result.stderr
+    assert json.loads((tmp_path / 'e.json').read_text())['episodes'] == 2
+    assert (tmp_path / 'e.csv').read_text().count('\n') == 3
 
 
 def test_json_is_all_that_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
