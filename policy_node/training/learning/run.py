@@ -152,7 +152,8 @@ def _train(trainer: Trainer, output: Path, command: str) -> Ending:
 def lock_run(folder: Path) -> Iterator[None]:
     """Makes the folder of a run and keeps other processes out of it.
 
-    The lock ends with the process, however that ends.
+    The lock ends with the process, however that ends. Some file systems of clusters have none; a
+    line says so.
 
     Raises:
         UsageError: If the folder cannot be made or written to.
@@ -172,6 +173,9 @@ def lock_run(folder: Path) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise RunTakenError(f'{folder} is being trained by another process') from None
+        except OSError as error:
+            why = f'no locks where it lies ({error.strerror})'
+            complain(NAME, f'{folder} cannot be kept from other processes: {why}')
         yield
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import pty
@@ -21,6 +23,7 @@ import torch
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.tensor_file import read_tensors, write_tensors
+from policy_node.training.benchmark.stored_runs import locked
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.learning.config import TrainConfig
 from policy_node.training.learning.distributed import Workers
@@ -273,6 +276,20 @@ def test_a_folder_that_is_being_trained_is_refused(
     assert f'{run} is being trained by another process' in error and error.count('\n') == 1
     assert sorted(path.name for path in run.iterdir()) == ['.lock']
     assert main(['--task', 'FetchReach', *SET, '--steps', '400', '--output', str(run)]) == 0
+
+
+def test_a_file_system_without_locks_takes_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr(fcntl, 'flock', refuse)
+    with lock_run(tmp_path / 'run'), locked(tmp_path / 'report'):
+        pass
+    said = capsys.readouterr().err
+    assert 'cannot be kept from other processes: no locks where it lies' in said
+    assert said.count('\n') == 1
 
 
 @pytest.fixture
