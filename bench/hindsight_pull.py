@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from policy_node.policies.policy import RestingPolicy
-from policy_node.training.learning.outcomes import Outcomes
-from policy_node.training.learning.replay import Episodes
-from policy_node.training.learning.rollouts import advantages, goals_in_hindsight
+from policy_node.training.experience.rollouts import advantages, goals_in_hindsight
+from policy_node.training.goals.outcomes import Outcomes
+from policy_node.training.replay.episode_replay import Episodes
 
 Array = NDArray[np.float64]
 

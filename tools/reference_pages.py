@@ -14,11 +14,11 @@ from pathlib import Path
 
 from fetch_hand_sim.commands.main import COMMANDS, Command
 from msgs_spec.tasks import TASKS
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.config_fields import ConfigFields
-from policy_node.training.learning.config_options import field_docstrings
-from policy_node.training.learning.config_rules import CHOICES, RANGES
-from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config_fields import ConfigFields
+from policy_node.training.configuration.config_options import field_docstrings
+from policy_node.training.configuration.config_rules import CHOICES, RANGES
+from policy_node.training.configuration.recipes import recipe_config
 
 _COLUMNS = '88'
 # One task for each group of equal values in the recipe `best`.
@@ -87,7 +87,7 @@ def train_config_page() -> str:
             [
                 '# Fields of training',
                 'Everything that decides what `train_her` learns: '
-                '`policy_node.training.learning.config.TrainConfig`. Any field is an option, '
+                '`policy_node.training.configuration.config.TrainConfig`. Any field is an option, '
                 '`--learning-rate 1e-4`, or `--set learning_rate=1e-4`; each is in the JSON of the '
                 'actor. [Training](../training.md) '
                 'says what they bought.',

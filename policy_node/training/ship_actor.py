@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     require_extra('train')
-    from policy_node.training.evaluation.shipping import ship
+    from policy_node.training.runs.shipping import ship
 
     try:
         better = ship(

@@ -19,14 +19,14 @@ from msgs_spec.command_line import (
     say,
 )
 from msgs_spec.tasks import TASKS, task_spec
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.config_options import add_field_options, given_fields
-from policy_node.training.learning.config_rules import RECIPES
-from policy_node.training.learning.config_values import config_from_dict, parse_assignment
-from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config_options import add_field_options, given_fields
+from policy_node.training.configuration.config_rules import RECIPES
+from policy_node.training.configuration.config_values import config_from_dict, parse_assignment
+from policy_node.training.configuration.recipes import recipe_config
 
 if TYPE_CHECKING:
-    from policy_node.training.learning.replay import Episodes
+    from policy_node.training.replay.episode_replay import Episodes
 
 
 _NAME = 'train_her'
@@ -96,8 +96,8 @@ def _own_option(options: argparse.Namespace, overrides: dict[str, Any], name: st
 
 def _resumed_config(options: argparse.Namespace, overrides: dict[str, Any]) -> TrainConfig:
     """The configuration of a run that goes on, with what may change in it."""
-    from policy_node.training.learning.run_folder import STATE_FILE
-    from policy_node.training.learning.training_state import read_state
+    from policy_node.training.runs.run_folder import STATE_FILE
+    from policy_node.training.runs.training_state import read_state
 
     if options.output is not None:
         raise ValueError(f'--output excludes --resume: the run goes on in {options.resume}')
@@ -130,8 +130,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace, command: str) -> int:
     require_extra('train')
-    from policy_node.training.learning.distributed import is_first_worker
-    from policy_node.training.learning.run import train_run
+    from policy_node.training.machine.distributed import is_first_worker
+    from policy_node.training.runs.run import train_run
 
     try:
         config = config_from_arguments(options)
@@ -170,7 +170,7 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
         raise ValueError('subgoal_every excludes --from-episodes: nobody gave them subgoals')
     if config.gamble:
         raise ValueError('gamble excludes --from-episodes: gambles in them ended nothing')
-    from policy_node.training.learning.logged_episodes import read_experience
+    from policy_node.training.replay.logged_episodes import read_experience
 
     task = task_spec(config.task, control_hz=config.control_hz)
     episodes, skipped = read_experience(directory, task, config.control_hz)

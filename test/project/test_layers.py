@@ -277,7 +277,7 @@ def test_ros_in_a_node_is_found(node):
         ('fetch_hand_sim.commands.demo', "util.find_spec('policy_node')"),
         ('fetch_hand_sim.commands.demo', "start('policy_node.node', parameters)"),
         ('fetch_hand_sim.commands.demo', "f'{sys.executable} -m policy_node.node --ros-args'"),
-        ('policy_node.policies.actor', "MODULE = 'policy_node.training.learning.trainer'"),
+        ('policy_node.policies.actor', "MODULE = 'policy_node.training.runs.trainer'"),
     ],
 )
 def test_a_forbidden_import_is_found(module, source):

@@ -15,7 +15,7 @@ from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import PHASES, EpisodeStatus
 from msgs_spec.topics import MONITORING, topics
-from policy_node.training.learning.config import TrainConfig
+from policy_node.training.configuration.config import TrainConfig
 from support import ROOT
 
 # One promise per line, written by `write` when 1.0 was released. Lines may be added, never changed.

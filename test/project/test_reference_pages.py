@@ -7,8 +7,8 @@ import dataclasses
 import runpy
 from collections.abc import Iterator
 
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.recipes import recipe_config
 from support import ROOT
 
 TOOL = runpy.run_path(str(ROOT / 'tools' / 'reference_pages.py'))

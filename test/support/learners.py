@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.ddpg import DDPG
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.learners.ddpg import DDPG
+from policy_node.training.machine.distributed import Workers
 
 SHAPE = NetworkShape(observation_size=1, goal_size=1, action_size=1, hidden_sizes=(32, 32))
 

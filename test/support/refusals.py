@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from policy_node.training.learning.recipes import recipe_config
+from policy_node.training.configuration.recipes import recipe_config
 
 
 def assert_refused(message: str, **changes: object) -> None:

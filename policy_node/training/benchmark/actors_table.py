@@ -9,7 +9,7 @@ from typing import Any
 
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.published import BEST, CEILINGS
-from policy_node.training.learning.origins import steps_behind
+from policy_node.training.runs.origins import steps_behind
 
 _NOT_PUBLISHED = 'no number found'
 

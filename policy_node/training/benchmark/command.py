@@ -51,8 +51,8 @@ from policy_node.training.benchmark.stored_runs import StoredRuns
 from policy_node.training.benchmark.studies import PAPER, best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.study import FINAL_EPISODES, Study, research_jobs
 from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
-from policy_node.training.learning.config_rules import FROM_NOTHING
-from policy_node.training.learning.config_values import parse_assignment
+from policy_node.training.configuration.config_rules import FROM_NOTHING
+from policy_node.training.configuration.config_values import parse_assignment
 
 _NAME = 'benchmark'
 ACTORS_TABLE = 'actors.md'

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from policy_node.training.benchmark.final import read_final
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.config_values import config_from_dict
-from policy_node.training.learning.run_folder import STATE_FILE
-from policy_node.training.learning.run_log import read_progress
-from policy_node.training.learning.training_state import read_counters, read_state
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config_values import config_from_dict
+from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.run_log import read_progress
+from policy_node.training.runs.training_state import read_counters, read_state
 
 PROGRESS_FILE = 'progress.csv'
 # What may differ between two parts of a job without another result to be expected; where a run

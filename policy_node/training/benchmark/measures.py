@@ -14,9 +14,9 @@ from policy_node.training.benchmark.final import read_final
 from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
 from policy_node.training.benchmark.machines import machine
 from policy_node.training.benchmark.results import Array, Curve, read_curve
-from policy_node.training.learning.recipes import ticks_of_40_ms
-from policy_node.training.learning.run_folder import COMMAND_FILE, LATEST_FILE
-from policy_node.training.learning.run_log import read_progress
+from policy_node.training.configuration.recipes import ticks_of_40_ms
+from policy_node.training.runs.run_folder import COMMAND_FILE, LATEST_FILE
+from policy_node.training.runs.run_log import read_progress
 
 GOOD_SUCCESS = 0.9
 _SUMMED_UP = ('area', 'final_success')

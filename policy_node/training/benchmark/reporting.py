@@ -13,8 +13,8 @@ from policy_node.training.benchmark.research_report import write_study
 from policy_node.training.benchmark.results import write_report
 from policy_node.training.benchmark.stored_runs import RUNS
 from policy_node.training.benchmark.study import Study
-from policy_node.training.evaluation.shipping import ship
-from policy_node.training.learning.run_folder import BEST_FILE, LATEST_FILE
+from policy_node.training.runs.run_folder import BEST_FILE, LATEST_FILE
+from policy_node.training.runs.shipping import ship
 
 
 def report(jobs: Sequence[Job], study: Study | None, output: Path, command: str) -> None:

@@ -21,8 +21,8 @@ from policy_node.policies.files import write_files
 from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, PROGRESS_FILE, Job
 from policy_node.training.benchmark.machines import machine
 from policy_node.training.benchmark.published import BEST, RERUN
-from policy_node.training.learning.run_folder import LATEST_FILE
-from policy_node.training.learning.run_log import read_progress
+from policy_node.training.runs.run_folder import LATEST_FILE
+from policy_node.training.runs.run_log import read_progress
 
 # An epoch of the paper: 50 cycles of 2 episodes on each of 19 workers.
 EPISODES_PER_EPOCH = 1900

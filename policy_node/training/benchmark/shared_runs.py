@@ -11,7 +11,7 @@ from policy_node.policies.files import write_files
 from policy_node.training.benchmark.jobs import Job, run_name
 from policy_node.training.benchmark.stored_runs import ABOUT, StoredRuns, locked, run_of
 from policy_node.training.benchmark.study import Study
-from policy_node.training.learning.run_folder import STATE_FILE
+from policy_node.training.runs.run_folder import STATE_FILE
 
 
 def take_from_other_studies(jobs: Sequence[Job], studies: Path) -> None:

@@ -22,8 +22,8 @@ from policy_node.training.benchmark.jobs import Job, differing_fields, run_name
 from policy_node.training.benchmark.measures import curve_of, measure_run
 from policy_node.training.benchmark.results import curve_rows, to_csv, to_json
 from policy_node.training.benchmark.study import Study
-from policy_node.training.learning.config_values import config_from_dict
-from policy_node.training.learning.recipes import STEP_COUNTS
+from policy_node.training.configuration.config_values import config_from_dict
+from policy_node.training.configuration.recipes import STEP_COUNTS
 
 RUNS, CURVES, ABOUT = 'runs.csv', 'curves.csv', 'study.json'
 RUN = ('task', 'arm', 'seed')

@@ -25,7 +25,7 @@ from msgs_spec.command_line import (
 from msgs_spec.parent_process import end_with_parent
 from policy_node.training.benchmark.final import measure_final
 from policy_node.training.benchmark.jobs import Job
-from policy_node.training.learning.run import RunTakenError, train_run
+from policy_node.training.runs.run import RunTakenError, train_run
 
 LOG_FILE = 'log.txt'
 # Seconds between two lines about each running job.

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
+from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, wilson_interval
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.subgoals import GuidedPolicy, Proposer
+from policy_node.training.goals.subgoals import GuidedPolicy, Proposer
 
 # Seeds of evaluation episodes start here; those of training runs stay far below.
 EVALUATION_SEED = 1_000_000_000

@@ -28,10 +28,10 @@ from policy_node.training.benchmark.jobs import ARMS
 from policy_node.training.benchmark.results import Curve, aggregate, read_curve, summarize
 from policy_node.training.benchmark.studies import paper_jobs, reduced_budget
 from policy_node.training.benchmark.study import REPEATABLE
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.run_folder import LOCK_FILE
-from policy_node.training.learning.run_log import COLUMNS
-from policy_node.training.learning.training_state import (
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.runs.run_folder import LOCK_FILE
+from policy_node.training.runs.run_log import COLUMNS
+from policy_node.training.runs.training_state import (
     read_counters,
     read_state,
     write_state,

@@ -20,10 +20,10 @@ from policy_node.training.benchmark.command import jobs_from_arguments, main, pa
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.studies import BEST_ORDER, STARTS_FROM, start_from
 from policy_node.training.benchmark.workers import LOG_FILE, Outcome, run_jobs
-from policy_node.training.learning.origins import steps_behind
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.run_log import read_progress
-from policy_node.training.learning.training_state import Counters, TrainingState, write_state
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.runs.origins import steps_behind
+from policy_node.training.runs.run_log import read_progress
+from policy_node.training.runs.training_state import Counters, TrainingState, write_state
 
 torch.set_num_threads(1)
 

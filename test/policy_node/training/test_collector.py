@@ -13,9 +13,9 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.policy import RestingPolicy
-from policy_node.training.learning.collector import Collector
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.replay import Episodes
+from policy_node.training.collection.collector import Collector
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.replay.episode_replay import Episodes
 
 torch.set_num_threads(1)
 

@@ -13,18 +13,18 @@ import pytest
 from msgs_spec.command_line import CommandParser
 from msgs_spec.tasks import TASKS
 from policy_node.training.benchmark.research import STUDIES
-from policy_node.training.learning import config_fields
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.config_fields import ConfigFields
-from policy_node.training.learning.config_options import (
+from policy_node.training.configuration import config_fields
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config_fields import ConfigFields
+from policy_node.training.configuration.config_options import (
     add_field_options,
     field_docstrings,
     given_fields,
 )
-from policy_node.training.learning.config_rules import FROM_NOTHING
-from policy_node.training.learning.config_values import config_from_dict, parse_assignment
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.threads import split_threads
+from policy_node.training.configuration.config_rules import FROM_NOTHING
+from policy_node.training.configuration.config_values import config_from_dict, parse_assignment
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.machine.threads import split_threads
 from policy_node.training.train_her import config_from_arguments, parse_arguments
 from support import ROOT
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.critics import AGGREGATES, Ensemble, make_critic
-from policy_node.training.learning.transitions import Transitions
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.networks.critics import AGGREGATES, Ensemble, make_critic
+from policy_node.training.replay.transitions import Transitions
 from support.learners import SHAPE, make_learner
 
 torch.set_num_threads(1)

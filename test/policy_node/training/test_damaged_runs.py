@@ -16,14 +16,14 @@ from safetensors.numpy import load_file, save_file
 
 from policy_node.policies import files
 from policy_node.policies.tensor_file import read_tensors, write_tensors
-from policy_node.training.learning import run as run_module
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.initial_networks import read_initial_networks
-from policy_node.training.learning.memory import available_memory
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.run_log import read_progress
-from policy_node.training.learning.trainer import Trainer
-from policy_node.training.learning.training_state import read_counters
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine.memory import available_memory
+from policy_node.training.runs import run as run_module
+from policy_node.training.runs.initial_networks import read_initial_networks
+from policy_node.training.runs.run_log import read_progress
+from policy_node.training.runs.trainer import Trainer
+from policy_node.training.runs.training_state import read_counters
 from policy_node.training.train_her import main
 
 torch.set_num_threads(1)

@@ -8,12 +8,12 @@ import sys
 
 import torch
 
-from policy_node.training.learning.distributed import Workers, join_workers
+from policy_node.training.machine.distributed import Workers, join_workers
 
 PROGRAM = """
 import torch
-from policy_node.training.learning.distributed import join_workers, leave_workers
-from policy_node.training.learning.normalizer import RunningStatistics
+from policy_node.training.machine.distributed import join_workers, leave_workers
+from policy_node.training.networks.normalizer import RunningStatistics
 from policy_node.policies.actor import Normalizer
 
 workers = join_workers(torch.device('cpu'))

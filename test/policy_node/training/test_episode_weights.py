@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from msgs_spec.tasks import GoalKind, task_spec
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.episode_weights import (
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.episode_weights import (
     episode_energy,
     episode_weights,
     ticks_until_dropped,
 )
-from policy_node.training.learning.experience import Experience
-from policy_node.training.learning.multi_step import StepCounter
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.replay import EpisodeReplay, Episodes
-from policy_node.training.learning.sampling import TransitionSampler
+from policy_node.training.experience.experience import Experience
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.replay.episode_replay import EpisodeReplay, Episodes
+from policy_node.training.replay.multi_step import StepCounter
 
 PEN = task_spec('HandManipulatePenRotate')
 TICKS = 10

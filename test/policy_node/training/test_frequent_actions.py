@@ -9,23 +9,23 @@ import torch
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.collector import Collector
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.ddpg import DDPG
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.exploration import ParameterNoise
-from policy_node.training.learning.frame_skip import (
+from policy_node.training.collection.collector import Collector
+from policy_node.training.collection.exploration import ParameterNoise
+from policy_node.training.collection.frame_skip import (
     HeldSteps,
     Holder,
     length_of,
     plain_actor,
     ticks_of,
 )
-from policy_node.training.learning.initial_networks import network_shape
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.replay import Episodes
-from policy_node.training.learning.sampling import TransitionSampler, make_sampler
-from policy_node.training.learning.transitions import Starts, Transitions
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.sampling import TransitionSampler, make_sampler
+from policy_node.training.learners.ddpg import DDPG
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.replay.transitions import Starts, Transitions
+from policy_node.training.runs.initial_networks import network_shape
 from support.refusals import assert_refused
 
 torch.set_num_threads(1)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from msgs_spec.rotations import quaternion_from_axis_angle
-from policy_node.training.learning.hindsight import (
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.goals.hindsight import (
     draw_sources,
     goal_mixture,
     goals_of,
     parse_mixture,
 )
-from policy_node.training.learning.replay import Episodes
-from policy_node.training.learning.sampling import TransitionSampler
-from policy_node.training.learning.transitions import Starts
+from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.replay.transitions import Starts
 
 COUNT, TICKS = 6, 10
 

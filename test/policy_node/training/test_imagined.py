@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.imagined import ImaginingDDPG
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.trainer import Trainer
-from policy_node.training.learning.transitions import Transitions
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.learners.imagined import ImaginingDDPG
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.replay.transitions import Transitions
+from policy_node.training.runs.trainer import Trainer
 from support.refusals import assert_refused
 
 torch.set_num_threads(1)

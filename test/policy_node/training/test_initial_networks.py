@@ -13,19 +13,19 @@ from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
 from policy_node.policies.loading import load_actor
 from policy_node.policies.shipped import shipped_actors
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.initial_networks import (
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.runs.initial_networks import (
     CRITIC_FIRST,
     network_shape,
     read_initial_networks,
 )
-from policy_node.training.learning.origins import steps_behind
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.run_folder import STATE_FILE
-from policy_node.training.learning.run_log import read_progress
-from policy_node.training.learning.trainer import Trainer
-from policy_node.training.learning.training_state import part_of
+from policy_node.training.runs.origins import steps_behind
+from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.run_log import read_progress
+from policy_node.training.runs.trainer import Trainer
+from policy_node.training.runs.training_state import part_of
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
 

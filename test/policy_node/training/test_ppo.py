@@ -14,24 +14,24 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.rotations import quaternion_from_axis_angle
 from msgs_spec.tasks import task_spec
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning import ppo
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.learners import make_learner
-from policy_node.training.learning.outcomes import Outcomes
-from policy_node.training.learning.ppo import PPO, log_probability
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.replay import Episodes
-from policy_node.training.learning.rollouts import (
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.rollouts import (
     RolloutMaker,
     Rollouts,
     advantages,
     decision_weights,
     goals_in_hindsight,
 )
-from policy_node.training.learning.sampling import TransitionSampler
-from policy_node.training.learning.trainer import Trainer
-from policy_node.training.learning.transitions import Transitions
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.goals.outcomes import Outcomes
+from policy_node.training.learners import ppo
+from policy_node.training.learners.make_learner import make_learner
+from policy_node.training.learners.ppo import PPO, log_probability
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.replay.transitions import Transitions
+from policy_node.training.runs.trainer import Trainer
 from support.refusals import assert_refused
 
 torch.set_num_threads(1)

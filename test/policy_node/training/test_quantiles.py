@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from policy_node.training.learning.quantiles import levels, pooled, quantile_costs
-from policy_node.training.learning.transitions import Transitions
+from policy_node.training.networks.quantiles import levels, pooled, quantile_costs
+from policy_node.training.replay.transitions import Transitions
 from support.learners import make_learner
 
 torch.set_num_threads(1)

@@ -27,9 +27,9 @@ from policy_node.training.benchmark.stored_runs import StoredRuns, locked, own_f
 from policy_node.training.benchmark.studies import PAPER
 from policy_node.training.benchmark.study import Study, research_jobs
 from policy_node.training.benchmark.workers import Outcome, attempt
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.run_folder import STATE_FILE
-from policy_node.training.learning.training_state import Counters, TrainingState, write_state
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.training_state import Counters, TrainingState, write_state
 from support import ROOT
 
 torch.set_num_threads(1)

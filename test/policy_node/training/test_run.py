@@ -24,15 +24,15 @@ from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.benchmark.stored_runs import locked
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.replay import EpisodeReplay, Episodes
-from policy_node.training.learning.replay_file import load_replay, save_replay
-from policy_node.training.learning.run import _stop_on_signals, lock_run
-from policy_node.training.learning.run_log import read_progress
-from policy_node.training.learning.trainer import Trainer
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.replay.episode_replay import EpisodeReplay, Episodes
+from policy_node.training.replay.replay_file import load_replay, save_replay
+from policy_node.training.runs.run import _stop_on_signals, lock_run
+from policy_node.training.runs.run_log import read_progress
+from policy_node.training.runs.trainer import Trainer
 from policy_node.training.train_her import main
 from support.full_disk import files_at_most
 

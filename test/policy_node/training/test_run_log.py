@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from policy_node.training.learning.run_log import COLUMNS, RunLog, draw_curve, read_progress
+from policy_node.training.runs.run_log import COLUMNS, RunLog, draw_curve, read_progress
 
 
 def row(steps: int, success: float | None) -> dict[str, float | None]:

@@ -10,14 +10,14 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.conditions import Horizon, Threshold, fold
-from policy_node.training.learning.ddpg import DDPG
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.multi_step import StepCounter
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.replay import Array, Episodes
-from policy_node.training.learning.sampling import TransitionSampler
-from policy_node.training.learning.transitions import Transitions
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.learners.ddpg import DDPG
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.networks.conditions import Horizon, Threshold, fold
+from policy_node.training.replay.episode_replay import Array, Episodes
+from policy_node.training.replay.multi_step import StepCounter
+from policy_node.training.replay.transitions import Transitions
 from support.refusals import assert_refused
 
 torch.set_num_threads(1)

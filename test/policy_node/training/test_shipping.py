@@ -11,10 +11,10 @@ import torch
 from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.benchmark.jobs import BEST_ARM, Job
 from policy_node.training.benchmark.reporting import ship_all
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.run_log import RunLog
-from policy_node.training.learning.trainer import Trainer
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.runs.run_log import RunLog
+from policy_node.training.runs.trainer import Trainer
 from policy_node.training.ship_actor import main
 
 torch.set_num_threads(1)
@@ -91,7 +91,7 @@ def test_a_folder_that_takes_no_actor_is_refused_before_any_episode(
 ) -> None:
     actors = tmp_path / 'actors'
     actors.touch()
-    monkeypatch.setattr('policy_node.training.evaluation.shipping.evaluate', None)
+    monkeypatch.setattr('policy_node.training.runs.shipping.evaluate', None)
     assert ship(run, actors, 2) == 2
     error = capsys.readouterr().err
     assert 'FetchReach.safetensors cannot be written: ' in error and error.count('\n') == 1

@@ -11,13 +11,13 @@ import torch
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.learning.collector import Collector
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.hindsight import with_subgoals
-from policy_node.training.learning.hindsight_actions import SubgoalSampler
-from policy_node.training.learning.replay import Episodes
-from policy_node.training.learning.sampling import TransitionSampler
-from policy_node.training.learning.subgoals import TESTED, GuidedPolicy, Proposer
+from policy_node.training.collection.collector import Collector
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.experience.hindsight_actions import SubgoalSampler
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.goals.hindsight import with_subgoals
+from policy_node.training.goals.subgoals import TESTED, GuidedPolicy, Proposer
+from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.train_her import main
 from support.refusals import assert_refused
 

@@ -17,21 +17,21 @@ from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
 from policy_node.policies.tensor_file import read_tensors
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
+from policy_node.training.experience.sampling import narrowed, scale_thresholds
 from policy_node.training.generate_episodes import main as generate_episodes
-from policy_node.training.learning.config import TrainConfig
-from policy_node.training.learning.distributed import Workers
-from policy_node.training.learning.graded import GradedReward, parse_grades
-from policy_node.training.learning.logged_episodes import read_experience
-from policy_node.training.learning.recipes import recipe_config
-from policy_node.training.learning.run_log import RunLog, read_progress
-from policy_node.training.learning.sampling import narrowed, scale_thresholds
-from policy_node.training.learning.trainer import (
+from policy_node.training.goals.graded import GradedReward, parse_grades
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.replay.logged_episodes import read_experience
+from policy_node.training.runs.run_log import RunLog, read_progress
+from policy_node.training.runs.trainer import (
     Collected,
     Trainer,
     TrainingError,
 )
-from policy_node.training.learning.training_state import read_state
+from policy_node.training.runs.training_state import read_state
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main
 

@@ -1,0 +1,1 @@
+"""Episodes collected: the simulations, and noise on what the actor does there."""

@@ -1,0 +1,21 @@
+"""The simulations that a configuration trains and is evaluated in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node.training.collection.gamble import GambleSimulation
+from policy_node.training.configuration.config import TrainConfig
+
+
+def make_simulation(config: TrainConfig, num_envs: int, num_threads: int) -> Simulation:
+    """Returns `num_envs` copies of the task as the configuration has it."""
+    options: dict[str, Any] = {
+        'num_envs': num_envs,
+        'num_threads': num_threads,
+        'reward_type': config.reward_type,
+        'success_rule': config.success_rule,
+        'control_hz': config.control_hz,
+    }
+    return (GambleSimulation if config.gamble else Simulation)(config.task, **options)

@@ -1,0 +1,82 @@
+"""Training configurations from text and JSON."""
+
+from __future__ import annotations
+
+import types
+import typing
+from typing import Any
+
+from msgs_spec.hints import did_you_mean
+from policy_node.training.configuration.config import TrainConfig
+
+
+def parse_assignment(text: str) -> tuple[str, Any]:
+    """Parses `name=value` into a field of `TrainConfig` and a value of its type.
+
+    Raises:
+        ValueError: If there is no such field or the value does not fit its type.
+    """
+    name, separator, value = text.partition('=')
+    hints = typing.get_type_hints(TrainConfig)
+    if name not in hints:
+        near = did_you_mean(name, list(hints))
+        raise ValueError(f'{text!r} is not name=value{near}; names: {", ".join(hints)}')
+    if not separator:
+        raise ValueError(f'{text!r} is not name=value: give {name}=...')
+    return name, parse_value(name, value)
+
+
+def parse_value(name: str, text: str) -> Any:
+    """Parses a value of the field `name`.
+
+    Raises:
+        ValueError: If it does not fit the field's type.
+    """
+    kind = typing.get_type_hints(TrainConfig)[name]
+    try:
+        return _parse(text, kind)
+    except ValueError:
+        if isinstance(kind, types.GenericAlias):
+            raise ValueError(f'{name} {text!r} is not whole numbers with commas: N,N,...') from None
+        kind = getattr(kind, '__name__', str(kind))
+        raise ValueError(f'{name} {text!r} is not of type {kind}') from None
+
+
+def _parse(value: str, kind: Any) -> Any:
+    if kind is bool:
+        choices = {'true': True, 'false': False, '1': True, '0': False}
+        if value.lower() not in choices:
+            raise ValueError(value)
+        return choices[value.lower()]
+    if isinstance(kind, types.GenericAlias):
+        return tuple(int(part) for part in value.split(',') if part)
+    if kind is int:
+        return int(value.replace('_', ''))
+    return kind(value)
+
+
+def config_from_dict(values: dict[str, Any]) -> TrainConfig:
+    """Rebuilds a configuration from `dataclasses.asdict` that went through JSON.
+
+    Fields that came later have their default.
+
+    Raises:
+        ValueError: If a field is unknown or a value not allowed.
+    """
+    hints = typing.get_type_hints(TrainConfig)
+    unknown = sorted(values.keys() - hints.keys())
+    if unknown:
+        raise ValueError(f'unknown configuration fields: {", ".join(unknown)}')
+    return TrainConfig(**{name: _typed(name, value, hints[name]) for name, value in values.items()})
+
+
+def _typed(name: str, value: Any, kind: Any) -> Any:
+    """A value from JSON as its field has it."""
+    if isinstance(kind, types.GenericAlias):
+        fits = isinstance(value, list | tuple) and all(type(part) is int for part in value)
+        value = tuple(value) if fits else value
+    else:
+        fits = type(value) is kind or (kind is float and type(value) is int)
+    if not fits:
+        raise ValueError(f'{name} {value!r} is not of type {getattr(kind, "__name__", kind)}')
+    return value

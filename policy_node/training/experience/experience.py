@@ -1,0 +1,135 @@
+"""What a worker has seen, and the batches it learns from."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs_spec.tasks import TaskSpec
+from policy_node.policies.actor import Actor
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.experience.episode_weights import episode_weights, ticks_until_dropped
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.goals.goal_choice import Judge
+from policy_node.training.goals.hindsight import SuccessFunction, goal_mixture, parse_mixture
+from policy_node.training.goals.subgoals import subgoal_columns
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.networks.normalizer import RunningStatistics
+from policy_node.training.replay.episode_replay import EpisodeReplay, Episodes
+from policy_node.training.replay.transitions import Transitions
+
+
+class Experience:
+    """Replay and normaliser statistics of one worker; statistics are shared by all workers.
+
+    Args:
+        config: The configuration; `replay_transitions` and `batch_size` are totals.
+        spec: The task.
+        workers: This worker among all.
+        sampler: Makes transitions.
+        generator: Source of all randomness.
+
+    Attributes:
+        config: The configuration.
+        judge: Who chooses goals and cuts returns, where the configuration asks for it.
+        replay: The episodes held.
+        statistics: Running statistics of observations and goals, by name.
+        generator: Source of relabelling and drawing.
+        batch_size: This worker's part of a batch.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        spec: TaskSpec,
+        workers: Workers,
+        sampler: TransitionSampler,
+        generator: np.random.Generator,
+    ) -> None:
+        self.config = config
+        self._spec = spec
+        self._workers = workers
+        self._sampler = self._first_sampler = sampler
+        self.judge: Judge | None = None
+        self.generator = generator
+        self.batch_size = workers.share(config.batch_size)
+        self.statistics = {
+            'observation_statistics': RunningStatistics(spec.observation_size),
+            'goal_statistics': RunningStatistics(spec.goal.size),
+        }
+        self._count_ticks = ticks_until_dropped(spec, config.ticks_after_drop)
+        self._weigh = episode_weights(
+            config.episode_weights, spec, config.control_hz, config.gamble
+        )
+        capacity = max(workers.share(config.replay_transitions) // spec.episode_ticks, 1)
+        self.replay = EpisodeReplay(
+            max(capacity, workers.share(config.num_envs)),
+            spec.episode_ticks,
+            spec.observation_size,
+            spec.goal.size,
+            spec.robot.action_size
+            + (config.longest_hold > 1)
+            + subgoal_columns(config.subgoal_every, spec.goal.size),
+            self._weigh,
+            self._count_ticks,
+        )
+
+    @property
+    def transitions(self) -> int:
+        """Transitions held."""
+        return len(self.replay) * self._spec.episode_ticks
+
+    def normalize(self, episodes: Episodes, actor: Actor, env_steps: int) -> None:
+        """Adds episodes to the statistics and gives these to the actor; all workers together.
+
+        Goals count as the networks will see them: relabelled.
+        """
+        observation, goal = episodes.observation[:, :-1], episodes.desired_goal
+        if len(episodes):
+            row = np.repeat(np.arange(len(episodes)), episodes.ticks)
+            valid = None if self._count_ticks is None else self._count_ticks(episodes)
+            mixture = self.mixture(env_steps)
+            goal = self._sampler.sample(episodes, row, mixture, self.generator, valid).goal
+        for name, values, normalizer in (
+            ('observation_statistics', observation, actor.observation_normalizer),
+            ('goal_statistics', goal, actor.goal_normalizer),
+        ):
+            self.statistics[name].update(values, self._workers)
+            self.statistics[name].write(normalizer)
+
+    def narrow(self, progress: float) -> None:
+        """Rewards goals as a run does in which they have narrowed this far, 0 ... 1."""
+        self._sampler = self._first_sampler.at(progress)
+
+    def count_met(self, episodes: Episodes, success: SuccessFunction) -> int:
+        """How many episodes end in `success`; lost ones do not."""
+        last, desired = episodes.achieved_goal[:, -1], episodes.desired_goal
+        met = success(last.astype(np.float64), desired.astype(np.float64))
+        if self.config.drop_is_lost and self._count_ticks is not None:
+            met &= self._count_ticks(episodes) == episodes.ticks
+        return int(met.sum())
+
+    def batch(self, env_steps: int) -> Transitions:
+        """Draws the transitions of one update, after `env_steps` environment steps."""
+        return self._draw(self.mixture(env_steps))
+
+    def _draw(self, mixture: dict[str, float]) -> Transitions:
+        """Draws transitions with goals from the sources of a mixture, and rewards of now."""
+        replay, generator = self.replay, self.generator
+        row = self._draw_rows()
+        return self._sampler.sample(
+            replay.episodes, row, mixture, generator, replay.valid_ticks, self.judge
+        )
+
+    def _draw_rows(self) -> NDArray[np.int64]:
+        """Draws the episode of each transition of a batch."""
+        return self.replay.draw(self.batch_size, self.config.moved_share, self.generator)
+
+    def mixture(self, env_steps: int) -> dict[str, float]:
+        """Probability of each goal source after `env_steps` environment steps."""
+        config = self.config
+        if config.goals:
+            return parse_mixture(config.goals)
+        early = env_steps < config.future_only_steps
+        strategy = 'future' if early and config.strategy == 'futureactual' else config.strategy
+        return goal_mixture(strategy, config.hindsight_k)

@@ -1,0 +1,1 @@
+"""What learns: DDPG, on-policy PPO, two levels of it."""

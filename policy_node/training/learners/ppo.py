@@ -1,0 +1,106 @@
+"""Proximal policy optimisation (Schulman et al. 2017, arXiv 1707.06347) for goals.
+
+The policy is the actor with Gaussian noise of `noise_std`, clipped to the range of actions as the
+collector does it. The density of a clipped action is that of the noise beyond the limit (Fujita &
+Maeda 2018, arXiv 1802.07564), so what is learnt from is what was done, but for how far the
+normalisers move with the new episodes; from the fourth cycle on that is next to nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from policy_node.policies.actor import MLP, Actor
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.experience.rollouts import RolloutTransitions
+from policy_node.training.learners.actor_critic import ActorCritic, Losses
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.replay.episode_replay import Array
+from policy_node.training.replay.transitions import Transitions
+
+# How far an update may move the probability of an action (the paper's value).
+CLIP = 0.2
+_ROOT = math.sqrt(2.0 * math.pi)
+
+
+class PPO(ActorCritic):
+    """Actor, value of states, and one update.
+
+    Args:
+        shape: Of both networks.
+        config: The configuration.
+        device: Where they live.
+        workers: With whom gradients are averaged.
+    """
+
+    def __init__(
+        self, shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
+    ) -> None:
+        actor, critic = Actor(shape), MLP(shape.feature_size, 1, shape)
+        torch.nn.init.constant_(critic.output.bias, config.first_value)
+        with torch.no_grad():
+            actor.network.output.weight.mul_(config.first_action_gain)
+        super().__init__(actor, critic, config, device, workers)
+
+    def update(self, batch: Transitions) -> Losses:
+        """Improves values and actor on a batch of rollouts.
+
+        Raises:
+            TypeError: If the batch is of no rollouts.
+        """
+        if not isinstance(batch, RolloutTransitions):
+            raise TypeError(f'PPO learns from RolloutTransitions, not {type(batch).__name__}')
+        features = self.actor.features(self.tensor(batch.observation), self.tensor(batch.goal))
+        weight = self.tensor(batch.weight)
+        value = self.critic(features).squeeze(-1)
+        critic_loss = (weight * (value - self.tensor(batch.value_target)).square()).mean()
+        self.step(self.critic_optimizer, critic_loss, self.critic_parameters)
+        actor_loss = self._actor_loss(batch, features, weight)
+        if self.updates >= self.critic_first:
+            self.step(self.actor_optimizer, actor_loss, self.actor_parameters)
+        self.updates += 1
+        return Losses(critic_loss.detach(), actor_loss.detach(), value.detach().mean())
+
+    def _actor_loss(self, batch: RolloutTransitions, features: Tensor, weight: Tensor) -> Tensor:
+        mean = self.actor(features)
+        logs = log_probability(mean, self.config.noise_std, self.tensor(batch.action))
+        ratio = (logs - self.tensor(batch.log_probability)).exp()
+        advantage = self.tensor(batch.advantage)
+        bounded = ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
+        gain = torch.minimum(ratio * advantage, bounded * advantage)
+        loss: Tensor = -(weight * gain).mean() + self.config.action_l2 * mean.square().mean()
+        return loss
+
+    @torch.no_grad()
+    def values(self, observation: Array, goal: Array) -> Array:
+        """Values (...,) of states (..., observation_size) for goals (..., goal_size)."""
+        features = self.actor.features(self.tensor(observation), self.tensor(goal))
+        value: Array = self.critic(features).squeeze(-1).cpu().numpy()
+        return value
+
+    @torch.no_grad()
+    def log_probabilities(self, observation: Array, goal: Array, action: Array) -> Array:
+        """Logarithms (...,) of the densities of actions (..., action_size)."""
+        mean = self.actor(self.actor.features(self.tensor(observation), self.tensor(goal)))
+        logs = log_probability(mean, self.config.noise_std, self.tensor(action))
+        found: Array = logs.cpu().numpy()
+        return found
+
+
+def log_probability(mean: Tensor, deviation: float, action: Tensor) -> Tensor:
+    """Logarithm (...,) of the density of a noisy action that was clipped to [-1, 1].
+
+    Args:
+        mean: (..., action_size).
+        deviation: Standard deviation of the noise.
+        action: (..., action_size), clipped.
+    """
+    inside = -0.5 * ((action - mean) / deviation).square() - math.log(deviation * _ROOT)
+    below = torch.special.log_ndtr((-1.0 - mean) / deviation)
+    above = torch.special.log_ndtr((mean - 1.0) / deviation)
+    logs = torch.where(action <= -1.0, below, torch.where(action >= 1.0, above, inside))
+    return logs.sum(dim=-1)

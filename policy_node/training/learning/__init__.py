@@ -1,1 +1,0 @@
-"""What learns: DDPG with hindsight experience replay."""

@@ -1,0 +1,1 @@
+"""What a run has: processors, devices, memory, other workers."""

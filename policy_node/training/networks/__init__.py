@@ -1,0 +1,1 @@
+"""Networks of the learners, and the statistics of their inputs."""

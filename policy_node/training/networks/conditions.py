@@ -1,0 +1,157 @@
+"""Value functions with one input more: how close is close enough, or how much time is left.
+
+A transition is then learnt from under a value of that input drawn at random, as it is for a goal
+chosen in hindsight. The actor acts at one value of it for good, so that what is saved is an actor
+like any other: the input is a constant, and its column goes into the bias of the first layer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from policy_node.policies.actor import MLP
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.replay.episode_replay import Array
+
+Goals = NDArray[np.float64]
+# Of the layer that takes the inputs, in actors and critics alike.
+_WEIGHT, _BIAS = 'hidden.0.weight', 'hidden.0.bias'
+# Smallest threshold drawn, as a share of the task's own.
+SMALLEST_THRESHOLD = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """The success threshold, a multiple of the task's own, log-uniform.
+
+    From coarse goals, which are reached often, the value of fine ones can be generalised. Where the
+    widest is narrower than the way that an episode begins with, nothing leads there.
+
+    Attributes:
+        metric: Distances and thresholds of the task.
+        widest: The largest multiple.
+    """
+
+    metric: GoalMetric
+    widest: float
+
+    def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+        """Draws the values (count,) that transitions are learnt from under: multiples of it."""
+        low, high = np.log(SMALLEST_THRESHOLD), np.log(self.widest)
+        return np.asarray(np.exp(generator.uniform(low, high, count)))
+
+    def inputs(self, drawn: NDArray[np.float64]) -> Array:
+        """What the networks see of them, (count, 1): their logarithms."""
+        return np.log(drawn).astype(np.float32)[:, None]
+
+    def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
+        """Reward (count,) of goals under them: 0 within that multiple, else -1."""
+        distance, rotation = self.metric.distances(achieved, desired)
+        spec = self.metric.spec
+        reached = distance < drawn * spec.distance_threshold
+        if spec.rotation_threshold is not None:
+            reached &= rotation < drawn * spec.rotation_threshold
+        return reached.astype(np.float64) - 1.0
+
+    def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Their values one step later, (count,): the same."""
+        return drawn
+
+    def goes_on(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether anything after this step counts, (count,): always."""
+        return np.ones(len(drawn), np.bool_)
+
+
+@dataclass(frozen=True, slots=True)
+class Horizon:
+    """The number of steps left: values are rewards of that many, as in TDM (arXiv 1802.09081).
+
+    Attributes:
+        ticks: Steps of an episode, the most that can be left.
+        compute_reward: (achieved_goal, desired_goal) -> reward, batched.
+    """
+
+    ticks: int
+    compute_reward: Callable[[Goals, Goals], Goals]
+
+    def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+        """Draws from 1 to the length of an episode."""
+        return generator.integers(1, self.ticks + 1, count).astype(np.float64)
+
+    def inputs(self, drawn: NDArray[np.float64]) -> Array:
+        """The share of an episode."""
+        return (drawn / self.ticks).astype(np.float32)[:, None]
+
+    def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
+        """That of the task."""
+        del drawn
+        return self.compute_reward(achieved, desired)
+
+    def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """One less."""
+        return drawn - 1.0
+
+    def goes_on(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether a step is left after this one."""
+        return drawn > 1.0
+
+
+Condition = Threshold | Horizon
+"""What a value is conditioned on, beside state, action and goal."""
+
+# The input at which an actor acts: the threshold of the task itself; a whole episode left.
+ACTING_INPUT = {'threshold': 0.0, 'horizon': 1.0}
+
+
+def make_condition(kind: str, metric: GoalMetric, widest: float) -> Condition | None:
+    """Returns the condition called `kind`; None for `none`."""
+    if kind == 'threshold':
+        return Threshold(metric, widest)
+    if kind == 'horizon':
+        return Horizon(metric.spec.episode_ticks, metric.reward)
+    return None
+
+
+def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
+    """A network without its last input, which is `value` for good.
+
+    Args:
+        network: Its first layer takes `shape.feature_size` + 1 inputs.
+        shape: Of the network to make.
+        value: That input.
+    """
+    folded = MLP(shape.feature_size, shape.action_size, shape)
+    folded.load_state_dict(without_input(network.state_dict(), shape.feature_size, value))
+    return folded
+
+
+def without_input(tensors: dict[str, Tensor], column: int, value: float) -> dict[str, Tensor]:
+    """Networks, by name, without the input at that column, which is `value` for good."""
+    changed = {}
+    for name in first_weights(tensors):
+        weight, bias = tensors[name], name.replace(_WEIGHT, _BIAS)
+        changed[name] = torch.cat([weight[:, :column], weight[:, column + 1 :]], dim=1)
+        changed[bias] = tensors[bias] + value * weight[:, column]
+    return tensors | changed
+
+
+def with_input(tensors: dict[str, Tensor], column: int) -> dict[str, Tensor]:
+    """Networks, by name, with one input more at that column, to which they are blind."""
+    changed = {}
+    for name in first_weights(tensors):
+        weight = tensors[name]
+        blind = weight.new_zeros((len(weight), 1))
+        changed[name] = torch.cat([weight[:, :column], blind, weight[:, column:]], dim=1)
+    return tensors | changed
+
+
+def first_weights(tensors: dict[str, Tensor]) -> list[str]:
+    """Names of the weights of layers that take the inputs."""
+    return [name for name in tensors if name.endswith(_WEIGHT)]

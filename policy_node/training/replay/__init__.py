@@ -1,0 +1,1 @@
+"""Whole episodes, and the transitions that are drawn from them."""

@@ -1,0 +1,71 @@
+"""Logged episodes as experience for the trainer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fetch_hand_sim.episode_log import EpisodeArrays, load_episodes
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec
+from policy_node.training.replay.episode_replay import Episodes
+
+
+def read_experience(
+    directory: Path, task: TaskSpec, control_hz: float = DEFAULT_CONTROL_HZ
+) -> tuple[Episodes, list[str]]:
+    """Loads the episodes of a task that the trainer can learn from.
+
+    Args:
+        directory: Where episodes were logged: by `sim_node`, `generate_episodes` or both.
+        task: The task; episodes of others are left out.
+        control_hz: Action frequency, Hz; episodes at another are left out.
+
+    Returns:
+        The episodes, and one line for each that was left out: damaged, of another task or rate,
+        interrupted, or with a goal that changed on the way.
+
+    Raises:
+        ValueError: If nothing is left.
+    """
+    skipped: list[str] = []
+    loaded = load_episodes(directory, on_skip=lambda error: skipped.append(str(error)))
+    usable = []
+    for episode in loaded:
+        reason = why_unusable(episode, task, control_hz)
+        if reason:
+            skipped.append(f'{episode.path}: {reason}')
+        else:
+            usable.append(episode)
+    if not usable:
+        first = f', first: {skipped[0]}' if skipped else ''
+        raise ValueError(f'{directory} holds no usable episode of {task.name}{first}')
+    return to_experience(usable), skipped
+
+
+def why_unusable(episode: EpisodeArrays, task: TaskSpec, control_hz: float) -> str:
+    """Returns why the trainer cannot take an episode, '' if it can."""
+    if episode.spec.name != task.name:
+        return f'{episode.spec.name}, not {task.name}'
+    if episode.record.control_hz != control_hz:
+        return f'{episode.record.control_hz} Hz, not {control_hz:g} Hz'
+    if not episode.is_complete or len(episode) != task.episode_ticks:
+        return f'{len(episode)} of {task.episode_ticks} steps'
+    if (episode.goals != episode.goals[0]).any():
+        return 'its goal changed on the way'
+    return ''
+
+
+def to_experience(episodes: Sequence[EpisodeArrays]) -> Episodes:
+    """Returns episodes of one task and full length as the arrays of the trainer, float32."""
+
+    def stack(arrays: list[np.ndarray]) -> np.ndarray:
+        return np.stack(arrays).astype(np.float32)
+
+    return Episodes(
+        observation=stack([episode.observations['observation'] for episode in episodes]),
+        achieved_goal=stack([episode.observations['achieved_goal'] for episode in episodes]),
+        desired_goal=stack([episode.goals[0] for episode in episodes]),
+        action=stack([episode.actions for episode in episodes]),
+    )

@@ -1,0 +1,134 @@
+"""What a critic promises, and what its actor then gets, in fresh episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node.training.collection.simulations import make_simulation
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config_rules import DEFAULTS
+from policy_node.training.configuration.config_values import config_from_dict
+from policy_node.training.evaluation.episodes import FIRST_SEED
+from policy_node.training.experience.sampling import make_sampler
+from policy_node.training.goals.hindsight import RewardFunction
+from policy_node.training.learners.actor_critic import ActorCritic
+from policy_node.training.learners.make_learner import make_learner
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.training_state import load_state, read_state
+
+# After the last tick things go on as in the mean of so many before it.
+_LAST_TICKS = 20
+# Shares of an episode at which values are compared with returns.
+_SHARES = (0.0, 0.25, 0.5)
+# Fields by which a critic says something else than what an action is worth; quantiles have a mean.
+_OTHER_VALUES = ('algorithm', 'longest_hold', 'advantage', 'subgoal_every', 'condition')
+
+
+@dataclass(frozen=True, slots=True)
+class Promise:
+    """Values and returns of some episodes from one tick on.
+
+    Attributes:
+        tick: That tick.
+        value: What the critic says of the actor's action, mean over the episodes.
+        gain: Discounted rewards of training that followed, likewise.
+        correlation: Of both, over the episodes; NaN where one does not vary.
+    """
+
+    tick: int
+    value: float
+    gain: float
+    correlation: float
+
+
+def measure(run: Path, episodes: int) -> list[Promise]:
+    """Compares values with returns in fresh episodes of the actor that collects.
+
+    Args:
+        run: Folder of a run.
+        episodes: How many.
+
+    Raises:
+        ValueError: If there is no such run, or its values are not of states, goals and actions.
+    """
+    config, progress = _read_config(run / STATE_FILE)
+    simulation = make_simulation(config, episodes, 0)
+    sampler = make_sampler(config, simulation.metric)
+    learner, experience = make_learner(
+        config,
+        simulation.spec,
+        torch.device('cpu'),
+        Workers(),
+        sampler,
+        np.random.default_rng(0),
+    )
+    load_state(run / STATE_FILE, learner, experience.statistics)
+    values, rewards = _play(simulation, learner, sampler.at(progress).compute_reward)
+    returns = discounted(rewards * sampler.reward_scale, config.tick_gamma)
+    ticks = [int(share * len(values)) for share in _SHARES]
+    return [_promise(tick, values[tick], returns[tick]) for tick in ticks]
+
+
+def _read_config(file: Path) -> tuple[TrainConfig, float]:
+    """The configuration of a run, and how far its goals have narrowed."""
+    state = read_state(file)
+    config = config_from_dict(state.extra['config'])
+    found = {name: getattr(config, name) for name in _OTHER_VALUES}
+    odd = [f'{name} {value}' for name, value in found.items() if value != DEFAULTS[name]]
+    if odd:
+        raise ValueError(f'{file.parent} has other values than of actions: {", ".join(odd)}')
+    # Nothing is learnt from here.
+    config = replace(config, replay_transitions=1, learning_starts=0, device='cpu')
+    return config, state.counters.narrowing_steps / config.total_steps
+
+
+def _play(
+    simulation: Simulation, learner: ActorCritic, compute_reward: RewardFunction
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Values and rewards (ticks, episodes) of one episode of each simulation."""
+    count = simulation.num_envs
+    observation = simulation.reset(seed=[FIRST_SEED + index for index in range(count)])
+    values, rewards = [], []
+    for _ in range(simulation.spec.episode_ticks):
+        value, action = _judge(learner, observation['observation'], observation['desired_goal'])
+        observation = simulation.step(action).observation
+        goals = observation['achieved_goal'], observation['desired_goal']
+        values.append(value)
+        rewards.append(compute_reward(*goals))
+    return np.array(values), np.array(rewards)
+
+
+@torch.no_grad()
+def _judge(
+    learner: ActorCritic, observation: NDArray[np.float64], goal: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What the actor does (episodes, action size), and what it is worth (episodes,)."""
+    seen, wanted = (learner.tensor(values).float() for values in (observation, goal))
+    features = learner.actor.features(seen, wanted)
+    action = learner.actor(features)
+    value = learner.critic(features, action)
+    if value.ndim > 1:
+        value = value.mean(dim=0)
+    return value.double().numpy(), action.double().numpy()
+
+
+def discounted(rewards: NDArray[np.float64], gamma: float) -> NDArray[np.float64]:
+    """Returns (ticks, episodes) of rewards that go on for ever as they were in the last ticks."""
+    following = rewards[-_LAST_TICKS:].mean(axis=0) / (1.0 - gamma)
+    returns = np.empty_like(rewards)
+    for tick in reversed(range(len(rewards))):
+        returns[tick] = following = rewards[tick] + gamma * following
+    return returns
+
+
+def _promise(tick: int, value: NDArray[np.float64], gain: NDArray[np.float64]) -> Promise:
+    varies = value.std() > 0.0 and gain.std() > 0.0
+    correlation = float(np.corrcoef(value, gain)[0, 1]) if varies else float('nan')
+    return Promise(tick, float(value.mean()), float(gain.mean()), correlation)

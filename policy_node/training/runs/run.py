@@ -1,0 +1,222 @@
+"""One run from its first step to its last: what it needs, its folder, signals, log and curve."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from fetch_hand_sim.episodes.context import source_revision
+from msgs_spec.command_line import (
+    CommandError,
+    UsageError,
+    complain,
+    discard_unread_output,
+    require_extra,
+)
+from policy_node.policies.files import one_line
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.machine.devices import choose_device
+from policy_node.training.machine.distributed import is_first_worker, join_workers, leave_workers
+from policy_node.training.machine.memory import available_memory, why_too_large
+from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.runs.initial_networks import (
+    InitialNetworks,
+    read_initial_networks,
+)
+from policy_node.training.runs.run_folder import COMMAND_FILE, LOCK_FILE, STATE_FILE
+from policy_node.training.runs.run_log import RunLog, draw_curve, read_progress
+from policy_node.training.runs.saving import NAME
+from policy_node.training.runs.trainer import Trainer, TrainingError
+from policy_node.training.runs.training_state import Counters
+
+
+class RunTakenError(CommandError):
+    """Another process works on the run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How a run, or this part of it, ended.
+
+    Attributes:
+        reason: Why, for people.
+        counters: How far it is.
+        signal: Number of the signal that stopped it; 0 if it ended by itself.
+    """
+
+    reason: str
+    counters: Counters
+    signal: int = 0
+
+
+def train_run(
+    config: TrainConfig,
+    output: Path,
+    *,
+    resume: bool = False,
+    command: str = '',
+    experience: Episodes | None = None,
+) -> Ending:
+    """Trains as configured, in this process, until a limit or a signal ends it.
+
+    Args:
+        config: What to train and how.
+        output: Folder of the run.
+        resume: Continue the run in the folder; else it must hold none.
+        command: Command line, for the record.
+        experience: Episodes to learn from as well.
+
+    Raises:
+        UsageError: If something that the run needs is missing or does not fit; nothing is written.
+        RunTakenError: If another process works on the folder.
+        CommandError: If training failed; the last checkpoint is kept.
+    """
+    require_extra('train')
+    networks = _initial_networks(config) if config.init_from and not resume else None
+    with lock_run(output) if is_first_worker() else contextlib.nullcontext():
+        if not resume and (output / STATE_FILE).exists():
+            raise UsageError(f'{output} holds a run; continue it with --resume or choose another')
+        try:
+            workers = join_workers(choose_device(config.device))
+            trainer = Trainer(config, output, workers, command, source_revision(), networks)
+            if resume:
+                trainer.resume(output / STATE_FILE)
+            if experience is not None:
+                trainer.add_experience(experience)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        except (MemoryError, RuntimeError) as error:
+            raise _without_memory(error) from None
+        if why := _too_large(trainer):
+            complain(NAME, why)
+        try:
+            ending = _train(trainer, output, command)
+        except (TrainingError, OSError) as error:
+            raise CommandError(f'{error}; {_kept(output)}') from None
+        finally:
+            leave_workers(workers)
+        if workers.is_first:
+            title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
+            try:
+                draw_curve(read_progress(output / 'progress.csv'), title, output / 'curve.png')
+            except OSError as error:
+                complain(NAME, f'no curve, the run itself is saved: {error}')
+        return ending
+
+
+def _kept(output: Path) -> str:
+    """What is left of a run that failed."""
+    if (output / STATE_FILE).is_file():
+        return f'the last checkpoint is kept in {output}'
+    return f'{output} has no checkpoint to go on from'
+
+
+def _without_memory(error: MemoryError | RuntimeError) -> Exception:
+    """What to raise where a run is larger than the machine; torch has no class for that."""
+    if isinstance(error, RuntimeError) and 'allocate' not in str(error):
+        return error
+    fields = 'replay_transitions, num_envs and hidden_sizes decide how much is needed'
+    return UsageError(f'not enough memory; {fields}: {one_line(error)}')
+
+
+def _too_large(trainer: Trainer) -> str:
+    """Warns of a replay that this worker's memory will not hold, which ends a run hours later."""
+    replay = trainer.experience.replay
+    left = max(trainer.config.total_steps - trainer.counters.env_steps, 0)
+    episodes = len(replay) + trainer.workers.share(left) // replay.ticks
+    needed = replay.bytes_of(episodes) - replay.bytes_of(len(replay))
+    return why_too_large(needed, available_memory())
+
+
+def _train(trainer: Trainer, output: Path, command: str) -> Ending:
+    config, counters, log = trainer.config, trainer.counters, None
+    if trainer.workers.is_first:
+        with (output / COMMAND_FILE).open('a') as file:
+            file.write(command + '\n')
+        log = RunLog(output, config.total_steps, config.time_limit, counters.env_steps)
+    try:
+        with _stop_on_signals(trainer) as received:
+            reason = trainer.train(log)
+    finally:
+        if log is not None:
+            log.close()
+    return Ending(reason, trainer.counters, received[0] if received else 0)
+
+
+@contextlib.contextmanager
+def lock_run(folder: Path) -> Iterator[None]:
+    """Makes the folder of a run and keeps other processes out of it.
+
+    The lock ends with the process, however that ends. Some file systems of clusters have none; a
+    line says so.
+
+    Raises:
+        UsageError: If the folder cannot be made or written to.
+        RunTakenError: If another process works on it.
+    """
+    try:
+        str(folder).encode()
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / LOCK_FILE).open('w')
+    except OSError as error:
+        raise UsageError(f'{folder} cannot hold a run: {error.strerror}') from None
+    except UnicodeEncodeError:
+        why = 'TensorBoard takes names in UTF-8 alone'
+        raise UsageError(f'{folder} cannot hold a run: {why}') from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunTakenError(f'{folder} is being trained by another process') from None
+        except OSError as error:
+            why = f'no locks where it lies ({error.strerror})'
+            complain(NAME, f'{folder} cannot be kept from other processes: {why}')
+        yield
+
+
+def _initial_networks(config: TrainConfig) -> InitialNetworks:
+    """Reads the networks to start from."""
+    try:
+        networks = read_initial_networks(config.init_from).fitted(config)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    if not networks.has_critic:
+        complain(NAME, f'{config.init_from} has no critic beside it: a new one learns first')
+    return networks
+
+
+@contextlib.contextmanager
+def _stop_on_signals(trainer: Trainer) -> Iterator[list[int]]:
+    """Ctrl-C, SIGTERM and SIGHUP end the run after the cycle; a second one ends it at once.
+
+    But not a second SIGHUP: a closed terminal sends one, and the shell in it another; so after the
+    first they are ignored. Where they are from the start, as `nohup` has it, that stays so.
+
+    Yields:
+        A list that will hold the number of the signal.
+    """
+    received: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        del frame
+        received.append(number)
+        trainer.stop(f'stopped by {signal.Signals(number).name}')
+        signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
+        discard_unread_output()
+        complain(NAME, 'stopping after this cycle; once more stops at once')
+
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        numbers.remove(signal.SIGHUP)
+    before = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            if number != signal.SIGHUP or number not in received:
+                signal.signal(number, handler)

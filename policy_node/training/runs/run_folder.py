@@ -1,0 +1,92 @@
+"""The files of a run and what goes into them."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from msgs_spec.tasks import task_spec
+from policy_node.policies import checkpoint
+from policy_node.policies.actor import Actor
+from policy_node.policies.checkpoint import ActorInfo
+from policy_node.training.collection.frame_skip import plain_actor
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.learners.actor_critic import ActorCritic
+from policy_node.training.networks.normalizer import RunningStatistics
+from policy_node.training.runs.training_state import Counters, save_state
+
+STATE_FILE = 'training_state.safetensors'
+LATEST_FILE = 'latest.safetensors'
+BEST_FILE = 'best.safetensors'
+REPLAY_FILE = 'replay.safetensors'
+LOCK_FILE = '.lock'
+COMMAND_FILE = 'command.txt'
+
+
+def companion_file(actor: Path) -> Path:
+    """Where the critic of an actor lies, so that training can go on from it."""
+    return actor.with_suffix('.training.safetensors')
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """Where a run writes its actors and the state that `--resume` goes on from.
+
+    Attributes:
+        path: The folder.
+        config: Configuration of the run.
+        command: Command line, for the metadata of actors.
+        source_revision: Revision of the source, likewise.
+        init_from: Origin of the networks the run started from; empty if they were random.
+    """
+
+    path: Path
+    config: TrainConfig
+    command: str = ''
+    source_revision: str = ''
+    init_from: dict[str, Any] = field(default_factory=dict)
+
+    def save_actor(
+        self, name: str, actor: Actor, env_steps: int, success: dict[str, Any] | None = None
+    ) -> None:
+        """Writes an actor with everything that is needed to run it and to know it by.
+
+        Args:
+            name: `LATEST_FILE` or `BEST_FILE`.
+            actor: The actor.
+            env_steps: Environment steps behind it.
+            success: Measured success, if any.
+        """
+        config, spec = self.config, task_spec(self.config.task)
+        info = ActorInfo(
+            task=config.task,
+            observation_layout=checkpoint.observation_layout(spec),
+            goal_size=spec.goal.size,
+            action_size=spec.robot.action_size,
+            hidden_sizes=config.hidden_sizes,
+            layer_norm=config.layer_norm,
+            control_hz=config.control_hz,
+            seed=config.seed,
+            command=self.command,
+            source_revision=self.source_revision,
+            env_steps=env_steps,
+            config=dataclasses.asdict(config),
+            success=success or {},
+            goal_features=config.goal_features,
+            init_from=self.init_from,
+        )
+        checkpoint.save(self.path / name, plain_actor(actor, config), info)
+
+    def replay_file(self, rank: int) -> Path:
+        """Where a worker keeps its newest episodes."""
+        return self.path / (REPLAY_FILE if rank == 0 else f'{rank}.{REPLAY_FILE}')
+
+    def save_state(
+        self, learner: ActorCritic, statistics: dict[str, RunningStatistics], counters: Counters
+    ) -> None:
+        """Writes everything that a resumed run needs but the replay."""
+        config = dataclasses.asdict(self.config)
+        extra = {'config': config, 'command': self.command, 'init_from': self.init_from}
+        save_state(self.path / STATE_FILE, learner, statistics, counters, extra)

@@ -1,0 +1,177 @@
+"""Puts an actor of a run into the package: evaluation, critic and curve beside it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fetch_hand_sim.simulation import Simulation
+from policy_node.policies import checkpoint
+from policy_node.policies.files import write_file
+from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, summarize
+from policy_node.training.evaluation.table import print_table
+from policy_node.training.policy_options import require_writable
+from policy_node.training.runs.run_folder import (
+    BEST_FILE,
+    COMMAND_FILE,
+    STATE_FILE,
+    companion_file,
+)
+from policy_node.training.runs.run_log import draw_curve, read_progress
+from policy_node.training.runs.state_checks import is_finite
+from policy_node.training.runs.training_state import TrainingState, read_state, write_state
+
+# What decides which of two actors is better, the first first.
+_BETTER = ('success_gymnasium', 'mean_return')
+
+
+def ship(
+    run: Path,
+    actors: Path,
+    *,
+    episodes: int,
+    num_envs: int = 100,
+    threads: int = 0,
+    name: str = BEST_FILE,
+) -> bool:
+    """Evaluates and, if it is better than the shipped actor, copies what belongs to an actor.
+
+    An actor that is the shipped one, evaluated on as many episodes, is left as it is.
+
+    Args:
+        run: Folder of the run.
+        actors: Where actors go.
+        episodes: Fresh episodes.
+        num_envs: Simulations in the batch.
+        threads: Simulation threads; 0 is all cores.
+        name: File of the actor in the run.
+
+    Returns:
+        Whether the actor of the run is the shipped one now.
+
+    Raises:
+        ValueError: If there is no such actor, no log beside it, a file of either folder is damaged,
+            the shipped actor acts at another rate, or it was evaluated on more episodes: a few may
+            all succeed by chance.
+        UsageError: If the folder takes no file.
+    """
+    actor, info = checkpoint.load(run / name)
+    progress, has_state = _progress_of(run), (run / STATE_FILE).is_file()
+    state = read_state(run / STATE_FILE) if has_state else None
+    shipped, digest = actors / f'{info.task}.json', checkpoint.checkpoint_hash(run / name)
+    target = actors / f'{info.task}.safetensors'
+    _require_rate(target, info.control_hz)
+    old = _evaluation_in(shipped)
+    if (old.get('run_sha256'), old.get('episodes')) == (digest, episodes):
+        print(f'ship_actor: the actor in {actors} is this one; nothing changed')
+        return True
+    if old and old['episodes'] > episodes:
+        raise ValueError(
+            f'the actor in {actors} was evaluated on {old["episodes"]} episodes, this one would be '
+            f'on {episodes}: give --episodes {old["episodes"]} or more'
+        )
+    require_writable(target)
+    simulation = Simulation(
+        info.task,
+        num_envs=min(num_envs, episodes),
+        num_threads=threads,
+        control_hz=info.control_hz,
+    )
+    summary = summarize(evaluate(simulation, actor, episodes, FIRST_SEED))
+    print_table({'policy': str(run), 'task': info.task, **summary})
+    if old and not is_better(summary, old):
+        print(f'ship_actor: the actor in {actors} is at least as good; nothing changed')
+        return False
+    recipe = info.config.get('recipe', 'an unknown')
+    title = f'{info.task}, {recipe} recipe, seed {info.seed}'
+    command = commands_of(run) or info.command
+    checkpoint.save(target, actor, replace(info, success=summary, command=command))
+    report = {
+        'actor': info.task,
+        'sha256': checkpoint.checkpoint_hash(target),
+        'run_sha256': digest,
+        'env_steps': info.env_steps,
+        'command': command,
+        'init_from': info.init_from,
+        'source_revision': info.source_revision,
+        **summary,
+    }
+    if state is not None:
+        ship_critic(state, target)
+    curve = target.with_suffix('.png')
+    # A mean of networks, taken as it is, has no curve of its own: that of a part stays.
+    if progress[-1].get('updates') or not curve.is_file():
+        draw_curve(progress, title, curve)
+    write_file(shipped, (json.dumps(report, indent=2) + '\n').encode())
+    print(f'ship_actor: {target} is the actor of {run} now')
+    return True
+
+
+def _require_rate(target: Path, control_hz: float) -> None:
+    """Refuses to replace an actor by one for other robots, whatever its success there.
+
+    Raises:
+        ValueError: If the one that is there acts at another rate, or is damaged.
+    """
+    if not target.is_file():
+        return
+    there = checkpoint.read_info(target).control_hz
+    if there != control_hz:
+        raise ValueError(
+            f'{target} acts at {there:g} Hz, this one at {control_hz:g} Hz: name another folder '
+            'with --actors'
+        )
+
+
+def _evaluation_in(file: Path) -> dict[str, Any]:
+    """What lies beside a shipped actor; empty where none is shipped.
+
+    Raises:
+        ValueError: If it is no evaluation.
+    """
+    if not file.is_file():
+        return {}
+    try:
+        found = json.loads(file.read_text())
+        for key in (*_BETTER, 'episodes'):
+            if not is_finite(found[key]):
+                raise ValueError(f'{key} {found[key]!r} is no number')
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f'{file} is no evaluation of an actor: {error!r}') from None
+    return dict(found)
+
+
+def _progress_of(run: Path) -> list[dict[str, float]]:
+    """The log of a run, asked for before anything is evaluated or replaced."""
+    file = run / 'progress.csv'
+    try:
+        progress = read_progress(file)
+    except OSError as error:
+        raise ValueError(f'{file} cannot be read: {error.strerror}') from None
+    if not progress:
+        raise ValueError(f'{file} has no row')
+    return progress
+
+
+def ship_critic(state: TrainingState, actor: Path) -> None:
+    """Puts the critic of a run beside its shipped actor, so that training can go on from there.
+
+    The actor holds its normalisers itself; optimisers start fresh.
+    """
+    tensors = {name: value for name, value in state.tensors.items() if name.startswith('critic.')}
+    extra = {'config': state.extra['config'], 'actor_sha256': checkpoint.checkpoint_hash(actor)}
+    write_state(companion_file(actor), TrainingState(tensors, state.counters, extra))
+
+
+def commands_of(run: Path) -> str:
+    """Every command of a run in order, the first and those that resumed it; '' if unknown."""
+    path = run / COMMAND_FILE
+    # The same command again goes on where it stopped: once is enough to say it.
+    return ' && '.join(dict.fromkeys(path.read_text().splitlines())) if path.is_file() else ''
+
+
+def is_better(new: dict[str, Any], old: dict[str, Any]) -> bool:
+    """Whether an evaluation is better: by last-step success, then by return."""
+    return [new[key] for key in _BETTER] > [old[key] for key in _BETTER]

@@ -1,0 +1,405 @@
+"""The training loop: collect, learn, evaluate, keep the best."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from msgs_spec.command_line import complain
+from policy_node.policies.actor import Actor
+from policy_node.training.collection.collector import Collector
+from policy_node.training.collection.simulations import make_simulation
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.evaluation.episodes import EpisodeOutcomes
+from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator, success_rate
+from policy_node.training.experience.sampling import make_sampler, narrowed
+from policy_node.training.learners.actor_critic import Losses
+from policy_node.training.learners.make_learner import make_learner
+from policy_node.training.machine.devices import choose_device
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine.threads import split_threads
+from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.replay.replay_file import load_replay
+from policy_node.training.runs.initial_networks import CRITIC_FIRST, InitialNetworks
+from policy_node.training.runs.progress_row import progress_row
+from policy_node.training.runs.run_folder import RunFolder
+from policy_node.training.runs.run_log import RunLog
+from policy_node.training.runs.saving import NAME, Saver
+from policy_node.training.runs.training_state import Counters, load_networks, load_state
+
+# Steps that a resumed run without these episodes collects before it goes on.
+MOST_REFILLED = 100_000
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on; the message names the step and the cause."""
+
+
+@dataclass(frozen=True, slots=True)
+class Collected:
+    """What one cycle of collection, and the evaluation when one was due, gave."""
+
+    episodes: Episodes
+    train_success: float
+    evaluation: EpisodeOutcomes | None = None
+    evaluated: Actor | None = None
+    guided: EpisodeOutcomes | None = None
+
+
+class Trainer:
+    """One run of one configuration, on one of several workers.
+
+    Args:
+        config: What to train and how.
+        output: Folder for checkpoints and logs.
+        workers: This worker among all.
+        command: Command line, for the metadata of checkpoints.
+        source_revision: Revision of the source, likewise.
+        init_from: Networks to start from; None starts from random ones.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        output: Path,
+        workers: Workers,
+        command: str = '',
+        source_revision: str = '',
+        init_from: InitialNetworks | None = None,
+    ) -> None:
+        self.config = config
+        self.workers = workers
+        origin = {} if init_from is None else init_from.origin
+        folder = RunFolder(output, config, command, source_revision, origin)
+        self._saver = Saver(folder, workers)
+        self.device = choose_device(config.device)
+        self._simulation_threads, torch_threads = split_threads(config)
+        torch.set_num_threads(torch_threads)
+        torch.manual_seed(config.seed)
+        self._build_simulations()
+        self._build_learner()
+        if init_from is not None:
+            tensors = init_from.completed(self.learner)
+            load_networks(tensors, self.learner, self.experience.statistics)
+            self._let_critic_learn_first()
+        self.counters = Counters()
+        self._stop_reason = ''
+        self._refill = 0
+
+    def _build_simulations(self) -> None:
+        config, share = self.config, self.workers.share
+        threads, num_envs = self._simulation_threads, share(config.num_envs)
+        self.simulation = make_simulation(config, num_envs, threads)
+        count = min(num_envs, config.evaluation_episodes)
+        self._evaluator = Evaluator(make_simulation(config, count, threads), config)
+        self.spec = self.simulation.spec
+
+    def _seed(self, env_steps: int) -> np.random.Generator:
+        """Seeds resets and exploration from `env_steps` on; returns the generator of batches."""
+        config = self.config
+        seeds = np.random.SeedSequence([config.seed, self.workers.rank, env_steps])
+        collector_seeds, sampler_seed = seeds.spawn(2)
+        # Below the seeds of evaluation, whose episodes must stay unseen.
+        resets = collector_seeds.generate_state(self.simulation.num_envs) >> 2
+        starts = [int(seed) % EVALUATION_SEED for seed in resets]
+        self.collector = Collector(self.simulation, starts, config)
+        return np.random.default_rng(sampler_seed)
+
+    def _build_learner(self) -> None:
+        config, spec = self.config, self.spec
+        sampler = make_sampler(config, self.simulation.metric)
+        generator = self._seed(env_steps=0)
+        self.learner, self.experience = make_learner(
+            config, spec, self.device, self.workers, sampler, generator
+        )
+
+    def stop(self, reason: str) -> None:
+        """Asks the run to end after the current cycle, with a checkpoint."""
+        self._stop_reason = reason
+
+    def resume(self, path: Path) -> None:
+        """Continues from a training state and the episodes beside it.
+
+        Where these are missing, as many are collected before learning goes on; they do not count as
+        steps of the run.
+
+        Raises:
+            ValueError: If the file does not fit the configuration.
+        """
+        state = load_state(path, self.learner, self.experience.statistics)
+        self.counters = state.counters
+        self.experience.narrow(self._narrowing)
+        origin = state.extra.get('init_from', {})
+        self._saver.folder = replace(self._saver.folder, init_from=origin)
+        self._let_critic_learn_first()
+        measured_otherwise = self._saver.keep_no_worse(self.counters)
+        if measured_otherwise is not None and self.workers.is_first:
+            actor, info = measured_otherwise
+            outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
+            self._saver.keep_best(outcomes, actor, self.counters, info.env_steps)
+        # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
+        self.experience.generator = self._seed(self.counters.env_steps)
+        limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
+        held = self.experience.replay.capacity * self.spec.episode_ticks
+        self._refill = min(self.workers.share(min(limits)), held)
+        file = self._saver.folder.replay_file(self.workers.rank)
+        try:
+            load_replay(file, self.experience.replay)
+        except ValueError as error:
+            if file.exists():
+                complain(NAME, error)
+            complain(NAME, f'{self._refill:,} steps fill the replay before learning goes on')
+
+    def _let_critic_learn_first(self) -> None:
+        """Holds an actor back that began without all its critics."""
+        origin, critics = self._saver.folder.init_from, self.config.critics
+        known = origin.get('critics', critics if origin.get('critic', True) else 0)
+        if known < critics and self.config.critic_first == 0:
+            self.learner.critic_first = CRITIC_FIRST
+
+    def add_experience(self, episodes: Episodes) -> None:
+        """Puts episodes from elsewhere into the replay; each worker takes its share.
+
+        They do not count as environment steps. Normalisers learn from them too, unless the run was
+        resumed and so may have seen them.
+
+        Raises:
+            ValueError: If they do not fit into the replay.
+        """
+        rows = np.arange(len(episodes)) % self.workers.world_size == self.workers.rank
+        share = episodes.select(rows)
+        self.experience.replay.add(share)
+        if self.counters.env_steps == 0:
+            self.experience.normalize(share, self.learner.actor, env_steps=0)
+
+    def train(self, log: RunLog | None = None) -> str:
+        """Runs until a limit is reached or `stop` is called; returns why it ended.
+
+        Raises:
+            TrainingError: If a loss or an observation is not finite; the checkpoints written before
+                are left as they are.
+        """
+        if self.counters.env_steps >= self.config.total_steps:
+            return f'{self.config.total_steps:,} environment steps were done before'
+        clock = _Clock(self.counters)
+        # The number of tensor threads belongs to a thread: without its own, the collector's small
+        # products would start one per core, which then spin against the simulation and the learner.
+        with ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,)) as executor:
+            submit = executor.submit if self.config.overlap else _run_now
+            collected = self._collect_first(submit)
+            if collected is None:
+                self.save()
+                return self._stop_reason or 'another worker stopped'
+            while True:
+                before = time.monotonic()
+                self._absorb(collected)
+                job = None
+                if self.config.overlap:
+                    # At the end the actor after this cycle is evaluated, not the one before it.
+                    job = submit(self._collect, *self._request(may_evaluate=not self._limit()))
+                losses = self._learn()
+                if job is None:
+                    job = submit(self._collect, *self._request())
+                collected = self._collect_or_explain(job)
+                clock.write(self.counters)
+                self._check(losses)
+                knows = self.counters.updates > 0 or bool(self.config.init_from)
+                if collected.evaluation is None and knows and self._limit():
+                    # Noise and learning rate have fallen, and nothing else would measure it.
+                    last = self._actor_to_evaluate()
+                    collected = submit(self._evaluate, collected, last).result()
+                self._keep_best(collected)
+                if log is not None:
+                    log.write(self._row(collected, losses, time.monotonic() - before))
+                reason = self._reason_to_stop()
+                if reason:
+                    self.save()
+                    return reason
+                self._saver.save_when_due(self.learner, self.experience, self.counters)
+
+    def _collect_first(self, submit: Callable[..., Future[Collected]]) -> Collected | None:
+        """Fills the replay of a resumed run that has lost it, then collects the first cycle.
+
+        None where the run is stopped before: it has nothing to learn from yet.
+        """
+        while True:
+            actor, random, _ = self._request(may_evaluate=False)
+            collected = self._collect_or_explain(submit(self._collect, actor, random, None))
+            filled = self.experience.transitions >= self._refill
+            if not self.workers.any(not filled):
+                return collected
+            self.experience.replay.add(collected.episodes)
+            if self.workers.any(bool(self._stop_reason)):
+                return None
+
+    def _request(self, may_evaluate: bool = True) -> tuple[Actor, bool, Actor | None]:
+        """What to collect next: with which actor, whether at random, and which to evaluate."""
+        counters, steps = self.counters, self.counters.env_steps
+        self.collector.exploration = self._exploration()
+        self.collector.proposer = self.learner.proposer()
+        actor, evaluated = self.learner.acting_actor(), None
+        if may_evaluate and counters.updates > 0 and steps >= counters.next_evaluation:
+            counters.next_evaluation = steps + self.config.evaluate_every
+            evaluated = self._actor_to_evaluate()
+        return actor, steps < self.config.random_steps, evaluated
+
+    def _actor_to_evaluate(self) -> Actor | None:
+        """The actor as it is evaluated now; None where another worker does it."""
+        if not self.workers.is_first:
+            return None
+        self._evaluator.proposer = self.learner.proposer(averaged=True)
+        return self.learner.evaluation_actor()
+
+    def _collect(self, actor: Actor, random: bool, evaluated: Actor | None) -> Collected:
+        return self._evaluate(Collected(*self.collector.collect(actor, random)), evaluated)
+
+    def _evaluate(self, collected: Collected, actor: Actor | None) -> Collected:
+        if actor is None:
+            return collected
+        outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
+        guided = self._evaluator.evaluate_guided(actor)
+        return replace(collected, evaluation=outcomes, evaluated=actor, guided=guided)
+
+    def _exploration(self) -> float:
+        """Share of noise and random actions for a run as far as this one."""
+        left = 3.0 * (1.0 - self.counters.env_steps / self.config.total_steps)
+        final = self.config.final_exploration
+        return final + (1.0 - final) * min(max(left, 0.0), 1.0)
+
+    def _collect_or_explain(self, job: Future[Collected]) -> Collected:
+        collected = job.result()
+        for name in ('observation', 'achieved_goal', 'desired_goal', 'action'):
+            if not np.isfinite(getattr(collected.episodes, name)).all():
+                raise TrainingError(
+                    f'{name} is not finite after {self.counters.env_steps} environment steps'
+                )
+        return collected
+
+    def _absorb(self, collected: Collected) -> None:
+        """Puts new episodes into the replay and into the normalisers."""
+        episodes = collected.episodes
+        if len(episodes):
+            self.experience.replay.add(episodes)
+        count = self.workers.sum(torch.tensor([len(episodes)])).item()
+        self.counters.episodes += int(count)
+        self.counters.env_steps += int(count) * self.spec.episode_ticks
+        self.experience.normalize(episodes, self.learner.actor, self.counters.env_steps)
+        if self.config.narrows:
+            self._narrow(episodes, int(count))
+
+    @property
+    def _narrowing(self) -> float:
+        """How far goals have narrowed, 0 ... 1."""
+        return self.counters.narrowing_steps / self.config.total_steps
+
+    def _narrow(self, episodes: Episodes, count: int) -> None:
+        """Narrows goals by one cycle of `count` episodes, unless too few of these met theirs."""
+        counters, config = self.counters, self.config
+        if config.narrow_above == 0.0:
+            counters.narrowing_steps = counters.env_steps
+        elif counters.updates > 0:
+            metric = narrowed(self.simulation.metric, config, self._narrowing)
+            found = self.experience.count_met(episodes, metric.success)
+            met = self.workers.sum(torch.tensor([found])).item()
+            if met >= config.narrow_above * count:
+                counters.narrowing_steps += count * self.spec.episode_ticks
+        self.experience.narrow(self._narrowing)
+
+    def _learn(self) -> list[Losses]:
+        first = self.workers.share(self.config.learning_starts) if self.counters.updates == 0 else 0
+        # The replay holds whole episodes.
+        first = min(first, self.experience.replay.capacity * self.spec.episode_ticks)
+        if self.workers.any(self.experience.transitions < max(first, 1)):
+            return []
+        steps = self.counters.env_steps
+        self.learner.set_progress(steps / self.config.total_steps)
+        losses = [
+            self.learner.update(self.experience.batch(steps))
+            for _ in range(self.config.updates_per_cycle)
+        ]
+        self.learner.average()
+        self.counters.updates = self.learner.updates
+        return losses
+
+    def _check(self, losses: list[Losses]) -> None:
+        """Stops on the first loss that is not finite."""
+        first = self.counters.updates - len(losses)
+        for name in ('critic', 'actor'):
+            values = [getattr(loss, name) for loss in losses]
+            finite = torch.isfinite(torch.stack(values)).tolist() if values else []
+            if not all(finite):
+                update = first + finite.index(False) + 1
+                raise TrainingError(
+                    f'{name} loss is {float(values[finite.index(False)])} in update {update}, '
+                    f'after {self.counters.env_steps} environment steps'
+                )
+
+    def _keep_best(self, collected: Collected) -> None:
+        outcomes, actor = collected.evaluation, collected.evaluated
+        if outcomes is not None and actor is not None and self._evaluator.is_complete(outcomes):
+            self._saver.keep_best(outcomes, actor, self.counters)
+
+    def _limit(self) -> str:
+        """Which of its own limits the run has reached; empty if none."""
+        config, counters = self.config, self.counters
+        if counters.env_steps >= config.total_steps:
+            return f'{config.total_steps:,} environment steps done'
+        if 0 < config.time_limit <= counters.seconds:
+            return f'time limit of {config.time_limit:g} s reached'
+        return ''
+
+    def _reason_to_stop(self) -> str:
+        target, reason = self.config.success_target, self._stop_reason
+        if not reason and 0 < target <= self.counters.best_success:
+            reason = f'success target {target:g} reached'
+        reason = reason or self._limit()
+        return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
+
+    def save(self) -> None:
+        """Writes the newest episodes and, as worker 0, the latest actor and the training state.
+
+        Raises:
+            OSError: If there is no room for them; what was there before is kept.
+        """
+        self._saver.save(self.learner, self.experience, self.counters)
+
+    def _row(
+        self, collected: Collected, losses: list[Losses], seconds: float
+    ) -> dict[str, float | None]:
+        workers, batch = self.workers.world_size, self.experience.batch_size
+        steps = self.simulation.num_envs * self.spec.episode_ticks * workers
+        success, outcomes = collected.train_success, collected.evaluation
+        rule = self.config.success_rule
+        row = progress_row(self.counters, success, outcomes, rule, losses)
+        row['steps_per_second'] = steps / seconds
+        row['samples_per_second'] = len(losses) * batch * workers / seconds
+        if collected.guided is not None:
+            row['eval_guided'] = success_rate(collected.guided, rule)
+        return row
+
+
+class _Clock:
+    """Time that a run has taken, over all its parts."""
+
+    def __init__(self, counters: Counters) -> None:
+        self._started = time.monotonic() - counters.seconds
+        self._processor_started = time.process_time() - counters.processor_seconds
+
+    def write(self, counters: Counters) -> None:
+        """Writes both times into the counters."""
+        counters.seconds = time.monotonic() - self._started
+        counters.processor_seconds = time.process_time() - self._processor_started
+
+
+def _run_now(function: Callable[..., Collected], *arguments: Any) -> Future[Collected]:
+    """Runs a job at once, in this thread, behind the interface of an executor."""
+    future: Future[Collected] = Future()
+    future.set_result(function(*arguments))
+    return future
