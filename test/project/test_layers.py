@@ -211,6 +211,47 @@ def test_no_modules_import_each_other(late):
     assert circle(import_graph(sources, late)) == []
 
 
+def folders(graph: Mapping[str, set[str]], parent: str) -> dict[str, set[str]]:
+    """Which folders in a package load each other, of a graph of modules.
+
+    The package's own modules are none: commands are on top of all folders.
+    """
+
+    def folder(module: str) -> str:
+        first, *rest = module.removeprefix(f'{parent}.').split('.')
+        return first if is_within(module, parent) and rest else ''
+
+    merged: dict[str, set[str]] = {}
+    for module, loaded in graph.items():
+        if folder(module):
+            others = {folder(each) for each in loaded} - {'', folder(module)}
+            merged[folder(module)] = merged.get(folder(module), set()) | others
+    return merged
+
+
+@pytest.mark.parametrize('late', [False, True], ids=['at import', 'in functions'])
+@pytest.mark.parametrize('parent', ['msgs_spec', 'fetch_hand_sim', 'policy_node', TRAINING])
+def test_no_folders_import_each_other(parent, late):
+    sources = {_full_name(path): path.read_text() for path in SOURCES}
+    assert circle(folders(import_graph(sources, late), parent)) == []
+
+
+def test_the_map_has_the_folders_of_training_in_the_order_in_which_they_use_each_other():
+    sources = {_full_name(path): path.read_text() for path in SOURCES}
+    uses = folders(import_graph(sources, late=True), TRAINING)
+    page = (ROOT / 'docs' / 'architecture.md').read_text()
+    order = re.findall(r'^### `policy_node/training/(\w+)/`', page, flags=re.MULTILINE)
+    assert set(order) == set(uses)
+    back = [(a, b) for a, used in uses.items() for b in used if order.index(b) < order.index(a)]
+    assert back == []
+
+
+def test_a_circle_of_folders_is_found():
+    sources = {'p.a.one': 'from p.b import two', 'p.b.two': '', 'p.b.three': 'import p.a.four'}
+    graph = import_graph({**sources, 'p.a.four': '', 'p.command': 'import p.a.one'})
+    assert set(circle(folders(graph, 'p'))) == {'a', 'b'}
+
+
 def test_a_circle_through_a_function_is_found():
     sources = {'p.a': 'from p import b', 'p.b': 'def late():\n    import p.a'}
     assert set(circle(import_graph(sources, late=True))) == {'p.a', 'p.b'}

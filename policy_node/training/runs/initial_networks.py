@@ -11,7 +11,6 @@ from torch import Tensor
 
 from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
-from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.shipped import actor_path
 from policy_node.training.configuration.config import TrainConfig
@@ -25,6 +24,7 @@ from policy_node.training.networks.conditions import (
     without_input,
 )
 from policy_node.training.networks.critics import Ensemble, count_critics, critic_tensors
+from policy_node.training.networks.network_shape import network_shape
 from policy_node.training.networks.widening import can_widen, widened
 from policy_node.training.runs.origins import steps_behind
 from policy_node.training.runs.run_folder import STATE_FILE, companion_file
@@ -151,20 +151,6 @@ class InitialNetworks:
                 completed = module.completed(given)
                 tensors |= {f'{part}.{name}': value for name, value in completed.items()}
         return tensors
-
-
-def network_shape(config: TrainConfig) -> NetworkShape:
-    """Shape of the actor, and of the critic, that a configuration asks for."""
-    spec = task_spec(config.task)
-    return NetworkShape(
-        observation_size=spec.observation_size,
-        goal_size=spec.goal.size,
-        # How long the action holds is one more.
-        action_size=spec.robot.action_size + (config.longest_hold > 1),
-        hidden_sizes=config.hidden_sizes,
-        layer_norm=config.layer_norm,
-        goal_features=goal_features(config.goal_features, spec),
-    )
 
 
 def read_initial_networks(name: str) -> InitialNetworks:
