@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from gymnasium.utils import seeding
+from numpy.typing import ArrayLike, NDArray
+
+Seed = int | np.random.Generator | None
+Seeds = int | Sequence[Seed] | None
 
 
 def require_whole(name: str, value: object) -> None:
@@ -13,3 +21,84 @@ def require_whole(name: str, value: object) -> None:
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ValueError(f'{name} must be a whole number, not {value!r}')
+
+
+def finite_numbers(
+    name: str, values: ArrayLike, shape: tuple[int, ...], owner: str
+) -> NDArray[np.floating]:
+    """Numbers for each simulation, float32 or float64.
+
+    Args:
+        name: What they are, for messages.
+        values: The numbers.
+        shape: What they must have, (N, size).
+        owner: Whose they are, for messages.
+
+    Raises:
+        ValueError: If the shape is another, or something is no finite number.
+    """
+    array = np.asarray(values)
+    if array.shape != shape:
+        raise ValueError(f'{name} of {owner} have shape {shape}, not {array.shape}')
+    if array.dtype.kind not in 'iuf':
+        raise ValueError(f'{name} are numbers, not of type {array.dtype}')
+    if array.dtype not in (np.float32, np.float64):
+        array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        env, part = np.argwhere(~np.isfinite(array))[0]
+        raise ValueError(f'{name} must be finite; {name}[{env}, {part}] is {array[env, part]}')
+    return array
+
+
+def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
+    """The simulations of indices or of a boolean mask (N,), in the order in which they are named.
+
+    Raises:
+        ValueError: If there is no such simulation, or one is named twice.
+    """
+    selected = np.asarray(ids)
+    if selected.dtype == bool and selected.shape == (num_envs,):
+        return np.flatnonzero(selected)
+    if selected.ndim == 1 and selected.size == 0:
+        return np.zeros(0, dtype=np.intp)
+    if selected.ndim != 1 or not np.issubdtype(selected.dtype, np.integer):
+        raise ValueError(
+            f'ids must be indices below {num_envs} or a boolean mask of shape ({num_envs},), '
+            f'not {ids!r}'
+        )
+    unique = np.unique(selected)
+    if unique[0] < 0 or unique[-1] >= num_envs or unique.size != selected.size:
+        raise ValueError(f'ids must be distinct and in [0, {num_envs}), not {ids!r}')
+    return selected.astype(np.intp)
+
+
+def generators(seed: Seeds, selected: NDArray[np.intp]) -> list[np.random.Generator | None]:
+    """The random generators that simulations go on with; None for those that keep their own.
+
+    Args:
+        seed: As `Simulation.reset` has it.
+        selected: Which simulations.
+
+    Raises:
+        ValueError: If a seed is negative, or there are more or fewer than simulations.
+        TypeError: If a seed is not an integer.
+    """
+    if seed is None:
+        return [None] * selected.size
+    if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+        return [_generator(int(seed) + int(i)) for i in selected]
+    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str | bytes):
+        raise TypeError(f'a seed is an integer, a sequence of integers or None, not {seed!r}')
+    if len(seed) != selected.size:
+        raise ValueError(f'{selected.size} simulations start again but {len(seed)} seeds came')
+    return [None if value is None else _generator(value) for value in seed]
+
+
+def _generator(seed: Any) -> np.random.Generator:
+    if isinstance(seed, np.random.Generator):
+        return seed
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool):
+        raise TypeError(f'a seed is an integer, not {seed!r}')
+    if seed < 0:
+        raise ValueError(f'a seed must not be negative, but {seed} is')
+    return seeding.np_random(int(seed))[0]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,13 @@ from mujoco import mjtWarning
 from mujoco.batch import SimulationError
 from numpy.typing import ArrayLike, NDArray
 
-from fetch_hand_sim.simulation.arguments import require_whole
+from fetch_hand_sim.simulation.arguments import (
+    Seeds,
+    finite_numbers,
+    generators,
+    require_whole,
+    selected_simulations,
+)
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.actions import command_from_action
@@ -37,8 +42,6 @@ from msgs_spec.tasks import (
 )
 
 Observation = dict[str, Array]
-Seed = int | np.random.Generator | None
-Seeds = int | Sequence[Seed] | None
 
 _LOGGER = logging.getLogger(__name__)
 # MuJoCo warnings after which it has thrown the state away.
@@ -201,7 +204,9 @@ class Simulation:
             TypeError: If a seed is not an integer.
         """
         selected = self._select(ids)
-        self._seed(selected, seed)
+        fresh = generators(seed, selected)
+        for index, generator in zip(selected.tolist(), fresh, strict=True):
+            self._generators[index] = generator or self._generators[index]
         if selected.size:
             self._start(np.sort(selected))
         return self.observe()
@@ -217,7 +222,7 @@ class Simulation:
                 moved then.
             gymnasium.error.ResetNeeded: If a simulation has never been reset.
         """
-        checked = self._check_finite('actions', actions)
+        checked = self._finite('actions', actions)
         if checked.size and (np.abs(checked) > 1.0).any():
             env, part = np.argwhere(np.abs(checked) > 1.0)[0]
             raise ValueError(
@@ -244,7 +249,7 @@ class Simulation:
         Returns:
             Which simulations diverged, (N,).
         """
-        return self._advance(self._check_finite('commands', commands))
+        return self._advance(self._finite('commands', commands))
 
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
@@ -428,62 +433,9 @@ class Simulation:
             'desired_goal': self.goals.copy(),
         }
 
-    def _check_finite(self, name: str, values: ArrayLike) -> NDArray[np.floating]:
-        array = np.asarray(values)
+    def _finite(self, name: str, values: ArrayLike) -> NDArray[np.floating]:
         shape = (self.num_envs, self.spec.robot.action_size)
-        if array.shape != shape:
-            raise ValueError(f'{name} of {self.spec.name} have shape {shape}, not {array.shape}')
-        if array.dtype.kind not in 'iuf':
-            raise ValueError(f'{name} are numbers, not of type {array.dtype}')
-        if array.dtype not in (np.float32, np.float64):
-            array = array.astype(np.float64)
-        if not np.isfinite(array).all():
-            env, part = np.argwhere(~np.isfinite(array))[0]
-            raise ValueError(f'{name} must be finite; {name}[{env}, {part}] is {array[env, part]}')
-        return array
+        return finite_numbers(name, values, shape, owner=self.spec.name)
 
     def _select(self, ids: ArrayLike | None) -> NDArray[np.intp]:
-        """The simulations of `ids`, in the order in which they are named."""
-        if ids is None:
-            return self._all
-        selected = np.asarray(ids)
-        if selected.dtype == bool and selected.shape == (self.num_envs,):
-            return np.flatnonzero(selected)
-        if selected.ndim == 1 and selected.size == 0:
-            return np.zeros(0, dtype=np.intp)
-        if selected.ndim != 1 or not np.issubdtype(selected.dtype, np.integer):
-            raise ValueError(
-                f'ids must be indices below {self.num_envs} or a boolean mask of shape '
-                f'({self.num_envs},), not {ids!r}'
-            )
-        unique = np.unique(selected)
-        if unique[0] < 0 or unique[-1] >= self.num_envs or unique.size != selected.size:
-            raise ValueError(f'ids must be distinct and in [0, {self.num_envs}), not {ids!r}')
-        # As given: seeds and goals come in this order.
-        return selected.astype(np.intp)
-
-    def _seed(self, selected: NDArray[np.intp], seed: Seeds) -> None:
-        if seed is None:
-            return
-        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
-            seeds: list[Seed] = [int(seed) + int(i) for i in selected]
-        elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes):
-            seeds = list(seed)
-        else:
-            raise TypeError(f'a seed is an integer, a sequence of integers or None, not {seed!r}')
-        if len(seeds) != selected.size:
-            raise ValueError(f'{selected.size} simulations start again but {len(seeds)} seeds came')
-        fresh = [None if value is None else _generator_from(value) for value in seeds]
-        for index, generator in zip(selected.tolist(), fresh, strict=True):
-            if generator is not None:
-                self._generators[index] = generator
-
-
-def _generator_from(seed: Any) -> np.random.Generator:
-    if isinstance(seed, np.random.Generator):
-        return seed
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool):
-        raise TypeError(f'a seed is an integer, not {seed!r}')
-    if seed < 0:
-        raise ValueError(f'a seed must not be negative, but {seed} is')
-    return seeding.np_random(int(seed))[0]
+        return self._all if ids is None else selected_simulations(ids, self.num_envs)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
-from fetch_hand_sim.simulation.simulation import Seeds
+from fetch_hand_sim.simulation.arguments import Seeds
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import TaskSpec
 from policy_node.training.configuration.config_rules import require_idle_gripper
