@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.command_line import discard_unread_output
 from policy_node.policies import checkpoint
 from policy_node.policies.files import write_file
 from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, summarize
@@ -80,6 +81,8 @@ def ship(
         control_hz=info.control_hz,
     )
     summary = summarize(evaluate(simulation, actor, episodes, FIRST_SEED))
+    # After an hour of episodes nobody may read the table any more; the actor is saved all the same.
+    discard_unread_output()
     print_table({'policy': str(run), 'task': info.task, **summary})
     if old and not is_better(summary, old):
         print(f'ship_actor: the actor in {actors} is at least as good; nothing changed')

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -57,6 +60,19 @@ def test_what_was_done_is_said_and_a_few_episodes_replace_no_longer_evaluation(
     assert ship(run, actors, 4) == 0
     assert 'is this one; nothing changed' in capsys.readouterr().out
     assert {file.name: file.read_bytes() for file in actors.iterdir()} == before
+
+
+def test_an_actor_is_shipped_where_nobody_reads_its_table_any_more(
+    run: Path, tmp_path: Path
+) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    actors = tmp_path / 'actors'
+    command = [sys.executable, '-m', 'policy_node.training.ship_actor', str(run)]
+    command += ['--episodes', '2', '--threads', '1', '--actors', str(actors)]
+    assert subprocess.run(command, stdout=writer, timeout=120, check=False).returncode == 0
+    os.close(writer)
+    assert (actors / 'FetchReach.json').is_file()
 
 
 @pytest.mark.parametrize(
