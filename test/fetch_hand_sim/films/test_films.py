@@ -76,6 +76,32 @@ def test_animations_last_as_long_as_asked_at_rates_that_browsers_show(kind, fps,
     assert np.ptp(durations[:-1]) <= (10 if kind == '.gif' else 1)
 
 
+@pytest.mark.parametrize('kind', ['.gif', '.webp'])
+def test_a_long_animation_needs_less_memory_than_its_pictures(kind, tmp_path):
+    code = (
+        'import pathlib, resource, sys\n'
+        'import numpy as np\n'
+        'from fetch_hand_sim.films.film import write_film\n'
+        'def most(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n'
+        'def pictures():\n'
+        '    for number in range(150):\n'
+        '        picture = np.full((480, 640, 3), 90, np.uint8)\n'
+        '        picture[200:280, 2 * number : 2 * number + 80] = 200\n'
+        '        yield picture\n'
+        'before = most()\n'
+        'write_film(pathlib.Path(sys.argv[1]), pictures(), 25.0)\n'
+        'print(most() - before)'
+    )
+    path = tmp_path / f'film{kind}'
+    result = subprocess.run(
+        [sys.executable, '-c', code, str(path)], check=True, capture_output=True, text=True
+    )
+    with Image.open(path) as image:
+        assert image.n_frames == 150
+    # Of the pictures themselves, KiB.
+    assert int(result.stdout) < 0.6 * 150 * 480 * 640 * 3 / 1024
+
+
 def test_mp4_holds_every_picture(tmp_path):
     pytest.importorskip('imageio_ffmpeg')
     import imageio.v3 as imageio
