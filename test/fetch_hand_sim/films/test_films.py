@@ -343,6 +343,17 @@ def test_bad_usage_is_one_line(folder, tmp_path, more, capsys):
     assert code == 2 and error.count('\n') == 1 and 'allowed' in error
 
 
+@pytest.mark.parametrize(
+    ('name', 'option', 'of'),
+    [('x.gif', '--frame', 'a picture (.png, .jpg)'), ('x.PNG', '--speed', 'a film (.mp4, .gif')],
+)
+def test_what_a_kind_of_file_has_no_use_for_is_refused(folder, tmp_path, name, option, of, capsys):
+    assert render_episode([str(folder), '--out', str(tmp_path / name), option, '2']) == 2
+    error = capsys.readouterr().err
+    assert f'{option} is of {of}' in error and error.count('\n') == 1
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize('size', ['100', '100x', '4x4x4'])
 def test_a_size_is_two_numbers(folder, size, capsys):
     with pytest.raises(SystemExit) as caught:
