@@ -5,6 +5,10 @@ from msgs_spec.loading import guard_loading
 # Before anything that takes long to import.
 guard_loading()
 
+from fetch_hand_sim.mujoco_import import import_mujoco  # noqa: E402
+
+import_mujoco()
+
 from fetch_hand_sim.gym_envs.registration import (  # noqa: E402
     make,
     make_vec,

@@ -47,10 +47,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         '--grid', type=picture_size, metavar='CxR', help='columns x rows of episodes, such as 4x4'
     )
-    parser.add_argument('--frame', type=int, default=-1, help='of a picture; default: -1, the last')
-    parser.add_argument('--speed', type=float, default=1.0, help='simulated seconds per second')
+    parser.add_argument('--frame', type=int, help='of a picture; default: -1, the last')
+    parser.add_argument('--speed', type=float, help='of a film: simulated seconds per second')
     options = parser.parse_args(arguments)
-    if not _SPEEDS[0] <= options.speed <= _SPEEDS[1]:
+    if options.speed is not None and not _SPEEDS[0] <= options.speed <= _SPEEDS[1]:
         parser.error(f'--speed {options.speed:g}; allowed: {_SPEEDS[0]:g} ... {_SPEEDS[1]:g}')
     if options.grid and not all(1 <= side <= 20 for side in options.grid):
         parser.error('--grid: allowed: 1x1 ... 20x20')
@@ -67,6 +67,7 @@ def _run(options: argparse.Namespace) -> int:
     from fetch_hand_sim.films.film import check_kind
 
     check_kind(options.out)
+    _check_is_used(options)
     try:
         _render(options)
     except ValueError as error:
@@ -76,6 +77,19 @@ def _run(options: argparse.Namespace) -> int:
         raise CommandError(str(error)) from None
     say(f'{options.out}: {options.out.stat().st_size / 1024:.0f} KiB')
     return EXIT_SUCCESS
+
+
+def _check_is_used(options: argparse.Namespace) -> None:
+    """Refuses what the kind of file has no use for."""
+    from fetch_hand_sim.films.film import STILL
+
+    if options.out.suffix.lower() in STILL:
+        if options.speed is not None:
+            raise UsageError(
+                f'--speed is of a film (.mp4, .gif, .webp); {options.out} is a picture'
+            )
+    elif options.frame is not None:
+        raise UsageError(f'--frame is of a picture (.png, .jpg); {options.out} is a film')
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -103,7 +117,8 @@ def _render(options: argparse.Namespace) -> None:
     try:
         if options.out.suffix.lower() in STILL:
             draw = framed if options.grid else Studio.picture
-            stills = [draw(studio, recording, options.frame) for recording in recordings]
+            index = -1 if options.frame is None else options.frame
+            stills = [draw(studio, recording, index) for recording in recordings]
             write_picture(options.out, tile(stills, columns))
             return
         # Of several rates the fastest: none loses a frame.
@@ -113,7 +128,7 @@ def _render(options: argparse.Namespace) -> None:
         if options.grid:
             pictures, count = grid(studio, recordings, columns, hz), sheets(recordings, hz)
         with progress('pictures', count) as advance:
-            write_film(options.out, _counted(pictures, advance), hz * options.speed)
+            write_film(options.out, _counted(pictures, advance), hz * (options.speed or 1.0))
     finally:
         studio.close()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import subprocess
@@ -10,7 +9,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +19,8 @@ Picture = NDArray[np.uint8]
 
 MOVING = ('.mp4', '.gif', '.webp')
 STILL = ('.png', '.jpg')
-# Of GIF and WebP: every colour kept would make files several times as large.
-_QUALITY = 72
-_COLORS = 128
-_SAMPLES = 8
 # Pixels of a side, at most.
 _LARGEST_SIDE = {'.mp4': 16384, '.gif': 65535, '.webp': 16383, '.jpg': 65500}
-# Milliseconds that a GIF and a WebP count in.
-_UNITS = {'.gif': 10, '.webp': 1}
-# Of a picture in either: browsers show what is shorter for 100.
-_SHORTEST_MS = 20
 
 
 def check_kind(path: Path) -> None:
@@ -79,11 +69,14 @@ def write_film(
         UsageError: If there is no ffmpeg.
         CommandError: If it fails.
     """
+    # Pillow is slow to import, and checks come before.
+    from fetch_hand_sim.films.animation import write_animation
+
     with _appearing(path) as hidden:
         if path.suffix.lower() == '.mp4':
             _write_mp4(hidden, pictures, fps, keyframe_every)
         else:
-            _write_animation(hidden, pictures, fps)
+            write_animation(hidden, pictures, fps)
 
 
 def write_picture(path: Path, picture: Picture) -> None:
@@ -92,38 +85,6 @@ def write_picture(path: Path, picture: Picture) -> None:
 
     with _appearing(path) as hidden:
         Image.fromarray(picture).save(hidden, quality=85, optimize=True)
-
-
-def _write_animation(path: Path, pictures: Iterable[Picture], fps: float) -> None:
-    from PIL import Image
-
-    every, images, count = _kept_every(fps), [], 0
-    for count, picture in enumerate(pictures, start=1):
-        if (count - 1) % every == 0:
-            images.append(Image.fromarray(picture))
-    options: dict[str, Any] = {'quality': _QUALITY, 'method': 4}
-    if path.suffix == '.gif':
-        # One palette for all, or colours flicker; made of some, because goals change their colour.
-        some = images[:: max(1, len(images) // _SAMPLES)]
-        samples = Image.fromarray(np.concatenate([np.asarray(image) for image in some]))
-        palette = samples.quantize(_COLORS)
-        images = [image.quantize(palette=palette) for image in images]
-        options = {'optimize': True}
-    first, *rest = images
-    durations = _durations(count, fps, _UNITS[path.suffix])
-    first.save(path, save_all=True, append_images=rest, duration=durations, loop=0, **options)
-
-
-def _kept_every(fps: float) -> int:
-    """One of how many pictures can be shown."""
-    return math.ceil(fps * _SHORTEST_MS / 1000.0)
-
-
-def _durations(count: int, fps: float, unit: int) -> list[int]:
-    """Milliseconds of the pictures kept of `count`, in units; what is rounded never adds up."""
-    begins = np.append(np.arange(0, count, _kept_every(fps)), count) * (1000.0 / fps)
-    lengths = np.diff(np.rint(begins / unit).astype(int) * unit)
-    return [max(_SHORTEST_MS, length) for length in lengths.tolist()]
 
 
 def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float, keyframe_every: int) -> None:

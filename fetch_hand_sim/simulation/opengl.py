@@ -101,6 +101,10 @@ def start_glfw() -> bool:
 
 def _use(backend: str) -> None:
     if backend not in (*_LIBRARIES, 'glfw'):
+        if not hasattr(gl_context, 'GLContext'):
+            raise RuntimeError(
+                f'rendering needs OpenGL: MUJOCO_GL={backend} has none; allowed: egl, osmesa, glfw'
+            )
         return
     try:
         gl_context.GLContext = import_module(f'mujoco.{backend}').GLContext

@@ -70,6 +70,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     options.ros_arguments = words[cut:]
     if not 0 <= options.port <= 65535:
         parser.error(f'--port {options.port}; allowed: 0 ... 65535')
+    if not options.wait >= 0.0:
+        parser.error(f'--wait {options.wait:g}; allowed: 0 and more')
     of_a_robot = _given(options, 'task', 'robot', 'policy', 'episode_dir')
     if options.path is not None and of_a_robot:
         parser.error(f'a file and {of_a_robot} exclude each other')

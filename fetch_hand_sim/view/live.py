@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections import deque
 from typing import Any
 
@@ -29,6 +30,8 @@ from msgs_spec.topics import DIAGNOSTICS, topic
 _HURRY = 1.5
 # Seconds between two looks at who is there and what nodes are set to.
 _LOOK_PERIOD = 0.5
+# Seconds without a word that say a robot is gone: one that is there reports every second.
+_SILENCE = 4.0
 
 
 class LiveRobot:
@@ -47,6 +50,7 @@ class LiveRobot:
         self._commander = ''
         self._phase = ''
         self._asked_rate: str | None = None
+        self._heard = time.monotonic()
         # Settings of nodes to be read: they may have changed.
         self._unread: set[str] = set()
         self._trail: deque[Array] = deque(maxlen=TRAIL_TICKS)
@@ -100,6 +104,7 @@ class LiveRobot:
             self._show_goal(request.values)
 
     def _on_status(self, status: EpisodeStatus) -> None:
+        self._hear()
         spec = task_spec(status.task, status.joint_prefix, status.control_hz)
         if self._picture is None or self._picture.task != spec.name:
             self._picture, self._curves = Picture(spec.name), None
@@ -122,6 +127,7 @@ class LiveRobot:
         spec = self.spec
         if spec is None or self._curves is None:
             return
+        self._hear()
         self._replays.count_tick()
         if tick.status is None and tick.reward is not None:
             # `episode_status` speaks up only where an episode begins or ends.
@@ -158,8 +164,13 @@ class LiveRobot:
         self._unread.add('actor')
         self._is_new = True
 
+    def _hear(self) -> None:
+        self._heard = time.monotonic()
+        if self._facts.is_silent:
+            self._update_facts(is_silent=False)
+
     def _look(self) -> None:
-        """Looks at who replays, and reads what nodes may have been set to."""
+        """Looks at who is there, and reads what nodes may have been set to."""
         is_other = self._replays.look()
         replay, facts = self._replays.replay, self._facts
         if is_other:
@@ -169,6 +180,8 @@ class LiveRobot:
             )
         if replay is not None:
             self._follow_replay(replay.name)
+        elif self.spec is not None and time.monotonic() - self._heard > _SILENCE:
+            self._notice_silence()
         for name, read in (
             ('speed', self._requests.read_speed),
             ('actor', self._requests.read_actor),
@@ -176,8 +189,14 @@ class LiveRobot:
             if name in self._unread:
                 read()
 
+    def _notice_silence(self) -> None:
+        """Stops to say of a robot that is gone, or hangs, how fast it ticks and who commands."""
+        if not self._facts.is_silent:
+            self._update_facts(is_silent=True, is_paused=False, commander='', rate=0.0)
+
     def _follow_replay(self, name: str) -> None:
         """Says of a replay what a robot says of itself in its diagnostics."""
+        self._hear()
         self._asked_rate = None
         self._unread.add('speed')
         self._requests.push_limit = 0.0
@@ -197,6 +216,7 @@ class LiveRobot:
                 self._take_report({pair.key: pair.value for pair in status.values})
 
     def _take_report(self, values: dict[str, str]) -> None:
+        self._hear()
         asked = values.get('rate asked (Hz)')
         if asked != self._asked_rate:
             # Rounded, and of a robot that is paused or in lockstep not there: the robot knows.

@@ -39,6 +39,7 @@ class Facts:
         actors: Actors to choose from; empty where there is no policy.
         actor: The one of these that acts, the file of another one, or '' if unknown.
         is_replay: Whether what is live is the replay of an episode.
+        is_silent: Whether nothing is heard of the robot any more; all else is what it said last.
         is_commanding: Whether the page sends commands.
         notice: What the last action led to.
     """
@@ -61,6 +62,7 @@ class Facts:
     actors: tuple[str, ...] = ()
     actor: str = ''
     is_replay: bool = False
+    is_silent: bool = False
     is_commanding: bool = False
     notice: str = ''
 

@@ -110,7 +110,7 @@ class Player:
         raise none_readable(skipped)
 
     def _change(self, by: int) -> None:
-        """Opens the next episode that can be read."""
+        """Opens the next episode that can be read; says so if none is left, and stays."""
         number, skipped = self._number, ''
         for _ in self._paths:
             number = (number + by) % len(self._paths)
@@ -121,6 +121,7 @@ class Player:
                 continue
             self._notice = skipped
             return
+        self._notice = f'no episode can be read any more; {skipped}'
 
     def _choose(self, number: int) -> None:
         """Opens an episode, or says why not and stays."""

@@ -18,11 +18,14 @@ from fetch_hand_sim.view.page.windows import (
     say,
     untitled_window,
 )
-from fetch_hand_sim.view.picture import Facts, Picture, Timeline
-from msgs_spec.tasks import task_spec
+from fetch_hand_sim.view.picture import Facts, Graphs, Picture, Timeline
+from msgs_spec.tasks import TaskSpec, task_spec
 
 _TIMELINE_HEIGHT = 74.0
 _LEAST_LIST = 100.0
+# Of a page with room for two columns, pixels: a telephone that is held upright has none.
+_TWO_COLUMNS = 2.0 * WIDTH + 3.0 * MARGIN
+_BUTTON_HEIGHT = 3.0 * MARGIN
 
 
 class Panels:
@@ -38,7 +41,8 @@ class Panels:
         self._windows = Windows()
         self._robot_panel = RobotPanel(send)
         self._episode_list = EpisodeList(episodes, send)
-        self._robot_height = 0.0
+        # Where the next window of the left column begins.
+        self._below = 0.0
 
     @property
     def keeps_goal(self) -> bool:
@@ -57,23 +61,38 @@ class Panels:
         with self._windows.column(f'{spec.name}###robot', MARGIN, MARGIN) as is_shown:
             if is_shown:
                 self._robot_panel.draw(spec, picture)
-            self._robot_height = imgui.GetWindowSize().y if is_shown else 3.0 * MARGIN
-        right = size.x - WIDTH - MARGIN
-        with self._windows.column('Curves###curves', right, MARGIN) as is_shown:
-            if is_shown:
-                draw_plots(spec, picture.graphs, WIDTH)
+            self._below = MARGIN + _height(is_shown) + MARGIN
+        self._draw_curves(spec, picture.graphs)
         if picture.timeline is not None:
             self._draw_file(picture.timeline, picture.facts)
+
+    def _draw_curves(self, spec: TaskSpec, graphs: Graphs) -> None:
+        """Draws them on the right, or where there is no room in the left column."""
+        width = imgui.GetIO().DisplaySize.x
+        is_narrow = width < _TWO_COLUMNS
+        x, y = width - WIDTH - MARGIN, MARGIN
+        if is_narrow:
+            self._windows.fold_once('Curves', 'Episodes')
+            x, y = MARGIN, self._below
+        with self._windows.column('Curves###curves', x, y) as is_shown:
+            if is_shown:
+                draw_plots(spec, graphs, WIDTH)
+            if is_narrow:
+                self._below += _height(is_shown) + MARGIN
 
     def _draw_file(self, timeline: Timeline, facts: Facts) -> None:
         size = imgui.GetIO().DisplaySize
         top = size.y - _TIMELINE_HEIGHT - MARGIN
         if len(self._episode_list) > 1:
-            y = self._robot_height + 2.0 * MARGIN
-            height = max(top - y - MARGIN, _LEAST_LIST)
-            with self._windows.column('Episodes', MARGIN, y, height) as is_shown:
+            height = max(top - self._below - MARGIN, _LEAST_LIST)
+            with self._windows.column('Episodes', MARGIN, self._below, height) as is_shown:
                 if is_shown:
                     self._episode_list.draw(timeline.number)
         width = size.x - 2.0 * MARGIN
         with untitled_window('timeline', MARGIN, top, width, _TIMELINE_HEIGHT):
             draw_timeline(timeline, facts, self._send)
+
+
+def _height(is_shown: bool) -> float:
+    """How high the window that is being drawn is, or the button in place of one that is not."""
+    return float(imgui.GetWindowSize().y) if is_shown else _BUTTON_HEIGHT

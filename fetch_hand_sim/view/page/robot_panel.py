@@ -20,6 +20,7 @@ from msgs_spec.tasks import TaskSpec
 _GREEN = imgui.Vec4(0.1, 0.55, 0.2, 1.0)
 _RED = imgui.Vec4(0.75, 0.2, 0.15, 1.0)
 _WAITING = 'The robot waits for somebody who commands it.'
+_SILENT = 'Nothing is heard of the robot: it has ended, or hangs. This is what it did last.'
 
 
 class RobotPanel:
@@ -108,7 +109,9 @@ def draw_actors(facts: Facts, send: Send) -> None:
 
 def _draw_state(spec: TaskSpec, picture: Picture) -> None:
     facts = picture.facts
-    if picture.frame is None:
+    if facts.is_silent:
+        say(_SILENT)
+    elif picture.frame is None:
         say('Nothing is seen yet.' if facts.is_replay else _WAITING)
     elif picture.frame.is_success:
         imgui.TextColored(_GREEN, 'Goal reached')

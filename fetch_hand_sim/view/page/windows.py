@@ -25,6 +25,13 @@ class Windows:
     def __init__(self) -> None:
         """Shows all."""
         self._hidden: set[str] = set()
+        self._has_folded = False
+
+    def fold_once(self, *names: str) -> None:
+        """Hides windows at the first call; what is shown again stays."""
+        if not self._has_folded:
+            self._has_folded = True
+            self._hidden.update(names)
 
     @contextmanager
     def column(self, title: str, x: float, y: float, height: float = 0.0) -> Iterator[bool]:

@@ -76,6 +76,32 @@ def test_animations_last_as_long_as_asked_at_rates_that_browsers_show(kind, fps,
     assert np.ptp(durations[:-1]) <= (10 if kind == '.gif' else 1)
 
 
+@pytest.mark.parametrize('kind', ['.gif', '.webp'])
+def test_a_long_animation_needs_less_memory_than_its_pictures(kind, tmp_path):
+    code = (
+        'import pathlib, resource, sys\n'
+        'import numpy as np\n'
+        'from fetch_hand_sim.films.film import write_film\n'
+        'def most(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n'
+        'def pictures():\n'
+        '    for number in range(150):\n'
+        '        picture = np.full((480, 640, 3), 90, np.uint8)\n'
+        '        picture[200:280, 2 * number : 2 * number + 80] = 200\n'
+        '        yield picture\n'
+        'before = most()\n'
+        'write_film(pathlib.Path(sys.argv[1]), pictures(), 25.0)\n'
+        'print(most() - before)'
+    )
+    path = tmp_path / f'film{kind}'
+    result = subprocess.run(
+        [sys.executable, '-c', code, str(path)], check=True, capture_output=True, text=True
+    )
+    with Image.open(path) as image:
+        assert image.n_frames == 150
+    # Of the pictures themselves, KiB.
+    assert int(result.stdout) < 0.6 * 150 * 480 * 640 * 3 / 1024
+
+
 def test_mp4_holds_every_picture(tmp_path):
     pytest.importorskip('imageio_ffmpeg')
     import imageio.v3 as imageio
@@ -315,6 +341,17 @@ def test_bad_usage_is_one_line(folder, tmp_path, more, capsys):
     code = render_episode([str(folder), '--out', str(tmp_path / 'x.png'), *more])
     error = capsys.readouterr().err
     assert code == 2 and error.count('\n') == 1 and 'allowed' in error
+
+
+@pytest.mark.parametrize(
+    ('name', 'option', 'of'),
+    [('x.gif', '--frame', 'a picture (.png, .jpg)'), ('x.PNG', '--speed', 'a film (.mp4, .gif')],
+)
+def test_what_a_kind_of_file_has_no_use_for_is_refused(folder, tmp_path, name, option, of, capsys):
+    assert render_episode([str(folder), '--out', str(tmp_path / name), option, '2']) == 2
+    error = capsys.readouterr().err
+    assert f'{option} is of {of}' in error and error.count('\n') == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize('size', ['100', '100x', '4x4x4'])

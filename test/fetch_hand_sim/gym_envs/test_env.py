@@ -327,6 +327,35 @@ def test_without_opengl_rendering_says_what_it_needs(monkeypatch):
     assert result.stdout.startswith('rendering needs OpenGL'), result.stderr
 
 
+WITHOUT_PICTURES = """
+import os
+import fetch_hand_sim
+env = fetch_hand_sim.make('fetch_hand_sim/FetchReach-v0', render_mode='rgb_array')
+env.reset(seed=0)
+print(os.environ['MUJOCO_GL'])
+try:
+    env.render()
+except RuntimeError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize('asked', ['nonsense', 'osmesa'])
+def test_an_opengl_that_is_not_there_keeps_nothing_but_pictures(asked, monkeypatch):
+    """`import mujoco` raises RuntimeError of the one, AttributeError where the other is missing."""
+    monkeypatch.setenv('MUJOCO_GL', asked)
+    result = subprocess.run(
+        [sys.executable, '-c', WITHOUT_PICTURES], capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    found, *reason = result.stdout.splitlines()
+    assert found == asked
+    if asked == 'nonsense':
+        assert 'MUJOCO_GL=nonsense has none; allowed: egl, osmesa, glfw' in reason[0]
+    elif reason:
+        assert reason[0].startswith('rendering needs OpenGL: apt install')
+
+
 RENDER_TWICE = RENDER.replace(
     'else:',
     '    try:\n        env.render()\n    except RuntimeError:\n        print("again")\nelse:',

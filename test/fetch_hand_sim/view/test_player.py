@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -128,6 +129,18 @@ def test_what_cannot_be_read_is_skipped_and_said(folder, tmp_path, clock):
     picture = player.picture()
     assert picture.timeline.number == 2
     assert 'damaged.mcap' in picture.facts.notice
+
+
+def test_episodes_that_are_gone_are_said_to_be(folder, tmp_path, clock):
+    shutil.copytree(folder, tmp_path / 'gone')
+    player = Player(find_playable(tmp_path / 'gone'), clock)
+    player.picture()
+    shutil.rmtree(tmp_path / 'gone')
+    player.perform(ChangeEpisode(1))
+    picture = player.picture()
+    assert picture.timeline.number == 0
+    assert 'no episode can be read any more' in picture.facts.notice
+    assert 'No such file' in picture.facts.notice
 
 
 def test_the_first_that_can_be_read_is_opened(folder, tmp_path, clock):

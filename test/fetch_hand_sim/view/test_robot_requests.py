@@ -9,7 +9,7 @@ import pytest
 import rclpy
 
 from fetch_hand_sim.view.page import robot_panel, time_controls
-from fetch_hand_sim.view.picture import Facts
+from fetch_hand_sim.view.picture import Facts, Picture
 from fetch_hand_sim.view.requests import (
     ChooseActor,
     OpenEpisode,
@@ -148,3 +148,13 @@ def test_any_speed_is_shown(monkeypatch, speed, shown):
     monkeypatch.setattr(time_controls, 'imgui', choice := Choice())
     time_controls.draw_speed(speed, lambda request: pytest.fail(f'{request} is no choice'))
     assert choice.shown == shown and 'x 5' in choice.names
+
+
+@pytest.mark.parametrize('is_silent', [True, False])
+def test_the_page_says_of_a_robot_that_it_is_gone(is_silent, monkeypatch):
+    said = []
+    monkeypatch.setattr(robot_panel, 'imgui', Choice())
+    monkeypatch.setattr(robot_panel, 'say', said.append)
+    facts = Facts(may_command=False, is_silent=is_silent)
+    robot_panel.RobotPanel(None).draw(SPEC, Picture(SPEC.name, facts=facts))
+    assert any('Nothing is heard' in line for line in said) is is_silent

@@ -1,4 +1,4 @@
-"""Following a robot over its topics, also one that comes back as another."""
+"""Following a robot over its topics, also one that is gone or comes back as another."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ import rclpy
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.view import live
 from fetch_hand_sim.view.robot_watch import RobotWatch
+from msgs_spec.diagnostics import Report, encode_reports
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import task_spec
 from msgs_spec.tick import TickEncoder
+from msgs_spec.topics import DIAGNOSTICS
 
 JOINTS = len(task_spec('FetchReach').robot.joints)
 
@@ -35,6 +38,11 @@ class Robot:
             if source.name not in lost:
                 self._publisher(source).publish(data)
         return tick
+
+    def report(self, values):
+        """Says something of itself, as `sim_node` does every second."""
+        report = Report('/sim_node', 'FetchReach', values, '')
+        self._publisher(DIAGNOSTICS).publish(encode_reports(report))
 
     def leave(self):
         for publisher in self._publishers.values():
@@ -88,3 +96,37 @@ def test_a_tick_that_lost_its_first_message_does_not_pass_for_the_one_before(nod
         assert np.array_equal(each.frame.achieved_goal, tick.achieved_goal)
         assert np.array_equal(each.frame.joint_position, tick.readings['joint_states'][:JOINTS])
         assert 'joint_states' not in lost and 'achieved_goal' not in lost
+
+
+REPORT = {'mode': 'real time', 'paused': 'False', 'rate (Hz)': '25.00', 'commanders': '/somebody'}
+
+
+def test_the_page_says_so_when_nothing_is_heard_of_a_robot_any_more(node, monkeypatch):
+    monkeypatch.setattr(live, '_SILENCE', 3.0)
+    robot = Robot(node, Simulation('FetchReach', num_threads=1), JOINT_PREFIX, 0)
+    viewer = live.LiveRobot(node, may_command=True)
+
+    def facts_after(act, condition, patience=20.0):
+        """What the page says once the condition holds, or after so many seconds."""
+        deadline, facts = time.monotonic() + patience, None
+        while time.monotonic() < deadline and not (facts and condition(facts)):
+            act()
+            rclpy.spin_once(node, timeout_sec=0.02)
+            picture = viewer.picture()
+            facts = picture.facts if picture else facts
+        return facts
+
+    def live_on():
+        robot.tick()
+        robot.report(REPORT)
+
+    def is_told(facts):
+        return facts.commander == '/somebody' and not facts.is_silent
+
+    assert is_told(facts_after(live_on, is_told))
+    # One that stands still reports, and no more.
+    assert is_told(facts_after(lambda: robot.report(REPORT), lambda facts: False, 5.0))
+    facts = facts_after(lambda: None, lambda facts: facts.is_silent)
+    assert (facts.is_silent, facts.rate, facts.commander) == (True, 0.0, '')
+    # It is heard again.
+    assert is_told(facts_after(lambda: robot.report(REPORT), is_told))

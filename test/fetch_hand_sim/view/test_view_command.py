@@ -89,6 +89,13 @@ def test_what_is_said_of_a_start_needs_a_task(capsys, option):
     assert line == f'view: {option}: only together with --task, for the robot it starts'
 
 
+@pytest.mark.parametrize('seconds', ['nan', '-3'])
+def test_a_time_to_wait_is_one(capsys, seconds):
+    code, lines = error_of(capsys, [f'--wait={seconds}'])
+    assert code == 2
+    assert lines == [f'view: --wait {seconds}; allowed: 0 and more']
+
+
 @pytest.mark.parametrize(
     ('name', 'hint'),
     [
