@@ -143,24 +143,33 @@ def run_command(name: str, run: Callable[[], int]) -> int:
     Returns:
         What `run` returns, or the exit code of what it raised: 1 or 2 for a `CommandError`, 130 for
         Ctrl-C (it is acknowledged at once with a line), 141 if nobody reads the output any more.
+        SIGTERM and SIGHUP are as Ctrl-C, with 143 and 129.
     """
     with _stopping_is_said(name) as stopping:
-        try:
-            code = run()
-            sys.stdout.flush()
-        except CommandError as error:
-            complain(name, error)
-            return error.exit_code
-        except KeyboardInterrupt:
-            return EXIT_INTERRUPTED
-        except BrokenPipeError:
-            _discard_output(sys.stdout.fileno())
-            return EXIT_CLOSED_PIPE
-        except ImportError:
-            # What becomes of KeyboardInterrupt in the initialisation of many a library.
-            if not stopping:
-                raise
-            return EXIT_INTERRUPTED
+        code = _exit_code(name, run, stopping)
+        if stopping and code == EXIT_INTERRUPTED:
+            return 128 + stopping[0]
+    return code
+
+
+def _exit_code(name: str, run: Callable[[], int], stopping: Sequence[int]) -> int:
+    """Runs the body of a command; `stopping` holds the signal once one came."""
+    try:
+        code = run()
+        sys.stdout.flush()
+    except CommandError as error:
+        complain(name, error)
+        return error.exit_code
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        _discard_output(sys.stdout.fileno())
+        return EXIT_CLOSED_PIPE
+    except ImportError:
+        # What becomes of KeyboardInterrupt in the initialisation of many a library.
+        if not stopping:
+            raise
+        return EXIT_INTERRUPTED
     return code
 
 
@@ -232,6 +241,10 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
 def _stopping_is_said(name: str) -> Iterator[list[int]]:
     """Ctrl-C says `stopping` before it raises KeyboardInterrupt; a second one ends the process.
 
+    SIGTERM and SIGHUP do the same, unless somebody else takes or ignores them: what is half written
+    is taken away. A terminal that closes may send several SIGHUP, so those after the first are
+    ignored.
+
     Yields:
         A list that will hold the signal.
     """
@@ -239,20 +252,31 @@ def _stopping_is_said(name: str) -> Iterator[list[int]]:
 
     def handle(number: int, frame: FrameType | None) -> None:
         received.append(number)
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
+        discard_unread_output()
         complain(name, 'stopping')
         signal.default_int_handler(number, frame)
 
-    is_main_thread = threading.current_thread() is threading.main_thread()
-    if not is_main_thread or not is_nobodys():
-        # A command inside of another one, or somebody else's handler: theirs stays.
-        yield received
-        return
-    before = signal.signal(signal.SIGINT, handle)
+    before = {number: signal.signal(number, handle) for number in _nobodys_signals()}
     try:
         yield received
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            if number != signal.SIGHUP or number not in received:
+                signal.signal(number, handler)
+
+
+def _nobodys_signals() -> list[signal.Signals]:
+    """The signals that a command takes: none inside of another one or of somebody else's program.
+
+    What a shell starts in the background ignores Ctrl-C, and SIGTERM ends it all the same.
+    """
+    ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    if threading.current_thread() is not threading.main_thread() or not (is_nobodys() or ignored):
+        return []
+    others = (signal.SIGTERM, signal.SIGHUP)
+    found = [each for each in others if signal.getsignal(each) == signal.SIG_DFL]
+    return found if ignored else [signal.SIGINT, *found]
 
 
 def discard_unread_output() -> None:

@@ -62,14 +62,32 @@ def test_an_error_that_nobody_expects_is_not_hidden():
         run_command('tool', lambda: 1 // 0)
 
 
-def test_ctrl_c_is_acknowledged_and_ends_with_130_without_a_traceback():
+@pytest.mark.parametrize(
+    ('number', 'code'), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_a_signal_is_acknowledged_and_ends_with_its_code_without_a_traceback(number, code):
     process = run_script(
         'try:\n    print("begun", flush=True)\n    time.sleep(60)\nfinally:\n    print("tidied")'
     )
     assert process.stdout.readline() == 'begun\n'
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     assert process.communicate(timeout=20) == ('tidied\n', 'tool: stopping\n')
-    assert process.returncode == 130
+    assert process.returncode == code
+
+
+def test_a_command_in_the_background_which_ignores_ctrl_c_tidies_at_sigterm():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        process = run_script(
+            'try:\n    print(1, flush=True)\n    time.sleep(60)\nfinally:\n    print("tidied")'
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
+    process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGTERM)
+    assert process.communicate(timeout=20) == ('tidied\n', 'tool: stopping\n')
+    assert process.returncode == 143
 
 
 def test_a_second_ctrl_c_ends_a_command_that_tidies_for_ever():
