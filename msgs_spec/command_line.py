@@ -262,7 +262,8 @@ def _stopping_is_said(name: str) -> Iterator[list[int]]:
         yield received
     finally:
         for number, handler in before.items():
-            if number != signal.SIGHUP or number not in received:
+            # A SIGHUP that is ignored by now has come once; the next one must not kill what ends.
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, handler)
 
 
