@@ -270,6 +270,9 @@ def validate(spec: ParameterSpec, value: object) -> None:
     """
     if not _is_allowed(spec, value):
         hint = did_you_mean(str(value), spec.choices)
+        if spec.allowed == 'any string' and isinstance(value, (int, float)):
+            # ROS reads what is given as YAML, where 2026 is a number and off is false.
+            hint = f'; a number or off is text in two pairs of quotes: "{spec.name}:=\'2026\'"'
         raise ValueError(f'{spec.name}: {value!r} given; allowed: {spec.allowed}{hint}')
 
 

@@ -95,11 +95,17 @@ def _split(words: Sequence[str]) -> tuple[Command | None, list[str], list[str]]:
 
 
 def ros_arguments(words: Sequence[str]) -> list[str]:
-    """Returns the arguments of a node; `task:=FetchPush` is enough for `--ros-args -p ...`."""
-    if '--ros-args' in words or not all(':=' in word for word in words):
+    """Returns the arguments of a node; `task:=FetchPush` is enough for `--ros-args -p ...`.
+
+    The same before `--ros-args`, after which ROS has its own words. `__ns:=/left`, which is no
+    parameter but a name of ROS, becomes a remapping.
+    """
+    end = words.index('--ros-args') if '--ros-args' in words else len(words)
+    short, rest = words[:end], words[end:]
+    if not short or not all(':=' in word for word in short):
         return list(words)
-    parameters = [part for word in words for part in ('-p', word)]
-    return ['--ros-args', *parameters] if parameters else []
+    given = [part for word in short for part in ('-r' if word.startswith('__') else '-p', word)]
+    return ['--ros-args', *given, *rest[1:]]
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -78,8 +78,15 @@ class ReplayNode(Node):
     def _open(self, name: str) -> Publisher:
         spec = self._schedule.topics[name]
         return self.create_publisher(
-            ros_message_class(spec.type_name), name, rclpy_profile(spec.qos)
+            ros_message_class(spec.type_name), self._name_here(name), rclpy_profile(spec.qos)
         )
+
+    def _name_here(self, name: str) -> str:
+        """The name that a recorded topic has here: in the namespace of this node, if it has one."""
+        namespace, recorded = self.get_namespace().rstrip('/'), f'{self._schedule.namespace}/'
+        if not namespace or name == _CLOCK or not name.startswith(recorded):
+            return name
+        return f'{namespace}/{name.removeprefix(recorded)}'
 
     def run(self, stop: StopSignals) -> None:
         """Publishes until the end of the episode, or until the signals say stop."""
@@ -104,8 +111,8 @@ class ReplayNode(Node):
         if not self._settings['wait_for_commands']:
             return
         listeners = Listeners(self, self._publishers_by_topic.values())
-        commands = f'{self._schedule.namespace}/commands'
-        own = int(commands in self._publishers_by_topic)
+        recorded = f'{self._schedule.namespace}/commands'
+        commands, own = self._name_here(recorded), int(recorded in self._publishers_by_topic)
         had_commander = False
         while not stop and not (had_commander and listeners.are_connected()):
             executor.spin_once(timeout_sec=_SPIN)

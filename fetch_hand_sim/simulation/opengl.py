@@ -15,8 +15,11 @@ from importlib import import_module
 
 from mujoco.rendering.classic import gl_context
 
-# What a backend needs on this machine, in the order of preference.
-_LIBRARIES = {'egl': 'libEGL.so.1', 'osmesa': 'libOSMesa.so.8'}
+_EGL, _OSMESA = 'libEGL.so.1', 'libOSMesa.so.8'
+# From EGL_EXT_platform_device.
+_PLATFORM_DEVICE = 0x313F
+_MOST_DEVICES = 64
+_BACKENDS = ('egl', 'osmesa', 'glfw')
 # What MuJoCo takes GLFW for, which needs a display.
 _WINDOWS = ('glfw', 'glx', 'enable', 'enabled', 'on', 'true', '1')
 ADVICE = 'rendering needs OpenGL: apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6'
@@ -66,11 +69,39 @@ def _backend() -> str:
         return asked
     if _has_display():
         return 'glfw'
-    for backend, library in _LIBRARIES.items():
-        if _is_installed(library):
-            _use(backend)
-            return backend
-    raise RuntimeError(ADVICE)
+    has_egl, has_osmesa = _is_installed(_EGL), _is_installed(_OSMESA)
+    if has_egl and _has_device():
+        backend = 'egl'
+    elif has_osmesa:
+        backend = 'osmesa'
+    else:
+        reason = ' (EGL is installed and finds no device)' if has_egl else ''
+        raise RuntimeError(f'{ADVICE}{reason}')
+    _use(backend)
+    return backend
+
+
+def _has_device() -> bool:
+    """Whether EGL can draw on anything; its library alone, without drivers, cannot.
+
+    Asked of EGL itself, because PyOpenGL stays with EGL for good once MuJoCo has tried it.
+    """
+    egl = ctypes.CDLL(_EGL)
+    egl.eglGetProcAddress.restype = ctypes.c_void_p
+    query, display_of = (
+        egl.eglGetProcAddress(name) for name in (b'eglQueryDevicesEXT', b'eglGetPlatformDisplayEXT')
+    )
+    if not (query and display_of):
+        return False
+    pointer, count = ctypes.c_void_p, ctypes.c_int(0)
+    devices = (pointer * _MOST_DEVICES)()
+    ask = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, pointer, pointer)(query)
+    if not ask(_MOST_DEVICES, devices, ctypes.byref(count)):
+        return False
+    open_display = ctypes.CFUNCTYPE(pointer, ctypes.c_uint, pointer, pointer)(display_of)
+    displays = (open_display(_PLATFORM_DEVICE, each, None) for each in devices[: count.value])
+    # None is closed: MuJoCo opens the same one next.
+    return any(display and egl.eglInitialize(pointer(display), None, None) for display in displays)
 
 
 def _has_display() -> bool:
@@ -100,7 +131,7 @@ def start_glfw() -> bool:
 
 
 def _use(backend: str) -> None:
-    if backend not in (*_LIBRARIES, 'glfw'):
+    if backend not in _BACKENDS:
         if not hasattr(gl_context, 'GLContext'):
             raise RuntimeError(
                 f'rendering needs OpenGL: MUJOCO_GL={backend} has none; allowed: egl, osmesa, glfw'

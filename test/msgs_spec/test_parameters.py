@@ -66,7 +66,7 @@ def test_allowed_values_pass(name, value):
         ('sim.real_time_factor', '2', "real_time_factor: '2' given; allowed: 0 or 0.01 ... 1000"),
         ('sim.command_timeout', True, 'command_timeout: True given; allowed: 0 ... 3600'),
         ('sim.joint_prefix', 'x' * 65, 'given; allowed: up to 64 characters$'),
-        ('sim.episode_dir', 1, 'episode_dir: 1 given; allowed: any string'),
+        ('sim.episode_dir', 1, '1 given; allowed: any string; .*: "episode_dir:=\'2026\'"$'),
         ('sim.wait_for_commands', 1, 'wait_for_commands: 1 given; allowed: true, false'),
         ('policy.task', 'Fetch', "task: 'Fetch' given; allowed: '', 'FetchReach', "),
     ],

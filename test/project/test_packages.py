@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tarfile
 import zipfile
 from email.parser import Parser
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
 import yaml
 from catkin_pkg.package import parse_package
 from test_colcon_install import PYTHON_PACKAGES, tracked_files
+from test_layers import ROS, SOURCES, imports
 
 from support import ROOT
 
@@ -83,6 +86,31 @@ def test_the_metadata_are_whole(metadata) -> None:
     assert metadata['Description-Content-Type'] == 'text/markdown'
     assert metadata.get_payload().startswith('# fetch_hand_sim')
     assert metadata.get_all('Project-URL') and len(metadata.get_all('Classifier')) > 5
+
+
+def imported_packages() -> set[str]:
+    """Top-level names of what the sources import, wherever in them."""
+    found = (each for path in SOURCES for each in imports(path.read_text(), ''))
+    return {each.module.partition('.')[0] for each in found}
+
+
+def test_everything_that_is_imported_is_required(metadata) -> None:
+    """Not left to what another package happens to bring along."""
+    # MuJoCo's own backend of that name, and what works without it.
+    names = imported_packages() - {'glfw', *ROS}
+    owners = {name: set(found) for name, found in packages_distributions().items()}
+    required = {re.match(r'[\w.-]+', each)[0].lower() for each in metadata.get_all('Requires-Dist')}
+    missing = {
+        name
+        for name in names & set(owners) - {*PYTHON_PACKAGES, *sys.stdlib_module_names}
+        if not {each.lower().replace('_', '-') for each in owners[name]} & required
+    }
+    assert not missing
+
+
+def test_package_xml_names_every_ros_package_that_is_imported() -> None:
+    depends = {each.name for each in parse_package(ROOT / 'package.xml').build_depends}
+    assert imported_packages() & set(ROS) <= depends
 
 
 def test_the_base_installation_is_small(metadata) -> None:

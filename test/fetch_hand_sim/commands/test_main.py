@@ -81,6 +81,12 @@ def test_an_unknown_command_is_one_line(arguments, line, capsys):
         ([], []),
         (['task:=FetchPush', 'seed:=1'], ['--ros-args', '-p', 'task:=FetchPush', '-p', 'seed:=1']),
         (['--ros-args', '-p', 'seed:=1'], ['--ros-args', '-p', 'seed:=1']),
+        (
+            ['seed:=1', '--ros-args', '-r', 'commands:=c', '--', 'left over'],
+            ['--ros-args', '-p', 'seed:=1', '-r', 'commands:=c', '--', 'left over'],
+        ),
+        (['__ns:=/left', 'a:=1'], ['--ros-args', '-r', '__ns:=/left', '-p', 'a:=1']),
+        (['--task', 'a:=1'], ['--task', 'a:=1']),
         (['--help'], ['--help']),
     ],
 )

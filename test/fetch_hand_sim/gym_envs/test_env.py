@@ -356,6 +356,22 @@ def test_an_opengl_that_is_not_there_keeps_nothing_but_pictures(asked, monkeypat
         assert reason[0].startswith('rendering needs OpenGL: apt install')
 
 
+def test_egl_without_a_device_leaves_the_drawing_to_osmesa(monkeypatch, tmp_path):
+    for name in ('MUJOCO_GL', 'DISPLAY', 'WAYLAND_DISPLAY'):
+        monkeypatch.delenv(name, raising=False)
+    # EGL looks for its drivers there.
+    monkeypatch.setenv('__EGL_VENDOR_LIBRARY_DIRS', str(tmp_path))
+    code = (
+        'import fetch_hand_sim.simulation.opengl as opengl\n'
+        'is_installed = opengl._is_installed\n'
+        'opengl._is_installed = lambda name: "OSMesa" in name or is_installed(name)\n'
+        'opengl._use = print\n'
+        'print(opengl.prepare_opengl())'
+    )
+    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert result.stdout.splitlines() == ['osmesa', 'osmesa'], result.stderr
+
+
 RENDER_TWICE = RENDER.replace(
     'else:',
     '    try:\n        env.render()\n    except RuntimeError:\n        print("again")\nelse:',

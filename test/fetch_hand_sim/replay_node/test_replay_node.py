@@ -257,6 +257,23 @@ def test_a_replay_begins_with_commands_of_another_name(start_process, episode):
     assert finish(replay) == (0, '')
 
 
+def test_in_a_namespace_it_replays_a_robot_of_that_namespace(start_process, episode):
+    """Beside the robot without one, whose topics it leaves alone."""
+    options = ros_args(path=episode, wait_for_commands=True, start_paused=True)
+    with client(REACH) as listener:
+        replay = start_process(*REPLAY_NODE, *options, '-r', '__ns:=/left')
+        node = listener.node
+        left = [f'/left{name}' for name in read_episode(episode).topics if name != '/clock']
+        published = [name for name in left if not name.endswith('/commands')]
+        listener.spin_until(lambda: all(map(node.count_publishers, published)), 'its topics')
+        assert node.count_publishers('/clock') == 1
+        assert not any(node.count_publishers(name.removeprefix('/left')) for name in left)
+        commands = topic(REACH, 'commands')
+        node.create_publisher(ros_message_class(commands.type_name), '/left/commands', 10)
+        listener.call(SetBool, '/left/replay_node/pause', data=False)
+        assert finish(replay) == (0, '')
+
+
 def test_a_policy_goes_on_when_less_than_a_second_is_replayed_again(start_process, episode):
     with client(REACH) as listener:
         received = collect(listener, 'commands')
