@@ -54,7 +54,7 @@ COMMANDS = {
     ),
     'train': Command('train an actor', 'train_her'),
     'evaluate': Command('success of an actor over many episodes', 'evaluate_policy'),
-    'benchmark': Command("the paper's comparison, four arms", 'benchmark'),
+    'benchmark': Command("the paper's comparison, and studies of arms and seeds", 'benchmark'),
     'export': Command('write an actor as ONNX', 'export_actor'),
     'episodes': Command(
         'logged episodes: list, check, film, recover, export, generate',
@@ -63,7 +63,7 @@ COMMANDS = {
             'check': Command('run episodes again and compare every bit', 'check_episode'),
             'film': Command('a film or a picture, without a display', 'render_episode'),
             'recover': Command('make bags of what a crash cut off', 'recover_episodes'),
-            'export': Command('as Parquet or Minari datasets', 'export_episodes'),
+            'export': Command('as Parquet, Minari or LeRobot datasets', 'export_episodes'),
             'generate': Command('log an actor in the batched simulation', 'generate_episodes'),
         },
     ),

@@ -123,6 +123,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
         Raises:
             ValueError: If the action has a wrong shape or is not finite.
+            gymnasium.error.ResetNeeded: If it was never reset.
         """
         self._physics.send()
         result = self.simulation.step(clip_actions(np.asarray(action)[None]))

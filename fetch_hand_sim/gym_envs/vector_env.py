@@ -163,7 +163,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
         Raises:
             ValueError: If the actions have a wrong shape or are not finite.
-            gymnasium.error.ResetNeeded: In mode `DISABLED`, if an episode has ended.
+            gymnasium.error.ResetNeeded: If one was never reset or, in mode `DISABLED`, an
+                episode has ended.
         """
         started = self._ended
         if self.autoreset_mode is AutoresetMode.DISABLED and started.any():
