@@ -92,6 +92,7 @@ class ReplayNode(Node):
         """Publishes until the end of the episode, or until the signals say stop."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
+        self.get_logger().info(self._description())
         try:
             self._wait_for_commander(executor, stop)
             self._begin()
@@ -101,6 +102,19 @@ class ReplayNode(Node):
         finally:
             await_acknowledgements(self._publishers_by_topic.values())
             executor.remove_node(self)
+
+    def _description(self) -> str:
+        """What it is about to do, as a line for who started it."""
+        seconds = (self._schedule.end_ns - self._start_ns) / 1e9
+        parts = [
+            f'{self._settings["path"]}: {seconds:.2f} s, at {self._settings["rate"]:g} x real time',
+            f'topics in {self._name_here(self._schedule.namespace + "/").rstrip("/") or "/"}',
+        ]
+        if self._settings['wait_for_commands']:
+            parts.append('waits for commands')
+        if self._settings['start_paused']:
+            parts.append('paused until ~/pause is called with false')
+        return '; '.join(parts)
 
     def _wait_for_commander(self, executor: SingleThreadedExecutor, stop: StopSignals) -> None:
         """Shows the latched topics, from which a policy learns what robot this is.

@@ -221,13 +221,36 @@ def test_commands_are_published_only_when_asked_for(start_process, episode):
     np.testing.assert_array_equal(commands, expected)
 
 
+def assert_ends_well(replay, said=''):
+    """With 0, and what it said at the start as its only line."""
+    code, output = finish(replay)
+    assert (code, output.count('\n')) == (0, 1), output
+    assert 'real time; topics in /' in output and output.endswith(f'{said}\n')
+
+
+@pytest.mark.parametrize(
+    ('parameter', 'said'),
+    [
+        ('wait_for_commands', '2.00 s, at 1 x real time; topics in /; waits for commands'),
+        ('start_paused', '; topics in /; paused until ~/pause is called with false'),
+    ],
+)
+def test_a_replay_that_waits_says_for_what(parameter, said, start_process, episode):
+    replay = start_process(*REPLAY_NODE, *ros_args(path=episode, **{parameter: True}))
+    with client(REACH) as listener:
+        listener.subscribe('episode_status')
+        listener.spin_until(lambda: bool(listener.received['episode_status']), 'what is latched')
+        replay.send_signal(signal.SIGINT)
+        assert_ends_well(replay, said)
+
+
 def test_interrupt_ends_a_replay_without_a_word(start_process, episode):
     replay = start_process(*REPLAY_NODE, *ros_args(path=episode, loop=True))
     with client(REACH) as listener:
         listener.subscribe('joint_states')
         listener.spin_until(lambda: bool(listener.received['joint_states']), 'a tick')
         replay.send_signal(signal.SIGINT)
-        assert finish(replay) == (0, '')
+        assert_ends_well(replay)
 
 
 @pytest.mark.alone
@@ -245,7 +268,7 @@ def test_a_listener_that_hangs_holds_up_the_end_for_a_second(start_process, epis
         watcher.spin(1.5)
         replay.send_signal(signal.SIGINT)
         began = time.monotonic()
-        assert finish(replay) == (0, '')
+        assert_ends_well(replay)
     assert time.monotonic() - began < 6.0
 
 
@@ -254,7 +277,7 @@ def test_a_replay_begins_with_commands_of_another_name(start_process, episode):
     arguments = ros_args(path=episode, wait_for_commands=True, rate=10.0)
     replay = start_process(*REPLAY_NODE, *arguments, *commands)
     start_process(*POLICY_NODE, '--ros-args', *commands)
-    assert finish(replay) == (0, '')
+    assert_ends_well(replay)
 
 
 def test_in_a_namespace_it_replays_a_robot_of_that_namespace(start_process, episode):
