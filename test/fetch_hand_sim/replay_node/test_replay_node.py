@@ -294,7 +294,7 @@ def test_in_a_namespace_it_replays_a_robot_of_that_namespace(start_process, epis
         commands = topic(REACH, 'commands')
         node.create_publisher(ros_message_class(commands.type_name), '/left/commands', 10)
         listener.call(SetBool, '/left/replay_node/pause', data=False)
-        assert finish(replay) == (0, '')
+        assert_ends_well(replay)
 
 
 def test_a_policy_goes_on_when_less_than_a_second_is_replayed_again(start_process, episode):
