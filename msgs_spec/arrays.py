@@ -1,4 +1,4 @@
-"""The array that nearly everything here computes with."""
+"""The arrays that nearly everything here computes with and draws."""
 
 from __future__ import annotations
 
@@ -7,3 +7,5 @@ from numpy.typing import NDArray
 
 # Positions, commands, rewards: float64 throughout, as MuJoCo computes.
 Array = NDArray[np.float64]
+# Rows, columns, RGB.
+Picture = NDArray[np.uint8]

@@ -13,7 +13,7 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
@@ -242,11 +242,31 @@ def _stopping_is_said(name: str) -> Iterator[list[int]]:
     """Ctrl-C says `stopping` before it raises KeyboardInterrupt; a second one ends the process.
 
     SIGTERM and SIGHUP do the same, unless somebody else takes or ignores them: what is half written
-    is taken away. A terminal that closes may send several SIGHUP, so those after the first are
-    ignored.
+    is taken away.
 
     Yields:
         A list that will hold the signal.
+    """
+
+    def say_and_raise(number: int, frame: FrameType | None) -> None:
+        complain(name, 'stopping')
+        signal.default_int_handler(number, frame)
+
+    with on_stop_signals(_nobodys_signals(), say_and_raise) as received:
+        yield received
+
+
+@contextmanager
+def on_stop_signals(
+    numbers: Iterable[signal.Signals], stop: Callable[[int, FrameType | None], None]
+) -> Iterator[list[int]]:
+    """Calls `stop` when one of these signals comes for the first time; again, it ends the process.
+
+    But not a second SIGHUP: a closed terminal sends one, and the shell in it another; so after the
+    first they are ignored.
+
+    Yields:
+        A list that will hold the numbers of those that came.
     """
     received: list[int] = []
 
@@ -254,15 +274,15 @@ def _stopping_is_said(name: str) -> Iterator[list[int]]:
         received.append(number)
         signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
         discard_unread_output()
-        complain(name, 'stopping')
-        signal.default_int_handler(number, frame)
+        stop(number, frame)
 
-    before = {number: signal.signal(number, handle) for number in _nobodys_signals()}
+    before = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield received
     finally:
         for number, handler in before.items():
-            # A SIGHUP that is ignored by now has come once; the next one must not kill what ends.
+            # A SIGHUP that is ignored by now has come once, here or in a part of what ran: the next
+            # one must not kill what ends.
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, handler)
 

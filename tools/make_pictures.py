@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.films.film import write_film, write_picture
-from fetch_hand_sim.films.pictures import Picture, Studio, tile, with_frame
+from fetch_hand_sim.films.pictures import Studio, tile, with_frame
 from fetch_hand_sim.films.recording import Recording, load_recordings
+from msgs_spec.arrays import Picture
 from msgs_spec.command_line import progress
 from msgs_spec.tasks import TASKS
 from policy_node.training.generate_episodes import main as generate_episodes
@@ -90,7 +90,7 @@ def labelled(picture: Picture, text: str) -> Picture:
     return np.asarray(image)
 
 
-def film(acts: Sequence[Act]) -> Iterator[NDArray[np.uint8]]:
+def film(acts: Sequence[Act]) -> Iterator[Picture]:
     """Yields the sheets of the film."""
     studio = Studio(*TILE)
     players = [play(studio, act) for act in acts]

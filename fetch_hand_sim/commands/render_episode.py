@@ -11,10 +11,8 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fetch_hand_sim.commands.picture_size import picture_size
+from msgs_spec.arrays import Picture
 from msgs_spec.command_line import (
     EXIT_SUCCESS,
     CommandError,
@@ -94,15 +92,7 @@ def _check_is_used(options: argparse.Namespace) -> None:
 
 def _render(options: argparse.Namespace) -> None:
     from fetch_hand_sim.films.film import STILL, check_size, write_film, write_picture
-    from fetch_hand_sim.films.pictures import (
-        Picture,
-        Studio,
-        framed,
-        grid,
-        sheet_size,
-        sheets,
-        tile,
-    )
+    from fetch_hand_sim.films.pictures import Studio, framed, grid, sheet_size, sheets, tile
     from fetch_hand_sim.films.recording import Recording, find_playable, load_recordings
 
     columns, rows = options.grid or (1, 1)
@@ -133,9 +123,7 @@ def _render(options: argparse.Namespace) -> None:
         studio.close()
 
 
-def _counted(
-    pictures: Iterator[NDArray[np.uint8]], advance: Callable[[int], None]
-) -> Iterator[NDArray[np.uint8]]:
+def _counted(pictures: Iterator[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:
     for picture in pictures:
         yield picture
         advance(1)

@@ -37,7 +37,7 @@ def require_module(module: str) -> Any:
 
 @contextmanager
 def alone_in(directory: Path) -> Iterator[None]:
-    """Makes a folder and waits until no other export writes to it: each would find it empty."""
+    """Makes a folder and waits until nobody else who asks for that writes to it."""
     directory.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:

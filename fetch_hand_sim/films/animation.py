@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-Picture = NDArray[np.uint8]
+from msgs_spec.arrays import Picture
 
 # Of GIF and WebP: every colour kept would make files several times as large.
 _QUALITY = 72

@@ -11,11 +11,9 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from msgs_spec.arrays import Picture
 from msgs_spec.command_line import CommandError, UsageError
-
-Picture = NDArray[np.uint8]
 
 MOVING = ('.mp4', '.gif', '.webp')
 STILL = ('.png', '.jpg')

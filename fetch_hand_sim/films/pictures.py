@@ -7,13 +7,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.films.recording import Recording
 from fetch_hand_sim.simulation.rendering import SceneRenderer
 from fetch_hand_sim.simulation.scene import Scene, tracked_position
-
-Picture = NDArray[np.uint8]
+from msgs_spec.arrays import Picture
 
 _TRAIL_TICKS = 40
 _GAP = 2

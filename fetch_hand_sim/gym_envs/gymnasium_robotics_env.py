@@ -53,6 +53,11 @@ CAMERAS: dict[str, dict[str, Any]] = {
 }
 
 
+def as_reference(reward: Any, reward_type: str) -> Any:
+    """A reward, or an array of them, with the reference's type: float32 if it is sparse."""
+    return reward.astype(np.float32) if reward_type == 'sparse' else reward
+
+
 class RobotEnv(FetchHandEnv, GoalEnv):
     """What all Fetch and hand environments of the reference have (`robot_env.py`).
 
@@ -130,12 +135,13 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         observation, reward, terminated, truncated, info = super().step(action)
         info['is_success'] = np.float32(info['is_success'])
         if not self.rewards_otherwise:
-            reward = self._as_reference(np.float64(reward))
+            reward = as_reference(np.float64(reward), self.reward_type)
         return observation, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
         """Reward of goals of any batch shape: float32 if sparse, a number for a single goal."""
-        return self._as_reference(super().compute_reward(achieved_goal, goal, info)[()])
+        reward = super().compute_reward(achieved_goal, goal, info)[()]
+        return as_reference(reward, self.reward_type)
 
     @property
     def has_object(self) -> bool:
@@ -163,9 +169,6 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     def __getstate__(self) -> dict[str, Any]:
         """As `FetchHandEnv`, without OpenGL."""
         return super().__getstate__() | {'_mujoco_renderer': None}
-
-    def _as_reference(self, reward: Any) -> Any:
-        return reward.astype(np.float32) if self.reward_type == 'sparse' else reward
 
     def _get_obs(self) -> Observation:
         self._physics.send()

@@ -13,6 +13,7 @@ from fetch_hand_sim.gym_envs.gymnasium_robotics_env import (
     CAMERAS,
     SIZE,
     RobotEnv,
+    as_reference,
     make_env,
     task_with_goals,
 )
@@ -92,7 +93,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
     def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
         """Reward of goals of any batch shape: float32 if sparse, a number for a single goal."""
         reward = super().compute_reward(achieved_goal, goal, info)[()]
-        return reward.astype(np.float32) if self.reward_type == 'sparse' else reward
+        return as_reference(reward, self.reward_type)
 
     def attributes(self, name: str) -> tuple[Any, ...]:
         """As `FetchHandVectorEnv`; also what is stated of the task, such as `initial_qpos`."""

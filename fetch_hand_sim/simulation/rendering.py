@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.opengl import ADVICE, prepare_opengl
 from fetch_hand_sim.simulation.scene import SHOWN_SITES, Frame, Scene
 from fetch_hand_sim.simulation.simulation import Simulation
-from msgs_spec.arrays import Array
+from msgs_spec.arrays import Array, Picture
 
 WIDTH, HEIGHT = 640, 480
 LARGEST_SIDE = 4096
@@ -56,7 +56,7 @@ class SceneRenderer:
         except Exception as error:
             raise RuntimeError(f'{ADVICE} ({error})') from error
 
-    def render(self, frame: Frame, trail: Sequence[Array] = ()) -> NDArray[np.uint8]:
+    def render(self, frame: Frame, trail: Sequence[Array] = ()) -> Picture:
         """Returns the picture of a frame, (height, width, 3).
 
         Args:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.rendering import SceneRenderer
 from fetch_hand_sim.simulation.scene import Frame, Scene
+from msgs_spec.arrays import Picture
 
 
 class Camera:
@@ -33,7 +33,7 @@ class Camera:
         """Whether it is time for the next picture."""
         return np.isfinite(self._period) and self._clock() >= self._due
 
-    def render(self, scene: Scene, frame: Frame) -> NDArray[np.uint8]:
+    def render(self, scene: Scene, frame: Frame) -> Picture:
         """Returns a picture (height, width, 3); the first one opens OpenGL.
 
         Raises:

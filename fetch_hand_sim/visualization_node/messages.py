@@ -10,7 +10,6 @@ import numpy as np
 import PIL.Image
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Quaternion, TransformStamped, Vector3
-from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
@@ -18,7 +17,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from fetch_hand_sim.simulation.scene import Marker as Shape
 from fetch_hand_sim.simulation.urdf import ROOT
 from fetch_hand_sim.visualization_node.transforms import Transform
-from msgs_spec.arrays import Array
+from msgs_spec.arrays import Array, Picture
 
 _GEOM = mujoco.mjtGeom
 _SHAPES = {
@@ -82,7 +81,7 @@ def marker_array(shapes: Mapping[str, Sequence[Shape]], stamp_ns: int) -> Marker
     return MarkerArray(markers=markers)
 
 
-def image_message(picture: NDArray[np.uint8], frame_id: str, stamp_ns: int) -> Image:
+def image_message(picture: Picture, frame_id: str, stamp_ns: int) -> Image:
     """Returns a picture (height, width, 3), red first."""
     height, width = picture.shape[:2]
     message = Image(
@@ -96,7 +95,7 @@ def image_message(picture: NDArray[np.uint8], frame_id: str, stamp_ns: int) -> I
     return message
 
 
-def compressed_message(picture: NDArray[np.uint8], frame_id: str, stamp_ns: int) -> CompressedImage:
+def compressed_message(picture: Picture, frame_id: str, stamp_ns: int) -> CompressedImage:
     """Returns a picture (height, width, 3), red first, as JPEG."""
     file = BytesIO()
     PIL.Image.fromarray(picture).save(file, 'JPEG', quality=_JPEG_QUALITY)

@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 
 from fetch_hand_sim.simulation.scene import Scene
@@ -28,6 +26,7 @@ from fetch_hand_sim.visualization_node.transforms import (
     frame_prefix,
     view_transform,
 )
+from msgs_spec.arrays import Picture
 from msgs_spec.listeners import Listeners
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.ros import (
@@ -46,7 +45,7 @@ from msgs_spec.topics import TopicSpec
 from msgs_spec.view_topics import SHOWN, scalar_topics
 
 _CAMERA_FRAME = 'camera'
-_PICTURES: dict[str, Callable[[NDArray[np.uint8], str, int], Any]] = {
+_PICTURES: dict[str, Callable[[Picture, str, int], Any]] = {
     'camera/image_raw': image_message,
     'camera/image_raw/compressed': compressed_message,
 }

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 # The largest actor of the paper's size has 0.7 MB.
 LARGEST_POLICY = 64 * 2**20
@@ -82,6 +84,11 @@ def _named(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise type(error)(error.errno, error.strerror, str(path)) from None
+
+
+def to_json(values: Mapping[str, Any]) -> bytes:
+    """Contents of a JSON file, as all commands here write and print it."""
+    return (json.dumps(values, indent=2) + '\n').encode()
 
 
 def sha256(data: bytes) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +24,7 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
-from policy_node.policies.files import write_file
+from policy_node.policies.files import to_json, write_file
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import (
     FIRST_SEED,
@@ -108,7 +107,7 @@ def _run(options: argparse.Namespace) -> int:
 def _show(report: dict[str, Any], json_file: Path | None) -> None:
     """Prints the summary: a table, or JSON where that was asked for without a file."""
     if json_file == _STDOUT:
-        print(json.dumps(report, indent=2), flush=True)
+        print(to_json(report).decode(), end='', flush=True)
     else:
         print_table(report)
 
@@ -120,7 +119,7 @@ def _write(report: dict[str, Any], outcomes: EpisodeOutcomes, options: argparse.
         OSError: If there is no room for one.
     """
     if options.json not in (None, _STDOUT):
-        write_file(options.json, f'{json.dumps(report, indent=2)}\n'.encode())
+        write_file(options.json, to_json(report))
     if options.csv is not None:
         write_file(options.csv, to_csv(outcomes))
 

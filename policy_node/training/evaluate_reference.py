@@ -24,7 +24,7 @@ from msgs_spec.command_line import (
 )
 from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
-from policy_node.policies.files import write_file
+from policy_node.policies.files import to_json, write_file
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
 from policy_node.training.policy_options import (
@@ -122,7 +122,7 @@ def _write(file: Path, report: dict[str, Any]) -> None:
         CommandError: If there is no room for it.
     """
     try:
-        write_file(file, (json.dumps(report, indent=2) + '\n').encode())
+        write_file(file, to_json(report))
     except OSError as error:
         raise CommandError(str(error)) from None
 

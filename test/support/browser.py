@@ -18,9 +18,10 @@ from threading import Thread
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 from websockets.sync.client import connect
+
+from msgs_spec.arrays import Picture
 
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
 SIZE = (960, 640)
@@ -142,7 +143,7 @@ class Browser:
             'left-- > 0 ? requestAnimationFrame(next) : done(); next(); })'
         )
 
-    def screenshot(self) -> NDArray[np.uint8]:
+    def screenshot(self) -> Picture:
         """What the page shows, (height, width, 3)."""
         data = base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
         return np.asarray(Image.open(BytesIO(data)).convert('RGB'))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from policy_node.policies import checkpoint
-from policy_node.policies.files import write_file
+from policy_node.policies.files import to_json, write_file
 from policy_node.training.benchmark.machines import machine
 from policy_node.training.collection.simulations import make_simulation
 from policy_node.training.configuration.config import TrainConfig
@@ -44,7 +44,7 @@ def measure_final(config: TrainConfig, folder: Path, episodes: int) -> None:
         'first_seed': FIRST_SEED,
         'machine': machine(),
     }
-    write_file(folder / FINAL_FILE, (json.dumps(found, indent=2) + '\n').encode())
+    write_file(folder / FINAL_FILE, to_json(found))
 
 
 def read_final(folder: Path) -> dict[str, Any] | None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies.files import write_files
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import (
@@ -20,7 +21,7 @@ from policy_node.training.benchmark.measures import (
     sum_up,
 )
 from policy_node.training.benchmark.results import Band, Curve, aggregate, draw, to_csv
-from policy_node.training.benchmark.stored_runs import RUN, Rows, StoredRuns, locked, run_of
+from policy_node.training.benchmark.stored_runs import RUN, Rows, StoredRuns, run_of
 from policy_node.training.benchmark.study import Study
 
 # The page of a study keeps its table between these lines.
@@ -47,7 +48,7 @@ def write_study(study: Study, jobs: Sequence[Job], output: Path, command: str) -
         ValueError: If a file of the folder cannot be read.
         OSError: If the report cannot be written; that of before stays then.
     """
-    with locked(output):
+    with alone_in(output):
         stored = StoredRuns.read(output)
         stored.add(jobs, command)
         data = stored.files(study)

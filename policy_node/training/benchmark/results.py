@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from rich.table import Table
 
 from msgs_spec.tasks import task_spec
 from policy_node.policies.checkpoint import read_info
-from policy_node.policies.files import write_files
+from policy_node.policies.files import to_json, write_files
 from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, PROGRESS_FILE, Job
 from policy_node.training.benchmark.machines import machine
 from policy_node.training.benchmark.published import BEST, RERUN
@@ -285,8 +284,3 @@ def to_csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
     writer.writeheader()
     writer.writerows(rows)
     return file.getvalue().encode()
-
-
-def to_json(values: Mapping[str, Any]) -> bytes:
-    """A JSON file."""
-    return (json.dumps(values, indent=2) + '\n').encode()

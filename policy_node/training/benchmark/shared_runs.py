@@ -7,9 +7,10 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies.files import write_files
 from policy_node.training.benchmark.jobs import Job, run_name
-from policy_node.training.benchmark.stored_runs import ABOUT, StoredRuns, locked, run_of
+from policy_node.training.benchmark.stored_runs import ABOUT, StoredRuns, run_of
 from policy_node.training.benchmark.study import Study
 from policy_node.training.runs.run_folder import STATE_FILE
 
@@ -48,7 +49,7 @@ def take_from_other_reports(study: Study, jobs: Sequence[Job], report: Path) -> 
         jobs: Its jobs; those that its report holds, or that have begun, are left alone.
         report: Its report, among those of the other studies.
     """
-    with locked(report):
+    with alone_in(report):
         stored, others = StoredRuns.read(report), _reports_beside(report)
         for job in jobs:
             if job.folder.exists() or stored.holds(job):

@@ -6,21 +6,19 @@ configured; runs that were configured otherwise are not put beside them.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import dataclasses
-import fcntl
 import json
 import math
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from policy_node.policies.files import to_json
 from policy_node.training.benchmark.jobs import Job, differing_fields, run_name
 from policy_node.training.benchmark.measures import curve_of, measure_run
-from policy_node.training.benchmark.results import curve_rows, to_csv, to_json
+from policy_node.training.benchmark.results import curve_rows, to_csv
 from policy_node.training.benchmark.study import Study
 from policy_node.training.configuration.config_values import config_from_dict
 from policy_node.training.configuration.recipes import STEP_COUNTS
@@ -205,20 +203,6 @@ class StoredRuns:
         for told in self.tasks.values():
             ordered = sorted(told['arms'].items(), key=lambda item: _index(arms, item[0]))
             told['arms'] = dict(ordered)
-
-
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Makes a report's folder and waits until no other process renews it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        # Some file systems have no locks.
-        with contextlib.suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def own_fields(study: Study) -> set[str]:

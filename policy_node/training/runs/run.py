@@ -15,7 +15,7 @@ from msgs_spec.command_line import (
     CommandError,
     UsageError,
     complain,
-    discard_unread_output,
+    on_stop_signals,
     require_extra,
 )
 from policy_node.policies.files import one_line
@@ -194,29 +194,19 @@ def _initial_networks(config: TrainConfig) -> InitialNetworks:
 def _stop_on_signals(trainer: Trainer) -> Iterator[list[int]]:
     """Ctrl-C, SIGTERM and SIGHUP end the run after the cycle; a second one ends it at once.
 
-    But not a second SIGHUP: a closed terminal sends one, and the shell in it another; so after the
-    first they are ignored. Where they are from the start, as `nohup` has it, that stays so.
+    A SIGHUP that is ignored from the start, as `nohup` has it, stays so.
 
     Yields:
         A list that will hold the number of the signal.
     """
-    received: list[int] = []
 
-    def handle(number: int, frame: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         del frame
-        received.append(number)
         trainer.stop(f'stopped by {signal.Signals(number).name}')
-        signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
-        discard_unread_output()
         complain(NAME, 'stopping after this cycle; once more stops at once')
 
     numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
     if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
         numbers.remove(signal.SIGHUP)
-    before = {number: signal.signal(number, handle) for number in numbers}
-    try:
+    with on_stop_signals(numbers, stop) as received:
         yield received
-    finally:
-        for number, handler in before.items():
-            if number != signal.SIGHUP or number not in received:
-                signal.signal(number, handler)

@@ -10,7 +10,7 @@ from typing import Any
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.command_line import discard_unread_output
 from policy_node.policies import checkpoint
-from policy_node.policies.files import write_file
+from policy_node.policies.files import to_json, write_file
 from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, summarize
 from policy_node.training.evaluation.table import print_table
 from policy_node.training.policy_options import require_writable
@@ -107,7 +107,7 @@ def ship(
     # A mean of networks, taken as it is, has no curve of its own: that of a part stays.
     if progress[-1].get('updates') or not curve.is_file():
         draw_curve(progress, title, curve)
-    write_file(shipped, (json.dumps(report, indent=2) + '\n').encode())
+    write_file(shipped, to_json(report))
     print(f'ship_actor: {target} is the actor of {run} now')
     return True
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies.files import write_files
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.final import FINAL_FILE
@@ -23,7 +24,7 @@ from policy_node.training.benchmark.shared_runs import (
     take_from_other_reports,
     take_from_other_studies,
 )
-from policy_node.training.benchmark.stored_runs import StoredRuns, locked, own_fields, read_rows
+from policy_node.training.benchmark.stored_runs import StoredRuns, own_fields, read_rows
 from policy_node.training.benchmark.studies import PAPER
 from policy_node.training.benchmark.study import Study, research_jobs
 from policy_node.training.benchmark.workers import Outcome, attempt
@@ -341,7 +342,7 @@ def test_reports_that_renew_a_page_at_once_lose_nothing(
     report, jobs = tmp_path / 'report', jobs_of('returns', '--arms', 'one')
 
     def renew(job: Job) -> None:
-        with locked(report):
+        with alone_in(report):
             stored_runs(report, [job])
 
     with ThreadPoolExecutor(len(jobs)) as pool:

@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 import torch
 
+from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.tensor_file import read_tensors, write_tensors
-from policy_node.training.benchmark.stored_runs import locked
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
@@ -285,7 +285,7 @@ def test_a_file_system_without_locks_takes_runs(
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
 
     monkeypatch.setattr(fcntl, 'flock', refuse)
-    with lock_run(tmp_path / 'run'), locked(tmp_path / 'report'):
+    with lock_run(tmp_path / 'run'), alone_in(tmp_path / 'report'):
         pass
     said = capsys.readouterr().err
     assert 'cannot be kept from other processes: no locks where it lies' in said
