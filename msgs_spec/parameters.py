@@ -19,6 +19,8 @@ from msgs_spec.tasks import (
 )
 
 Value = str | int | float | bool
+# Of topics that are ROS's own.
+_ROS_QOS = tuple(f'qos_overrides./{name}.' for name in ('clock', 'parameter_events', 'rosout'))
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,8 +303,10 @@ def unknown_parameter(specs: Sequence[ParameterSpec], name: str) -> str | None:
     are often written for several nodes.
     """
     is_known = any(name in (spec.name, spec.former) for node in NODES.values() for spec in node)
-    if is_known or name == 'use_sim_time' or name.startswith('qos_overrides.'):
+    if is_known or name == 'use_sim_time' or name.startswith(_ROS_QOS):
         return None
+    if name.startswith('qos_overrides.'):
+        return f'{name} is ignored: the quality of service of all topics is fixed'
     # Who mistypes a former name means the one of today.
     names = {known: spec.name for spec in specs for known in (spec.former, spec.name)}
     hint = did_you_mean(name, names)

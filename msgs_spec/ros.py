@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from importlib import import_module
+from itertools import pairwise
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -376,7 +377,7 @@ def run_node(
     from rclpy.signals import SignalHandlerOptions
 
     try:
-        _refuse_plain_arguments(sys.argv[1:] if args is None else args)
+        _refuse_arguments(sys.argv[1:] if args is None else args)
         _initialise(rclpy.init, args, SignalHandlerOptions.NO)
         run(stop)
     except CommandError as error:
@@ -401,10 +402,13 @@ def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any
         raise UsageError(' '.join(str(error).split())) from None
 
 
-def _refuse_plain_arguments(args: Sequence[str]) -> None:
-    """Rejects what stands outside of `--ros-args ... --`, which rclpy would ignore."""
+def _refuse_arguments(args: Sequence[str]) -> None:
+    """Rejects what stands outside of `--ros-args ... --`, which rclpy would ignore.
+
+    Also a parameter without a value, of which it would say `error not set`.
+    """
     inside = False
-    for arg in args:
+    for before, arg in pairwise(['', *args]):
         if arg == '--ros-args':
             inside = True
         elif arg == '--':
@@ -414,3 +418,5 @@ def _refuse_plain_arguments(args: Sequence[str]) -> None:
                 f'unknown argument {arg!r}; parameters are given as --ros-args -p <name>:=<value>, '
                 'or as <name>:=<value> alone after `fetch_hand_sim sim`, `policy`, ...'
             )
+        elif before in ('-p', '--param') and arg.endswith(':='):
+            raise UsageError(f'{arg} has no value; an empty text is given as {arg}"\'\'"')

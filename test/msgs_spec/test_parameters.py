@@ -172,6 +172,26 @@ def test_a_mistyped_former_name_points_to_that_of_today():
     assert line == "there is no parameter 'chekpoint'; did you mean 'policy'?"
 
 
+def test_quality_of_service_that_is_fixed_is_not_ignored_without_a_word():
+    line = unknown_parameter(SIM_NODE, 'qos_overrides./joint_states.publisher.depth')
+    assert line is not None and line.endswith('the quality of service of all topics is fixed')
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['task:=FetchPush'], "sim_node: unknown argument 'task:=FetchPush'; parameters are given"),
+        (['--ros-args', '-p', 'task:=FetchPush', '--', 'x'], "sim_node: unknown argument 'x'; "),
+        (['--ros-args', '-p', 'joint_prefix:='], 'sim_node: joint_prefix:= has no value; '),
+    ],
+)
+def test_what_rclpy_ignores_or_does_not_explain_is_one_line(arguments, message):
+    command = [sys.executable, '-m', 'fetch_hand_sim.sim_node', *arguments]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.startswith(message) and done.stdout == ''
+    assert done.stderr.count('\n') == 1
+
+
 @pytest.mark.parametrize('name', ['qos_overrides./clock.publisher.depth', 'use_sim_time', 'rate'])
 def test_parameters_of_others_are_no_mistake(name):
     assert unknown_parameter(SIM_NODE, name) is None
