@@ -116,10 +116,9 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for names, group in ((_SUMMED_UP, runs), (_SUMMED_UP_IN_TIME, timed)):
         for name in names:
             found |= _quartiles(name, [float(run[name]) for run in group])
-    # A censored run counts as slower than any other; the middle of an even number with one has no
-    # value, so the slower one counts.
-    ordered = sorted(float('inf') if steps == '' else float(steps) for steps in reached)
-    middle = ordered[len(ordered) // 2]
+    # A censored run counts as slower than any other, and as one of the two in the middle it leaves
+    # no mean of them.
+    middle = np.median([float('inf') if steps == '' else float(steps) for steps in reached])
     found[f'steps_to_{GOOD_SUCCESS}_median'] = '' if np.isinf(middle) else int(middle)
     found['reached'] = sum(steps != '' for steps in reached)
     return found

@@ -128,6 +128,10 @@ def test_a_censored_run_is_slower_than_any_other() -> None:
     assert (row['steps_to_0.9_median'], row['reached'], row['area_median']) == (300, 2, 0.2)
     row = sum_up([run(0.1, '', 0.5), run(0.2, '', 0.9), run(0.3, 100, 1.0)])
     assert (row['steps_to_0.9_median'], row['reached']) == ('', 1)
+    row = sum_up([run(0.1, 300, 0.9), run(0.3, 100, 1.0)])
+    assert (row['steps_to_0.9_median'], row['reached']) == (200, 2)
+    row = sum_up([run(0.1, '', 0.5), run(0.3, 100, 1.0)])
+    assert (row['steps_to_0.9_median'], row['reached']) == ('', 1)
 
 
 def test_arms_are_apart_where_quartiles_do_not_touch() -> None:
