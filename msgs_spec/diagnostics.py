@@ -21,6 +21,14 @@ from msgs_spec.topics import DIAGNOSTICS
 REPORT_PERIOD = 1.0
 
 
+def next_report(due: float, now: float) -> float:
+    """When the report after one that was due, and is made now, is due: seconds of a steady clock.
+
+    Periods keep their beat unless one was missed: then the next one is whole, too.
+    """
+    return due + REPORT_PERIOD if due + REPORT_PERIOD > now else now + REPORT_PERIOD
+
+
 class Level(IntEnum):
     """The levels of `diagnostic_msgs/DiagnosticStatus`."""
 

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 BEAT = 0.1
 # Seconds for what was said last to be heard.
 _LAST_WORDS_SECONDS = 1.0
+# Callbacks that an executor is asked for which does not say whether there are any.
+_SERVED_BLINDLY = 10
 # In which who is there is found for sure.
 DISCOVERY_TIME = 2.0
 # Seconds after which the graph has forgotten a process that was killed: until then it may stand
@@ -131,7 +133,9 @@ class EventLoop:
                 nothing.
         """
         if not self._is_queue:
-            self._executor.spin_once(timeout_sec=0.0)
+            # It says neither what waits nor whether it has served anything, and asking takes time.
+            for _ in range(min(limit, _SERVED_BLINDLY)):
+                self._executor.spin_once(timeout_sec=0.0)
             return
         # First in, first out: the mark comes last of what is there.
         reached: list[bool] = []
@@ -418,5 +422,5 @@ def _refuse_arguments(args: Sequence[str]) -> None:
                 f'unknown argument {arg!r}; parameters are given as --ros-args -p <name>:=<value>, '
                 'or as <name>:=<value> alone after `fetch_hand_sim sim`, `policy`, ...'
             )
-        elif before in ('-p', '--param') and arg.endswith(':='):
+        elif before in ('-p', '--param') and arg.partition(':=')[1:] == (':=', ''):
             raise UsageError(f'{arg} has no value; an empty text is given as {arg}"\'\'"')

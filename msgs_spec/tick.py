@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -78,7 +79,7 @@ class EpisodeStatus:
         """Reads the key/value pairs of a message; other keys than the attributes are ignored.
 
         Raises:
-            ValueError: If a pair is missing or cannot be read.
+            ValueError: If a pair is missing or cannot be read, or nothing can run at the rate.
         """
         values = {'joint_prefix': JOINT_PREFIX, **values}
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
@@ -87,7 +88,7 @@ class EpisodeStatus:
         phases: dict[str, Phase] = {phase: phase for phase in PHASES}
         flags = {'True': True, 'False': False}
         try:
-            return cls(
+            status = cls(
                 task=values['task'],
                 episode=int(values['episode']),
                 seed=int(values['seed']),
@@ -102,6 +103,9 @@ class EpisodeStatus:
             )
         except (KeyError, ValueError) as error:
             raise ValueError(f'episode_status with unreadable value: {error}') from None
+        if not 0.0 < status.control_hz < math.inf:
+            raise ValueError(f'episode_status with control_hz {status.control_hz}')
+        return status
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -63,8 +63,8 @@ class EpisodeRecorder:
         directory: Where episodes are collected.
         namespace: ROS namespace of relative topic names.
         attachments: Files stored with every episode.
-        metadata: Makes the metadata of an episode from the status of its first tick; called by the
-            writing thread.
+        metadata: Makes the metadata of an episode from the status of its first tick, when it is
+            recorded.
         on_error: Called once, with one line, when the disk fails, by any thread.
         on_logged: Called for every completed file, by a thread of its own.
         on_slow: Called with one line when the robot has to wait for the disk, now and then.
@@ -87,6 +87,7 @@ class EpisodeRecorder:
     ) -> None:
         self.has_failed = False
         self.waited_s = 0.0
+        self._metadata = metadata
         self._on_error = on_error
         self._on_slow = on_slow
         self._waited_said_s = self._say_after = 0.0
@@ -96,7 +97,6 @@ class EpisodeRecorder:
         self._files = _EpisodeFiles(
             EpisodeDirectory(directory, namespace=namespace),
             attachments,
-            metadata,
             self._fail,
             on_logged,
         )
@@ -108,7 +108,8 @@ class EpisodeRecorder:
         if tick.status.phase == 'reset':
             self._end('reset before the end')
             if not self.has_failed:
-                self._put(partial(self._files.begin, tick.status))
+                metadata = self._metadata(tick.status)
+                self._put(partial(self._files.begin, tick.status, metadata))
                 self._status = tick.status
         if self._status is None:
             return
@@ -194,13 +195,11 @@ class _EpisodeFiles:
         self,
         episodes: EpisodeDirectory,
         attachments: Sequence[Attachment],
-        metadata: Callable[[EpisodeStatus], Mapping[str, str]],
         on_error: Callable[[str], None],
         on_logged: Callable[[LoggedEpisode], None],
     ) -> None:
         self._episodes = episodes
         self._attachments = attachments
-        self._metadata = metadata
         self._on_error = on_error
         self._on_logged = on_logged
         self._writer: EpisodeWriter | None = None
@@ -217,12 +216,10 @@ class _EpisodeFiles:
         if self._writer is not None:
             self._writer.flush()
 
-    def begin(self, status: EpisodeStatus) -> None:
+    def begin(self, status: EpisodeStatus, metadata: Mapping[str, str]) -> None:
         """Begins the file of an episode with this first status."""
         self._room.acquire()
-        self._writer = self._episodes.begin(
-            status.task, status.seed, self._metadata(status), self._attachments
-        )
+        self._writer = self._episodes.begin(status.task, status.seed, metadata, self._attachments)
 
     def write_tick(self, stamp_ns: int, messages: Messages) -> None:
         """Writes the messages of a tick."""

@@ -75,7 +75,7 @@ class EpisodeRunner:
     @property
     def is_done(self) -> bool:
         """Whether all episodes asked for are finished."""
-        return 0 < self._episodes <= self.episode
+        return 0 < self._episodes <= self.episode - self._first_episode
 
     @property
     def seed(self) -> int:

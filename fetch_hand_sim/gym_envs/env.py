@@ -14,6 +14,7 @@ from fetch_hand_sim.gym_envs.shared_physics import SharedPhysics
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
 from fetch_hand_sim.simulation import Observation, Simulation
+from fetch_hand_sim.simulation.arguments import finite_goal
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
@@ -154,8 +155,9 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
     @goal.setter
     def goal(self, goal: ArrayLike) -> None:
+        given = finite_goal(goal, self.simulation.spec)
         self._release_goal()
-        self.simulation.goals[0] = goal
+        self.simulation.goals[0] = given
 
     def render(self) -> Image | None:
         """Returns a picture of the robot and its goal.

@@ -318,6 +318,10 @@ def _goal_kind(task: str) -> tuple[str, str]:
 
 def task_with_goals(task: str, position: str | None, rotation: str | None) -> str:
     """The task of the same object with other goals."""
+    if task not in MANIPULATE_CONFIGS:
+        raise ValueError(
+            f'task {task!r} has no object in the hand; allowed: {", ".join(MANIPULATE_CONFIGS)}'
+        )
     own = _goal_kind(task)
     wanted = (position or own[0], rotation or own[1])
     asset = MANIPULATE_CONFIGS[task].asset

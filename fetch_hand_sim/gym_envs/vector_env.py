@@ -17,7 +17,7 @@ from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures, check_rende
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
-from fetch_hand_sim.simulation.arguments import require_whole
+from fetch_hand_sim.simulation.arguments import finite_goal, require_whole
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
@@ -279,13 +279,14 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
         Raises:
             AttributeError: If there is no such attribute, or it cannot be set.
-            ValueError: If there are too many or too few, or a shared one would differ.
+            ValueError: If there are too many or too few, a goal is none, or a shared one would
+                differ.
         """
         each = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
         if len(each) != self.num_envs:
             raise ValueError(f'{self.num_envs} environments take as many values, not {len(each)}')
         if name == 'goal':
-            self.simulation.goals[:] = each
+            self.simulation.goals[:] = [finite_goal(goal, self.simulation.spec) for goal in each]
         elif name not in _SETTABLE:
             allowed = ', '.join(('goal', *_SETTABLE))
             raise AttributeError(f'{name!r} of a batch cannot be set; allowed: {allowed}')

@@ -30,7 +30,7 @@ from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports
+from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports, next_report
 from msgs_spec.parameters import SIM_NODE
 from msgs_spec.ros import (
     BEAT,
@@ -260,7 +260,7 @@ class SimNode(Node):
         if now - self._ticked_at >= BEAT:
             self._stand_still(now)
         if now >= self._report_due:
-            self._report_due = max(self._report_due + REPORT_PERIOD, now)
+            self._report_due = next_report(self._report_due, now)
             self._report(now)
 
     def _stand_still(self, now: float) -> None:

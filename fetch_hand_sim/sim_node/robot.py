@@ -93,7 +93,7 @@ class Robot:
         self._clock = clock
         self._encoder = TickEncoder(runner.spec)
         self.last_messages: Messages = []
-        self._ticked_at = -math.inf
+        self._ticked_at = self._resumed_at = -math.inf
         self._reset_due: float | None = None
 
     def wait(self) -> float:
@@ -116,17 +116,19 @@ class Robot:
 
     @property
     def misses_commands(self) -> bool:
-        """Whether a second or more has passed without a command that is due.
+        """Whether a second or more has passed without a command that is due, pauses left out.
 
-        That is one for the next tick in lockstep, and any where there was one before.
+        That is one for the next tick in lockstep, and any where there was one before; there
+        `command_timeout` and two ticks in slow motion may be longer than a second.
         """
         schedule = self.schedule
         if schedule.is_paused or not self.runner.has_started:
             return False
+        now = self._clock()
         if schedule.mode == 'lockstep':
-            return self._clock() - self._ticked_at > _LONGEST_SILENCE
+            return now - max(self._ticked_at, self._resumed_at) > _LONGEST_SILENCE
         silence = max(_LONGEST_SILENCE, self.buffer.timeout, 2.0 * schedule.pacer.period)
-        return (self.buffer.age() or 0.0) > silence
+        return min(self.buffer.age() or 0.0, now - self._resumed_at) > silence
 
     def tick_when_due(self) -> None:
         """Runs the tick that `wait` says is due."""
@@ -229,6 +231,7 @@ class Robot:
         if paused == self.schedule.is_paused:
             return Answer(True, 'already paused' if paused else 'already running')
         self.schedule.set_paused(paused, self._clock())
+        self._resumed_at = self._clock()
         return Answer(True, f'{"paused" if paused else "running"} at {self._now()}')
 
     def step(self, ticks: int = 1) -> Answer:

@@ -9,6 +9,9 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
+from msgs_spec.arrays import Array
+from msgs_spec.tasks import TaskSpec
+
 Seed = int | np.random.Generator | None
 Seeds = int | Sequence[Seed] | None
 
@@ -47,6 +50,18 @@ def finite_numbers(
     if not np.isfinite(array).all():
         env, part = np.argwhere(~np.isfinite(array))[0]
         raise ValueError(f'{name} must be finite; {name}[{env}, {part}] is {array[env, part]}')
+    return array
+
+
+def finite_goal(goal: ArrayLike, spec: TaskSpec) -> Array:
+    """A goal (goal size,) of a task.
+
+    Raises:
+        ValueError: If it has another shape, or something is no finite number.
+    """
+    array = np.asarray(goal, dtype=np.float64)
+    if array.shape != (spec.goal.size,) or not np.isfinite(array).all():
+        raise ValueError(f'a goal of {spec.name} is {spec.goal.size} finite numbers, not {goal!r}')
     return array
 
 

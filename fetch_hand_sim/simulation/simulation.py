@@ -6,6 +6,7 @@ no steps and ends no episodes: whoever drives it decides.
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
 from dataclasses import dataclass
@@ -302,7 +303,8 @@ class Simulation:
             index: Which simulation.
 
         Raises:
-            ValueError: If there is no such body that can move, or a value is not finite.
+            ValueError: If there is no such simulation, no such body that can move, or a value is
+                not finite.
         """
         values = np.asarray(wrench, dtype=np.float64)
         if values.shape != (6,) or not np.isfinite(values).all():
@@ -310,7 +312,7 @@ class Simulation:
         number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY.value, body)
         if number < 1 or not self.model.body_weldid[number]:
             raise ValueError(f'no body {body[:40]!r} that can move')
-        self._pushes[index, number] = values
+        self._pushes[selected_simulations([index], self.num_envs), number] = values
         self._is_pushed = True
 
     def resting_commands(self) -> Array:
@@ -324,6 +326,10 @@ class Simulation:
     def observe(self) -> Observation:
         """The observation as it is now, fresh arrays."""
         return self._observation(*self._task.observe())
+
+    def __copy__(self) -> Simulation:
+        """As `copy.deepcopy`: two simulations have no physics or generators in common."""
+        return copy.deepcopy(self)
 
     def __getstate__(self) -> dict[str, Any]:
         """Arguments and everything that decides the future, for `pickle` and `copy.deepcopy`."""

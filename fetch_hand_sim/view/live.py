@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections import deque
 from typing import Any
@@ -265,6 +266,7 @@ class LiveRobot:
 
 def _number(text: str | None) -> float:
     try:
-        return float(text or 0.0)
+        value = float(text or 0.0)
     except ValueError:
         return 0.0
+    return value if math.isfinite(value) else 0.0

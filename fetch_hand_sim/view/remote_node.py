@@ -88,6 +88,12 @@ class RemoteNode:
         parameter = Parameter(name, value=value).to_parameter_msg()
         self._call('set_parameters', _SET_PARAMETERS, {'parameters': [parameter]}, answered)
 
+    def close(self) -> None:
+        """Forgets the other node; answers on their way are not heard."""
+        for client in self._clients.values():
+            self._node.destroy_client(client)
+        self._clients.clear()
+
     def _call(
         self,
         service: str,

@@ -96,6 +96,8 @@ class RobotRequests:
 
     def take_replay(self, replay: Replay | None) -> None:
         """Takes who replays where a robot would be, or None: it is asked instead of the robot."""
+        if self._replay is not None:
+            self._replay[1].close()
         self._replay = None
         if replay is not None:
             self._replay = replay, RemoteNode(self._node, replay.name, self._notice)

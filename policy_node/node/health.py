@@ -67,14 +67,14 @@ class Health:
         self._responder: Responder | None = None
         self._tick_duration = 0.0
         self._answered, self._dropped, self._unusable = Increase(), Increase(), Increase()
-        self._then: float | None = None
+        self._then = 0.0
         # When there was one robot at most.
         self._alone_at = -math.inf
         self._said: set[str] = set()
 
-    def start(self, responder: Responder, status: EpisodeStatus) -> None:
-        """Takes the robot that was found."""
-        self._responder = responder
+    def start(self, responder: Responder, status: EpisodeStatus, now: float) -> None:
+        """Takes the robot that was found; a period begins, in seconds of the responder's clock."""
+        self._responder, self._then = responder, now
         self._tick_duration = 1.0 / status.control_hz
         self._answered, self._dropped, self._unusable = Increase(), Increase(), Increase()
 
@@ -128,8 +128,7 @@ class Health:
         self, responder: Responder, now: float, robots: int, robot_pace: Pace | None
     ) -> Report:
         given = robot_pace or Pace(is_paused=False, period=self._tick_duration)
-        seconds = now - self._then if self._then is not None else 0.0
-        self._then = now
+        seconds, self._then = now - self._then, now
         answered = self._answered.since(responder.answered)
         rate = answered / seconds if seconds else 0.0
         age = None if responder.received_at is None else now - responder.received_at

@@ -14,7 +14,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from msgs_spec.codecs import build_status, decode_status, message_stamp
-from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports
+from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports, next_report
 from msgs_spec.parameters import POLICY_NODE
 from msgs_spec.ros import (
     BEAT,
@@ -138,7 +138,7 @@ class PolicyNode(Node):
         # Last of all: its appearance tells the robot that everything before it is in place.
         self._commands = self._publisher(topic(commander.spec, 'commands'))
         self._of_robot.append(self._commands)
-        self._health.start(responder, status)
+        self._health.start(responder, status, time.monotonic())
         self.get_logger().info(f'{commander.spec.name}: commands come from {commander.description}')
 
     def _unpublished(self, subscriptions: list[Subscription]) -> list[str]:
@@ -275,7 +275,7 @@ class PolicyNode(Node):
         now = time.monotonic()
         if now < self._report_due:
             return
-        self._report_due = max(self._report_due + REPORT_PERIOD, now)
+        self._report_due = next_report(self._report_due, now)
         robots = self.count_publishers(self._status_name)
         elsewhere = [] if robots or now < self._elsewhere_from else self._robots_elsewhere()
         pace = self._pace if now < self._pace_until else None

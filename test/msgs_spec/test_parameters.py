@@ -9,7 +9,13 @@ import sys
 import pytest
 
 from msgs_spec.parameters import NODES, POLICY_NODE, SIM_NODE, unknown_parameter, usage, validate
-from msgs_spec.ros import UsageError, declare_parameters, descriptor, set_callback
+from msgs_spec.ros import (
+    UsageError,
+    _refuse_arguments,
+    declare_parameters,
+    descriptor,
+    set_callback,
+)
 
 SPECS = {
     f'{node.removesuffix("_node")}.{s.name}': s for node, specs in NODES.items() for s in specs
@@ -190,6 +196,10 @@ def test_what_rclpy_ignores_or_does_not_explain_is_one_line(arguments, message):
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.startswith(message) and done.stdout == ''
     assert done.stderr.count('\n') == 1
+
+
+def test_only_nothing_at_all_is_no_value():
+    _refuse_arguments(['--ros-args', '-p', 'policy:=a:=', '-r', '__ns:='])
 
 
 @pytest.mark.parametrize('name', ['qos_overrides./clock.publisher.depth', 'use_sim_time', 'rate'])

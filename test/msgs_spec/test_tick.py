@@ -147,6 +147,8 @@ def test_status_survives_exactly():
         ({'seed': None}, 'episode_status without seed'),
         ({'seed': 'seven'}, "episode_status with unreadable value: .*'seven'"),
         ({'phase': 'dancing'}, "episode_status with unreadable value: 'dancing'"),
+        ({'control_hz': '-1'}, 'episode_status with control_hz -1.0'),
+        ({'control_hz': 'nan'}, 'episode_status with control_hz nan'),
         ({'is_success': 'yes'}, "episode_status with unreadable value: 'yes'"),
     ],
 )

@@ -260,10 +260,13 @@ class FetchTask(Task):
 
         Of the pass only positions are ever read; these models have no actuators, so no efforts.
         """
-        super().step()
-        if self.config.block_gripper:
-            self._qpos[:, self._fingers] = 0.0
-            self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
+        try:
+            super().step()
+        finally:
+            # The others go on where MuJoCo gave one up.
+            if self.config.block_gripper:
+                self._qpos[:, self._fingers] = 0.0
+                self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
 
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
         """Returns the distance to a point."""

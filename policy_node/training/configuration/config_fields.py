@@ -146,7 +146,8 @@ class ConfigFields:
     learning_rate: float = 1e-3
     """Adam step size of actor and critic."""
     final_learning_rate: float = 1.0
-    """Share of `learning_rate` left at `total_steps`, falling linearly; 1 keeps it constant."""
+    """Share of `learning_rate` left to actor and critic at `total_steps`, falling linearly; 1 keeps
+    it constant. What imagines subgoals keeps the whole."""
     actor_average: float = 0.0
     """Share of an average of actor weights kept each cycle; the average is what is evaluated and
     saved, as best and as latest. 0 evaluates the actor itself."""

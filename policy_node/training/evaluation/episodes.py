@@ -137,8 +137,8 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
         ticks_reached += success
         ticks_kept += success & result.success
         success = result.success
-        touched |= success & ~diverged
         diverged |= result.diverged
+        touched |= success & ~diverged
         episode_return += result.reward
     goals = observation['achieved_goal'], observation['desired_goal']
     metric, spec = simulation.metric, simulation.spec

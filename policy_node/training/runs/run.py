@@ -72,7 +72,8 @@ def train_run(
         experience: Episodes to learn from as well.
 
     Raises:
-        UsageError: If something that the run needs is missing or does not fit; nothing is written.
+        UsageError: If something that the run needs is missing or does not fit; nothing is written
+            but the folder and its lock.
         RunTakenError: If another process works on the folder.
         CommandError: If training failed; the last checkpoint is kept.
     """

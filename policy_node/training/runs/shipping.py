@@ -103,6 +103,9 @@ def ship(
     }
     if state is not None:
         ship_critic(state, target)
+    else:
+        # That of the actor before would be refused beside this one.
+        companion_file(target).unlink(missing_ok=True)
     curve = target.with_suffix('.png')
     # A mean of networks, taken as it is, has no curve of its own: that of a part stays.
     if progress[-1].get('updates') or not curve.is_file():

@@ -90,6 +90,7 @@ class Trainer:
             load_networks(tensors, self.learner, self.experience.statistics)
             self._let_critic_learn_first()
         self.counters = Counters()
+        self._part_noise()
         self._stop_reason = ''
         self._refill = 0
 
@@ -120,6 +121,13 @@ class Trainer:
             config, spec, self.device, self.workers, sampler, generator
         )
 
+    def _part_noise(self) -> None:
+        """Lets workers that began with the same networks draw noise of their own."""
+        rank = self.workers.rank
+        if rank > 0:
+            seeds = np.random.SeedSequence([self.config.seed, rank, self.counters.env_steps])
+            torch.manual_seed(int(seeds.generate_state(1)[0]))
+
     def stop(self, reason: str) -> None:
         """Asks the run to end after the current cycle, with a checkpoint."""
         self._stop_reason = reason
@@ -135,6 +143,7 @@ class Trainer:
         """
         state = load_state(path, self.learner, self.experience.statistics)
         self.counters = state.counters
+        self._part_noise()
         self.experience.narrow(self._narrowing)
         origin = state.extra.get('init_from', {})
         self._saver.folder = replace(self._saver.folder, init_from=origin)

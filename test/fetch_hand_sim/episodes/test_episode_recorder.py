@@ -102,6 +102,35 @@ def test_the_file_is_the_one_a_writer_alone_makes(
     assert len(made) == 2 and made == files(tmp_path / 'writer')
 
 
+def test_metadata_are_those_of_the_moment_in_which_an_episode_begins(
+    tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However far the disk is behind: who introduces himself later has not begun it."""
+    opened = threading.Event()
+    begin = EpisodeDirectory.begin
+
+    def late(*arguments: object) -> object:
+        opened.wait(10.0)
+        return begin(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(EpisodeDirectory, 'begin', late)
+    metadata = dict(METADATA)
+    recorder = EpisodeRecorder(
+        tmp_path,
+        metadata=lambda status: dict(metadata),
+        on_error=print,
+        on_logged=lambda logged: None,
+    )
+    recorder.record(*ticks[0])
+    metadata['checkpoint_sha256'] = 'f' * 64
+    opened.set()
+    for tick, messages in ticks[1:]:
+        recorder.record(tick, messages)
+    recorder.close('')
+    (file,) = tmp_path.glob('*/*.mcap')
+    assert 'checkpoint_sha256' not in read_episode(file).metadata
+
+
 @pytest.mark.alone
 def test_a_slow_disk_delays_no_tick(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch

@@ -52,3 +52,11 @@ def test_the_same_seed_gives_the_same_goal(simulation):
     second.set_next_seed(9)
     again = second.advance(second.resting_command()).desired_goal
     np.testing.assert_array_equal(again, goal)
+
+
+def test_a_number_of_episodes_counts_from_the_first_of_them(simulation):
+    runner = EpisodeRunner(simulation, episodes=2, first_episode=5)
+    for _ in range(2):
+        assert not runner.is_done
+        run_episode(runner)
+    assert runner.is_done

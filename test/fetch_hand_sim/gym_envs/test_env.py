@@ -433,3 +433,18 @@ def test_without_a_display_a_window_says_what_it_needs(monkeypatch):
     monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
     with pytest.raises(RuntimeError, match="render_mode 'human' needs a display"):
         make('FetchReach', render_mode='human').reset(seed=0)
+
+
+@pytest.mark.parametrize('goal', [0.3, [0.0, 0.0], [0.0, np.nan, 0.0]])
+def test_a_goal_is_as_many_finite_numbers_as_the_task_has(goal):
+    env = gymnasium.make('fetch_hand_sim/FetchReach-v0').unwrapped
+    env.reset(seed=0)
+    before = env.goal.copy()
+    with pytest.raises(ValueError, match='a goal of FetchReach is 3 finite numbers, not '):
+        env.goal = goal
+    assert env.goal.tolist() == before.tolist()
+    batch = gymnasium.make_vec(
+        'fetch_hand_sim/FetchReach-v0', num_envs=2, vectorization_mode='vector_entry_point'
+    )
+    with pytest.raises(ValueError, match='a goal of FetchReach is 3 finite numbers, not '):
+        batch.set_attr('goal', [goal, goal])

@@ -15,6 +15,7 @@ import pytest
 
 import fetch_hand_sim
 from fetch_hand_sim.gym_envs.goal_env import import_goal_env
+from fetch_hand_sim.gym_envs.gymnasium_robotics_env import ManipulateEnv
 from fetch_hand_sim.gym_envs.registration import reference_ids
 from msgs_spec.tasks import TASKS
 from support import SUPPORT
@@ -177,6 +178,8 @@ def test_goals_of_the_same_object_can_be_asked_for(make):
     assert env.spec_of_task.name == 'HandManipulateBlockRotateZ'
     with pytest.raises(ValueError, match='allowed: ignore and xyz, random and xyz'):
         make('HandManipulateEgg-v1', target_rotation='parallel')
+    with pytest.raises(ValueError, match="'FetchReach' has no object in the hand; allowed: Hand"):
+        ManipulateEnv('FetchReach')
 
 
 def test_gymnasium_makes_lists_of_pictures(make):

@@ -11,7 +11,7 @@ import pytest
 
 from fetch_hand_sim.sim_node.health import Health, Surroundings
 from msgs_spec.codecs import message_stamp
-from msgs_spec.diagnostics import Level, encode_reports
+from msgs_spec.diagnostics import Level, encode_reports, next_report
 from msgs_spec.schemas import deserialize
 from msgs_spec.topics import DIAGNOSTICS, topics
 
@@ -153,6 +153,42 @@ def test_a_period_with_a_pause_or_another_pace_in_it_is_not_judged(make):
     assert pass_a_second().level is Level.OK
     case.clock.now += 1.0
     assert '0.0 ticks per second, not the 25.0 asked' in health.report(FINE, case.clock.now).message
+
+
+@pytest.mark.parametrize('factor', [0.01, 0.1])
+def test_slow_motion_is_not_called_slow(make, factor):
+    """A period holds a few ticks, and one more or less of them tells nothing."""
+    case = make()
+    health = Health(case.robot, '/sim_node', case.clock.now)
+    case.robot.tick_when_due()
+    case.robot.set_real_time_factor(factor)
+    health.report(FINE, case.clock.now)
+    start = case.clock.now
+    for second in range(1, 9):
+        while case.clock.now + case.robot.wait() < start + second:
+            case.clock.now += case.robot.wait()
+            case.robot.tick_when_due()
+        case.clock.now = start + second
+        assert health.report(FINE, case.clock.now).level is Level.OK
+
+
+def test_a_report_that_came_late_is_followed_by_a_whole_period():
+    assert next_report(due=5.0, now=5.1) == 6.0
+    assert next_report(due=5.0, now=7.5) == 8.5
+
+
+@pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
+def test_a_pause_is_not_a_silence_of_who_commands(make, mode):
+    case = make(mode)
+    case.robot.tick_when_due()
+    case.robot.buffer.accept([0.0] * 4)
+    case.robot.tick_when_due()
+    case.robot.pause(True)
+    case.clock.now += 60.0
+    case.robot.pause(False)
+    assert not case.robot.misses_commands
+    case.clock.now += 1.1
+    assert case.robot.misses_commands
 
 
 def test_report_counts_rejections_by_reason(make):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
+from mujoco.batch import SimulationError
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.actions import command_from_action
@@ -248,6 +249,50 @@ def test_a_diverged_simulation_starts_again_and_the_others_go_on(
         assert values[2].tobytes() == fresh[name][2].tobytes()
     assert not simulation.step(action).diverged.any()
     assert not list(tmp_path.iterdir()), 'MuJoCo wrote a file into the working directory'
+
+
+@pytest.mark.parametrize('task', ['FetchReach', 'HandReach'])
+def test_a_simulation_that_mujoco_gives_up_changes_no_bit_of_the_others(task, monkeypatch):
+    """As a full stack of MuJoCo does: the batch goes on and raises at its end."""
+    simulation = Simulation(task, num_envs=4, num_threads=1)
+    undisturbed = Simulation(task, num_envs=4, num_threads=1)
+    for each in (simulation, undisturbed):
+        each.reset(seed=0)
+    batch = simulation.task.batch
+
+    class GivesUp:
+        """The batch, whose third simulation is lost."""
+
+        def __getattr__(self, name):
+            return getattr(batch, name)
+
+        def step(self, *args, **kwargs):
+            batch.step(*args, **kwargs)
+            raise SimulationError(np.array([2]), 'no room')
+
+    monkeypatch.setattr(simulation.task, 'batch', GivesUp())
+    action = actions(simulation, 1)[0]
+    result, expected = simulation.step(action), undisturbed.step(action)
+    assert result.diverged.tolist() == [False, False, True, False]
+    for name, values in result.observation.items():
+        assert values[[0, 1, 3]].tobytes() == expected.observation[name][[0, 1, 3]].tobytes()
+
+
+@pytest.mark.parametrize('index', [-1, 2, True])
+def test_a_push_is_of_a_simulation_that_there_is(index):
+    simulation = Simulation('FetchPush', num_envs=2, num_threads=1)
+    simulation.reset(seed=0)
+    with pytest.raises(ValueError, match='ids must be'):
+        simulation.perturb('object0', [1, 0, 0, 0, 0, 0], index)
+
+
+def test_a_shallow_copy_shares_no_generator():
+    simulation = Simulation('FetchReach', num_threads=1)
+    simulation.reset(seed=0)
+    expected = copy.deepcopy(simulation).reset()['desired_goal']
+    copy.copy(simulation).reset(seed=7)
+    copy.copy(simulation).reset()
+    assert simulation.reset()['desired_goal'].tobytes() == expected.tobytes()
 
 
 def test_a_goal_is_taken_in_the_hemisphere_of_the_object():

@@ -188,7 +188,7 @@ def test_report_says_what_is_wrong(case, episode):
     responder, _, ticks = case
     health = Health('/policy_node')
     assert health.report(7.0, 0).message == 'waits for a robot'
-    health.start(responder, episode[0])
+    health.start(responder, episode[0], 6.0)
     feed(responder, ticks[0])
     health.report(7.0, 1)
     feed(responder, ticks[1])
@@ -221,7 +221,7 @@ def test_a_robot_in_slow_motion_is_not_called_silent(episode):
     status, ticks = episode
     now = [0.0]
     responder, health = Responder(resting(), status, Wire(), lambda: now[0]), Health('/policy_node')
-    health.start(responder, status)
+    health.start(responder, status, 0.0)
     for tick in ticks:
         feed(responder, tick)
         for _ in range(4):
@@ -237,7 +237,7 @@ def diagnostics(*reports):
 def test_a_paused_robot_is_not_called_silent(case, episode):
     responder, _, ticks = case
     health = Health('/arm/policy_node')
-    health.start(responder, episode[0])
+    health.start(responder, episode[0], 6.0)
     feed(responder, ticks[0])
     message = diagnostics(Report('/arm/sim_node', 'FetchReach', {'paused': 'True'}, 'is paused'))
     pace = read_pace(message, '/arm')
@@ -261,7 +261,7 @@ def test_a_paused_robot_is_not_called_silent(case, episode):
 def test_slow_inference_is_that_at_the_pace_of_the_robot(case, episode, values, period):
     responder, _, ticks = case
     health = Health('/policy_node')
-    health.start(responder, episode[0])
+    health.start(responder, episode[0], 6.0)
     feed(responder, ticks[0])
     responder.inference.add(0.06)
     responder.inference.add(0.06)

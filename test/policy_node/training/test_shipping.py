@@ -147,3 +147,18 @@ def test_an_actor_that_says_nothing_of_its_recipe_is_shipped_whole(
     assert ship(run, tmp_path / 'actors', 2) == 0
     suffixes = {file.name.partition('.')[2] for file in (tmp_path / 'actors').iterdir()}
     assert suffixes == {'safetensors', 'training.safetensors', 'json', 'png'}
+
+
+def test_the_critic_of_another_actor_does_not_stay_beside_one_that_has_none(
+    run: Path, tmp_path: Path
+) -> None:
+    actors = tmp_path / 'actors'
+    assert ship(run, actors, 2) == 0
+    critic = actors / 'FetchReach.training.safetensors'
+    assert critic.is_file()
+    report = json.loads((actors / 'FetchReach.json').read_text())
+    worse = report | {'run_sha256': '', 'success_gymnasium': -1.0}
+    (actors / 'FetchReach.json').write_text(json.dumps(worse))
+    (run / 'training_state.safetensors').unlink()
+    assert ship(run, actors, 2) == 0
+    assert not critic.exists()
