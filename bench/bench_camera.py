@@ -23,8 +23,10 @@ import rclpy  # noqa: E402
 from bench_rate import Watcher, report  # noqa: E402
 from bench_view import start  # noqa: E402
 
-from msgs_spec.ros import (  # noqa: E402
+from msgs_spec.event_loop import (  # noqa: E402
     EventLoop,
+)
+from msgs_spec.ros import (  # noqa: E402
     rclpy_profile,
     ros_message_class,
 )

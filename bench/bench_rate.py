@@ -27,8 +27,10 @@ import numpy as np  # noqa: E402
 import rclpy  # noqa: E402
 
 from msgs_spec.codecs import decode_status  # noqa: E402
-from msgs_spec.ros import (  # noqa: E402
+from msgs_spec.event_loop import (  # noqa: E402
     EventLoop,
+)
+from msgs_spec.ros import (  # noqa: E402
     rclpy_profile,
     ros_message_class,
 )

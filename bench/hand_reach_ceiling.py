@@ -15,14 +15,12 @@ import sys
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array
 from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
 
 _STARTS, _STEPS, _DAMPING = 6, 120, 1e-5
-
-Array = NDArray[np.float64]
 
 
 class Hand:

@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler
 from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
 
 TASKS = ('HandManipulatePenRotate', 'HandManipulatePenFull')
-
-Array = NDArray[np.float64]
 
 
 def goals_of(task: str, episodes: int) -> Array:

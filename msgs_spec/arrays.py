@@ -7,5 +7,7 @@ from numpy.typing import NDArray
 
 # Positions, commands, rewards: float64 throughout, as MuJoCo computes.
 Array = NDArray[np.float64]
+# What replays and networks hold.
+Array32 = NDArray[np.float32]
 # Rows, columns, RGB.
 Picture = NDArray[np.uint8]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from msgs_spec import codecs
+from msgs_spec.arrays import Array
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.topics import TopicSpec
 
@@ -22,8 +23,6 @@ from msgs_spec.topics import TopicSpec
 _BODY = 4
 _STAMP = struct.Struct('<iI')
 _FLOAT = struct.Struct('<d')
-
-Array = NDArray[np.float64]
 
 
 class LayoutError(ValueError):

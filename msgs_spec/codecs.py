@@ -12,13 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from msgs_spec.arrays import Array
 from msgs_spec.rotations import wxyz_to_xyzw, xyzw_to_wxyz
 from msgs_spec.schemas import message_class
 from msgs_spec.topics import TopicSpec
-
-Array = NDArray[np.float64]
 
 _NANOSECONDS = 10**9
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])

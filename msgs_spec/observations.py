@@ -10,14 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from msgs_spec.arrays import Array
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.rotations import matrix_to_euler, quaternion_to_matrix
 from msgs_spec.tasks import PHYSICS_TIMESTEP, GoalKind, TaskSpec, substeps_per_tick
 from msgs_spec.topics import topic
 
-Array = NDArray[np.float64]
 # What sensors say: vectors (..., topic.size) by name of the topic.
 Readings = Mapping[str, Array]
 

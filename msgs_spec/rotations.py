@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from msgs_spec.arrays import Array
 
 _SINGULAR = 4.0 * np.finfo(np.float64).eps
 

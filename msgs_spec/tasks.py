@@ -12,14 +12,10 @@ from enum import Enum
 from numbers import Real
 from typing import Any, Literal, get_args
 
-import numpy as np
-from numpy.typing import NDArray
-
+from msgs_spec.arrays import Array
 from msgs_spec.foreign_tasks import foreign_tasks
 from msgs_spec.hints import did_you_mean
 from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, RobotSpec
-
-Array = NDArray[np.float64]
 
 # One physics substep, seconds, and the paper's 20 substeps per action (25 Hz).
 PHYSICS_TIMESTEP = 0.002
@@ -107,6 +103,9 @@ class TaskSpec:
         object_symmetry: `cube`, or `revolution` for an object that is the same turned about its z
             axis or upside down; None where the goal is no pose.
         formulas: None for the thirteen and for a task that is observed as one of them.
+        looks_like: Which of the thirteen it is to the eye: the view, where goals lie and how they
+            turn. A task that is made from one of them with `dataclasses.replace` keeps it; None for
+            what is usual with the robot.
     """
 
     name: str
@@ -123,6 +122,7 @@ class TaskSpec:
     ignores_z_rotation: bool = False
     object_symmetry: str | None = None
     formulas: TaskFormulas | None = None
+    looks_like: str | None = None
 
     @property
     def achieved_goal_start(self) -> int:
@@ -193,6 +193,7 @@ def _fetch(name: str, has_object: bool = True) -> TaskSpec:
         rotation_threshold=None,
         reference_id=f'{name}-v4',
         achieved_goal='object_position' if has_object else 'end_effector_position',
+        looks_like=name,
     )
 
 
@@ -213,6 +214,7 @@ def _hand_manipulate(
         rotation_threshold=0.1,
         reference_id=f'{name}-v1',
         achieved_goal='object_pose',
+        looks_like=name,
         position_counts=position_counts,
         ignores_z_rotation=ignores_z_rotation,
         object_symmetry='cube' if 'Block' in name else 'revolution',
@@ -230,6 +232,7 @@ _HAND_REACH = TaskSpec(
     rotation_threshold=None,
     reference_id='HandReach-v3',
     achieved_goal='fingertip_positions',
+    looks_like='HandReach',
 )
 
 TASKS: dict[str, TaskSpec] = {

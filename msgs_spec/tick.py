@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_status
 from msgs_spec.observations import Readings
@@ -19,7 +19,6 @@ from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import TopicSpec, topics
 
-Array = NDArray[np.float64]
 Phase = Literal['waiting', 'reset', 'running', 'finished']
 # What each says of the tick it comes with. An episode that is given up ends without `finished`.
 PHASES: dict[Phase, str] = {

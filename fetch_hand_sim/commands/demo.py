@@ -42,12 +42,11 @@ from msgs_spec.command_line import (
     run_command,
     whole_number,
 )
+from msgs_spec.node_main import StopSignals, destroy
 from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.ros import (
     DISCOVERY_TIME,
-    StopSignals,
     count_publishers,
-    destroy,
     rclpy_profile,
     ros_message_class,
 )

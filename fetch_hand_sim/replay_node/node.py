@@ -15,18 +15,17 @@ from std_srvs.srv import SetBool
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.replay_node import NODE_NAME
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
+from msgs_spec.command_line import UsageError
 from msgs_spec.listeners import Listeners
+from msgs_spec.node_main import StopSignals
 from msgs_spec.parameters import REPLAY_NODE
 from msgs_spec.ros import (
-    StopSignals,
-    UsageError,
     await_acknowledgements,
     count_publishers,
-    declare_parameters,
     rclpy_profile,
     ros_message_class,
-    set_callback,
 )
+from msgs_spec.ros_parameters import declare_parameters, set_callback
 
 # Seconds between looks at the stop flag while nothing is due.
 _SPIN = 0.1

@@ -30,21 +30,18 @@ from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.cdr import TopicCodec
+from msgs_spec.command_line import UsageError
 from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports, next_report
+from msgs_spec.event_loop import BEAT, EventLoop
+from msgs_spec.node_main import NodeFailure, StopSignals
 from msgs_spec.parameters import SIM_NODE
 from msgs_spec.ros import (
-    BEAT,
-    EventLoop,
-    NodeFailure,
-    StopSignals,
-    UsageError,
     await_acknowledgements,
-    declare_parameters,
     rclpy_profile,
     ros_message_class,
     seldom,
-    set_callback,
 )
+from msgs_spec.ros_parameters import declare_parameters, set_callback
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import DIAGNOSTICS, LATEST_TICK, MONITORING, REAL_TIME_FACTOR, topics
 

@@ -66,7 +66,7 @@ _MANIPULATE_VIEW = View((1.05, 0.89, 0.18), 0.47, 62.0, -38.0)
 def default_view(spec: TaskSpec) -> View:
     """The camera from which a task is seen best."""
     if spec.robot.has_gripper_command:
-        return _SLIDE_VIEW if spec.name == 'FetchSlide' else _FETCH_VIEW
+        return _SLIDE_VIEW if spec.looks_like == 'FetchSlide' else _FETCH_VIEW
     return _REACH_VIEW if spec.goal is GoalKind.FINGERTIPS else _MANIPULATE_VIEW
 
 

@@ -12,7 +12,7 @@ from fetch_hand_sim.view.player import Player
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import announce, open_page
 from msgs_spec.command_line import EXIT_SUCCESS, UsageError
-from msgs_spec.ros import StopSignals
+from msgs_spec.node_main import StopSignals
 
 _FRAME_TIME = 1.0 / 60.0
 

@@ -22,16 +22,15 @@ from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import announce, open_page
-from msgs_spec.ros import (
-    DISCOVERY_TIME,
-    EventLoop,
+from msgs_spec.command_line import UsageError
+from msgs_spec.event_loop import EventLoop
+from msgs_spec.node_main import (
     NodeFailure,
     StopSignals,
-    UsageError,
-    count_publishers,
     destroy,
     run_node,
 )
+from msgs_spec.ros import DISCOVERY_TIME, count_publishers
 from msgs_spec.tasks import TaskSpec
 
 NODE_NAME = 'view'

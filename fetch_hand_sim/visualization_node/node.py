@@ -27,18 +27,17 @@ from fetch_hand_sim.visualization_node.transforms import (
     view_transform,
 )
 from msgs_spec.arrays import Picture
+from msgs_spec.event_loop import BEAT, EventLoop
 from msgs_spec.listeners import Listeners
+from msgs_spec.node_main import StopSignals
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.ros import (
-    BEAT,
-    EventLoop,
-    StopSignals,
     count_publishers,
-    declare_parameters,
     rclpy_profile,
     ros_message_class,
     seldom,
 )
+from msgs_spec.ros_parameters import declare_parameters
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import TopicSpec

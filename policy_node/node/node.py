@@ -14,20 +14,13 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from msgs_spec.codecs import build_status, decode_status, message_stamp
+from msgs_spec.command_line import UsageError
 from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports, next_report
+from msgs_spec.event_loop import BEAT, EventLoop
+from msgs_spec.node_main import NodeFailure, StopSignals
 from msgs_spec.parameters import POLICY_NODE
-from msgs_spec.ros import (
-    BEAT,
-    EventLoop,
-    NodeFailure,
-    StopSignals,
-    UsageError,
-    declare_parameters,
-    rclpy_profile,
-    ros_message_class,
-    seldom,
-    set_callback,
-)
+from msgs_spec.ros import rclpy_profile, ros_message_class, seldom
+from msgs_spec.ros_parameters import declare_parameters, set_callback
 from msgs_spec.schemas import serialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import EpisodeStatus

@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from msgs_spec.arrays import Array
 from policy_node.policies import checkpoint
 from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
 from policy_node.policies.policy import LoadedPolicy, Observation, observation_part
-
-Array = NDArray[np.float64]
 
 # As torch.nn.LayerNorm.
 _NORM_EPSILON = 1e-5

@@ -81,7 +81,7 @@ WITHOUT_EXTRAS = """
 import os, runpy, sys, traceback
 
 sys.modules.update(dict.fromkeys({extras!r}))
-import fetch_hand_sim.episodes.generator, msgs_spec.ros, rich.progress, rich.table, shtab
+import fetch_hand_sim.episodes.generator, msgs_spec.node_main, rich.progress, rich.table, shtab
 
 for module in {modules!r}:
     print(f'== {{module}}', file=sys.stderr, flush=True)

@@ -23,7 +23,6 @@ from fetch_hand_sim.simulation.model_tuning import (
 from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.task import (
-    Array,
     BatchConfig,
     Generators,
     Ids,
@@ -31,6 +30,7 @@ from fetch_hand_sim.simulation.tasks.task import (
     integration_state,
     joint_qpos_slice,
 )
+from msgs_spec.arrays import Array
 from msgs_spec.robots import GRIPPER_STEP
 from msgs_spec.rotations import quaternion_multiply
 from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec

@@ -17,7 +17,6 @@ import numpy as np
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.hand import HandTask, load_hand_model
 from fetch_hand_sim.simulation.tasks.task import (
-    Array,
     BatchConfig,
     Generators,
     Ids,
@@ -27,6 +26,7 @@ from fetch_hand_sim.simulation.tasks.task import (
     weakly,
 )
 from msgs_spec.actions import resting_command
+from msgs_spec.arrays import Array
 from msgs_spec.rotations import (
     euler_to_matrix,
     euler_to_quaternion,

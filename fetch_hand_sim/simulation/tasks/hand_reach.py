@@ -8,12 +8,12 @@ import numpy as np
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.hand import HandTask, fingertip_sites, load_hand_model
 from fetch_hand_sim.simulation.tasks.task import (
-    Array,
     BatchConfig,
     Generators,
     Ids,
     integration_state,
 )
+from msgs_spec.arrays import Array
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec
 

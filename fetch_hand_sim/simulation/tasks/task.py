@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.models import prepare_engine
 from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
 from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec, Timing
 
-Array = NDArray[np.float64]
 Ids = NDArray[np.intp]
 Generators = Sequence[np.random.Generator]
 

@@ -62,7 +62,7 @@ def moved_goal(
     if spec.goal is GoalKind.POSE and (is_turning or not spec.position_counts):
         return _turned(spec, goal, ray, delta)
     # What lies on the table stays on it; all else moves in the plane of the picture.
-    normal = _Z if spec.name in _ON_THE_TABLE else ray.forward
+    normal = _Z if spec.looks_like in _ON_THE_TABLE else ray.forward
     place = ray.meets_plane(handle.position, normal)
     if place is None:
         return goal
@@ -74,7 +74,7 @@ def moved_goal(
 
 def _turned(spec: TaskSpec, goal: Array, ray: Ray, delta: Array) -> Array:
     turn = quaternion_from_axis_angle(_Z, _TURN * delta[0])
-    if spec.name != 'HandManipulateBlockRotateZ':
+    if spec.looks_like != 'HandManipulateBlockRotateZ':
         tilt = quaternion_from_axis_angle(ray.right, _TURN * delta[1])
         turn = quaternion_multiply(tilt, turn)
     result = goal.copy()

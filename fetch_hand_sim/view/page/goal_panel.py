@@ -27,7 +27,7 @@ def position_ranges(spec: TaskSpec) -> tuple[tuple[float, float], ...]:
         return _FINGERTIP_RANGES
     if not spec.robot.has_gripper_command:
         return _HAND_RANGES
-    return _SLIDE_RANGES if spec.name == 'FetchSlide' else _FETCH_RANGES
+    return _SLIDE_RANGES if spec.looks_like == 'FetchSlide' else _FETCH_RANGES
 
 
 class GoalPanel:
@@ -74,7 +74,7 @@ def _draw_position(spec: TaskSpec, position: Array) -> None:
 def _draw_angles(spec: TaskSpec, quaternion: Array) -> Array:
     """Sliders for the angles about the world's axes; the quaternion as it was if none moved."""
     angles = quaternion_to_euler(quaternion)
-    axes = (2,) if spec.name == 'HandManipulateBlockRotateZ' else (0, 1, 2)
+    axes = (2,) if spec.looks_like == 'HandManipulateBlockRotateZ' else (0, 1, 2)
     has_changed = False
     for axis in axes:
         imgui.SetNextItemWidth(ITEM_WIDTH)

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from msgs_spec.arrays import Array
 from msgs_spec.tasks import task_spec
 from policy_node.policies.checkpoint import read_info
 from policy_node.policies.files import to_json, write_files
@@ -28,7 +28,6 @@ EPISODES_PER_EPOCH = 1900
 FAST_SUCCESS = 0.95
 _ARMS = {**ARMS, BEST_ARM.name: BEST_ARM}
 
-Array = NDArray[np.float64]
 _Value = TypeVar('_Value')
 
 

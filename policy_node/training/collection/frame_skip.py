@@ -15,21 +15,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_spec.arrays import Array32
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.replay.episode_replay import Array
 from policy_node.training.replay.multi_step import Act
 from policy_node.training.replay.transitions import Starts
 
 
-def ticks_of(length: Array, most: int) -> NDArray[np.int64]:
+def ticks_of(length: Array32, most: int) -> NDArray[np.int64]:
     """Ticks, 1 ... `most`, of lengths in [-1, 1], any shape."""
     share = (np.asarray(length, np.float64) + 1.0) / 2.0
     return 1 + np.rint(share * (most - 1)).astype(np.int64)
 
 
-def length_of(ticks: NDArray[np.int64], most: int) -> Array:
+def length_of(ticks: NDArray[np.int64], most: int) -> Array32:
     """The length in [-1, 1] that means so many ticks, float32."""
     return (2.0 * (ticks - 1) / (most - 1) - 1.0).astype(np.float32)
 
@@ -44,9 +44,9 @@ class Holder:
     def __init__(self, most: int) -> None:
         self._most = most
         self._left = np.zeros(0, np.int64)
-        self._held: Array = np.zeros((0, 0), np.float32)
+        self._held: Array32 = np.zeros((0, 0), np.float32)
 
-    def take(self, action: Array, ticks_left: int) -> Array:
+    def take(self, action: Array32, ticks_left: int) -> Array32:
         """Takes what would be decided now; returns what holds, with the length it has left.
 
         Args:
@@ -80,7 +80,7 @@ class HeldSteps:
     def count(
         self,
         starts: Starts,
-        goal: Array,
+        goal: Array32,
         generator: np.random.Generator,
         act: Act | None,
     ) -> NDArray[np.int64]:

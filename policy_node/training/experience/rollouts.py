@@ -19,6 +19,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_spec.arrays import Array, Array32
 from policy_node.training.goals.hindsight import (
     OUTCOME,
     RewardFunction,
@@ -26,7 +27,7 @@ from policy_node.training.goals.hindsight import (
     goals_of,
 )
 from policy_node.training.goals.outcomes import Outcomes
-from policy_node.training.replay.episode_replay import Array, Array64, Episodes
+from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.transitions import Starts, Transitions
 
 _SMALLEST_DEVIATION = 1e-6
@@ -35,11 +36,11 @@ _SMALLEST_DEVIATION = 1e-6
 class Critique(Protocol):
     """What a learner says of states, and of actions taken in them."""
 
-    def values(self, observation: Array, goal: Array) -> Array:
+    def values(self, observation: Array32, goal: Array32) -> Array32:
         """Values (...,) of states (..., observation_size) for goals (..., goal_size)."""
         ...
 
-    def log_probabilities(self, observation: Array, goal: Array, action: Array) -> Array:
+    def log_probabilities(self, observation: Array32, goal: Array32, action: Array32) -> Array32:
         """Logarithms (...,) of the densities of actions (..., action_size)."""
         ...
 
@@ -57,10 +58,10 @@ class RolloutTransitions(Transitions):
         weight: (batch,) of the transition in all losses.
     """
 
-    log_probability: Array
-    advantage: Array
-    value_target: Array
-    weight: Array
+    log_probability: Array32
+    advantage: Array32
+    value_target: Array32
+    weight: Array32
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +78,11 @@ class Rollouts:
     """
 
     episodes: Episodes
-    reward: Array
-    log_probability: Array
-    advantage: Array
-    value_target: Array
-    weight: Array
+    reward: Array32
+    log_probability: Array32
+    advantage: Array32
+    value_target: Array32
+    weight: Array32
 
     def draw(
         self, row: NDArray[np.int64], gamma: float, generator: np.random.Generator
@@ -121,7 +122,7 @@ class RolloutMaker:
     trace: float
     corrects: bool
 
-    def make(self, episodes: Episodes, goals: Sequence[Array]) -> Rollouts:
+    def make(self, episodes: Episodes, goals: Sequence[Array32]) -> Rollouts:
         """Rollouts of episodes with their own goals, and once more with each of others.
 
         Args:
@@ -158,7 +159,7 @@ class RolloutMaker:
         )
 
 
-def advantages(reward: Array64, value: Array64, gamma: float, trace: float) -> Array64:
+def advantages(reward: Array, value: Array, gamma: float, trace: float) -> Array:
     """Generalised advantages (Schulman et al. 2016, arXiv 1506.02438), (episodes, T).
 
     Args:
@@ -176,7 +177,7 @@ def advantages(reward: Array64, value: Array64, gamma: float, trace: float) -> A
     return found
 
 
-def decision_weights(log_ratio: NDArray[np.floating]) -> Array64:
+def decision_weights(log_ratio: NDArray[np.floating]) -> Array:
     """Per-decision weights (episodes, T) of mean 1 at each tick.
 
     Args:
@@ -192,7 +193,7 @@ def goals_in_hindsight(
     mixture: dict[str, float],
     generator: np.random.Generator,
     outcomes: Outcomes | None = None,
-) -> Array:
+) -> Array32:
     """A goal for each episode as a whole, (episodes, goal_size), from the sources of a mixture.
 
     Args:

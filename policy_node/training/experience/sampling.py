@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.arrays import Array32
 from policy_node.training.collection.frame_skip import HeldSteps
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.goals.goal_choice import CANDIDATES, GOAL_CHOICES, Judge
 from policy_node.training.goals.graded import GradedReward, parse_grades
 from policy_node.training.goals.hindsight import RewardFunction, draw_sources, flat, goals_of
 from policy_node.training.networks.conditions import Condition, make_condition
-from policy_node.training.replay.episode_replay import Array, Episodes
+from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.multi_step import StepCounter, discounted_rewards
 from policy_node.training.replay.transitions import Starts, Transitions
 
@@ -104,7 +105,7 @@ class TransitionSampler:
             return batch
         return _with_losses(starts, steps, batch, self.lost_value)
 
-    def _single(self, starts: Starts, goal: Array) -> Transitions:
+    def _single(self, starts: Starts, goal: Array32) -> Transitions:
         """Transitions of one step, unconditioned: what nearly every run draws, and fast."""
         episodes, row, tick = starts.episodes, starts.row, starts.tick
         state = row * (episodes.ticks + 1) + tick
@@ -124,7 +125,7 @@ class TransitionSampler:
         self,
         starts: Starts,
         steps: NDArray[np.int64],
-        goal: Array,
+        goal: Array32,
         generator: np.random.Generator,
     ) -> Transitions:
         """Transitions of several steps, or under a condition.
@@ -139,7 +140,7 @@ class TransitionSampler:
         condition = self.condition
         drawn = None if condition is None else condition.draw(len(row), generator)
 
-        def reward_after(achieved: Array, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
+        def reward_after(achieved: Array32, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
             goals = achieved.astype(np.float64), goal[chosen].astype(np.float64)
             if condition is None or drawn is None:
                 return np.asarray(self.compute_reward(*goals))
@@ -167,10 +168,10 @@ class TransitionSampler:
         self,
         starts: Starts,
         names: NDArray[np.str_],
-        first: Array,
+        first: Array32,
         generator: np.random.Generator,
         judge: Judge,
-    ) -> Array:
+    ) -> Array32:
         """The best of several future goals of each transition, (batch, goal_size)."""
         source = (names == _LATER[1]).astype(np.intp)
         candidates = [first]

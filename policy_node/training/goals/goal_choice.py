@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from policy_node.training.replay.episode_replay import Array
+from msgs_spec.arrays import Array32
 from policy_node.training.replay.transitions import Transitions
 
 # Future goals that one is chosen of.
@@ -18,7 +18,7 @@ CANDIDATES = 8
 class Judge(Protocol):
     """What a learner thinks of transitions while a batch is drawn."""
 
-    def act(self, observation: Array, goal: Array) -> Array:
+    def act(self, observation: Array32, goal: Array32) -> Array32:
         """Actions (batch, action_size) of the actor."""
         ...
 

@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_spec.arrays import Array32
 from msgs_spec.rotations import quaternion_conjugate, quaternion_multiply
 from msgs_spec.tasks import GoalKind
 from policy_node.training.goals.subgoals import subgoals_of
-from policy_node.training.replay.episode_replay import Array
 from policy_node.training.replay.transitions import Starts
 
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -99,7 +99,7 @@ def goals_of(
     source: NDArray[np.intp],
     names: Sequence[str],
     generator: np.random.Generator,
-) -> Array:
+) -> Array32:
     """Returns goals (batch, goal_size), each from the source `names[source]`.
 
     A transition leads from state `tick` to state `tick + 1`; `future` takes any state from
@@ -113,7 +113,7 @@ def goals_of(
     return goal
 
 
-def _goals(starts: Starts, source: str, generator: np.random.Generator) -> Array:
+def _goals(starts: Starts, source: str, generator: np.random.Generator) -> Array32:
     episodes, count = starts.episodes, len(starts.row)
     if source == 'actual':
         return episodes.desired_goal.take(generator.integers(len(episodes), size=count), axis=0)
@@ -138,7 +138,7 @@ def _goals(starts: Starts, source: str, generator: np.random.Generator) -> Array
     return achieved.take(starts.row * (episodes.ticks + 1) + state, axis=0)
 
 
-def _displaced(starts: Starts, generator: np.random.Generator) -> Array:
+def _displaced(starts: Starts, generator: np.random.Generator) -> Array32:
     """Goals near the achieved ones, which know nothing of where the transitions lead.
 
     A goal that is chosen because a step led there tells the critic that such steps lead there;
@@ -156,15 +156,15 @@ def _displaced(starts: Starts, generator: np.random.Generator) -> Array:
     return displace(here, achieved[row, tick], achieved[row, tick + span])
 
 
-def displace(here: Array, before: Array, after: Array) -> Array:
+def displace(here: Array32, before: Array32, after: Array32) -> Array32:
     """Goals (batch, goal_size) as far from `here` as `after` is from `before`, poses turned too."""
-    moved: Array = here + (after - before)
+    moved: Array32 = here + (after - before)
     if moved.shape[-1] == GoalKind.POSE.size:
         turn = quaternion_multiply(after[:, 3:], quaternion_conjugate(before[:, 3:]))
         moved[:, 3:] = quaternion_multiply(turn, here[:, 3:])
     return moved
 
 
-def flat(values: Array) -> Array:
+def flat(values: Array32) -> Array32:
     """Rows of all episodes, one after the other."""
     return values.reshape(-1, values.shape[-1])

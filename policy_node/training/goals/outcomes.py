@@ -16,8 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.arrays import Array32
 from policy_node.training.goals.hindsight import OUTCOME, displace
-from policy_node.training.replay.episode_replay import Array, Episodes
+from policy_node.training.replay.episode_replay import Episodes
 
 # Episodes whose outcomes are drawn from, and states of each.
 EPISODES = 2000
@@ -36,8 +37,8 @@ class Outcomes:
         metric: Says what is met, and what is near.
     """
 
-    before: Array
-    after: Array
+    before: Array32
+    after: Array32
     metric: GoalMetric
 
     @classmethod
@@ -58,7 +59,7 @@ class Outcomes:
     def __len__(self) -> int:
         return len(self.after)
 
-    def goals(self, episodes: Episodes, generator: np.random.Generator) -> Array:
+    def goals(self, episodes: Episodes, generator: np.random.Generator) -> Array32:
         """A goal for each episode as a whole, (episodes, goal_size)."""
         count = len(episodes)
         drawn = generator.integers(len(self), size=_CANDIDATES * count)
@@ -67,7 +68,7 @@ class Outcomes:
         asked = np.tile(episodes.desired_goal, (_CANDIDATES, 1))
         near = replace(self.metric, reward_type='dense').reward(candidates, asked)
         best = near.reshape(_CANDIDATES, count).argmax(axis=0)
-        goals: Array = candidates[best * count + np.arange(count)]
+        goals: Array32 = candidates[best * count + np.arange(count)]
         return goals
 
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from msgs_spec.arrays import Array32
 from policy_node.policies.network_shape import NORMALIZED_CLIP
 from policy_node.policies.policy import Policy
-from policy_node.training.replay.episode_replay import Array
 from policy_node.training.replay.transitions import Starts
 
 # Share of proposals that are tested (Levy et al. 2019).
@@ -30,7 +30,7 @@ def subgoal_columns(every: int, goal_size: int) -> int:
     return goal_size + 1 if every else 0
 
 
-def subgoals_of(starts: Starts) -> Array:
+def subgoals_of(starts: Starts) -> Array32:
     """The subgoals (batch, goal_size) that were pursued where transitions begin."""
     episodes = starts.episodes
     size = episodes.desired_goal.shape[-1]
@@ -55,16 +55,16 @@ class Proposer:
     """
 
     policy: Policy
-    mean: Array
-    std: Array
+    mean: Array32
+    std: Array32
     is_pose: bool
 
-    def normalized(self, observation: Mapping[str, ArrayLike]) -> Array:
+    def normalized(self, observation: Mapping[str, ArrayLike]) -> Array32:
         """What it proposes, (N, goal size), in standard deviations from the mean."""
-        share: Array = self.policy.predict(observation, deterministic=True)[0]
+        share: Array32 = self.policy.predict(observation, deterministic=True)[0]
         return NORMALIZED_CLIP * share
 
-    def goals(self, normalized: Array) -> Array:
+    def goals(self, normalized: Array32) -> Array32:
         """Goals (N, goal size), float32, that lie so many standard deviations from the mean."""
         goals = self.mean + self.std * normalized
         if self.is_pose:
@@ -93,7 +93,7 @@ class Guide:
         self._generator = generator
         self._std, self._epsilon = noise_std, random_epsilon
         self.share = 1.0
-        self._subgoal: Array = np.zeros((0, 0), np.float32)
+        self._subgoal: Array32 = np.zeros((0, 0), np.float32)
         self._tested = np.zeros(0, np.bool_)
 
     def lead(
@@ -122,7 +122,7 @@ class Guide:
         self._subgoal = proposer.goals(np.where(replaced[:, None], drawn, noisy))
         self._tested = generator.random(count) < TESTED
 
-    def mark(self, noisy: Array, own: Array) -> Array:
+    def mark(self, noisy: Array32, own: Array32) -> Array32:
         """Actions (N, action size + goal size + 1): of tests the actor's own; then the subgoals.
 
         Args:
@@ -148,7 +148,7 @@ class GuidedPolicy:
         self._actor, self._proposer = actor, proposer
         self._every, self._ticks = every, ticks
         self._tick = 0
-        self._subgoal: Array = np.zeros((0, 0), np.float32)
+        self._subgoal: Array32 = np.zeros((0, 0), np.float32)
 
     def predict(
         self, observation: Mapping[str, ArrayLike], *, deterministic: bool = True

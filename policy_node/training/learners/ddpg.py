@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from msgs_spec.arrays import Array32
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
@@ -27,7 +28,6 @@ from policy_node.training.networks.critics import (
     make_critic,
 )
 from policy_node.training.networks.quantiles import pooled, quantile_costs
-from policy_node.training.replay.episode_replay import Array
 from policy_node.training.replay.transitions import Transitions
 
 # Fields of `Transitions` that every batch has.
@@ -271,31 +271,31 @@ class DDPG(ActorCritic):
         return actor.cpu().eval()
 
     @torch.no_grad()
-    def act(self, observation: Array, goal: Array) -> Array:
+    def act(self, observation: Array32, goal: Array32) -> Array32:
         """Actions (batch, action_size) of the actor, without noise."""
         inputs = self.tensor(observation), self.tensor(goal)
         features = self.actor.features(*inputs)
         if self.config.condition != 'none':
             acting = features.new_full((len(features), 1), ACTING_INPUT[self.config.condition])
             features = torch.cat([features, acting], dim=-1)
-        action: Array = self.actor(features).cpu().numpy()
+        action: Array32 = self.actor(features).cpu().numpy()
         return action
 
     @torch.no_grad()
-    def surprise(self, batch: Transitions) -> Array:
+    def surprise(self, batch: Transitions) -> Array32:
         """Absolute error of each value, (batch,); of several critics the mean."""
         error = self._separate_errors(self._known(batch)).abs()
-        found: Array = (error if error.ndim == 1 else error.mean(dim=0)).cpu().numpy()
+        found: Array32 = (error if error.ndim == 1 else error.mean(dim=0)).cpu().numpy()
         return found
 
     @torch.no_grad()
-    def disagreement(self, batch: Transitions) -> Array:
+    def disagreement(self, batch: Transitions) -> Array32:
         """Standard deviation of each value over the critics, (batch,)."""
         known = self._known(batch)
-        spread: Array = self.critic(known.features, known.action).std(dim=0).cpu().numpy()
+        spread: Array32 = self.critic(known.features, known.action).std(dim=0).cpu().numpy()
         return spread
 
-    def importance(self, batch: Transitions) -> Array:
+    def importance(self, batch: Transitions) -> Array32:
         """Importance weights of a batch, (batch,), from what has just learnt from it as well.
 
         Raises:
@@ -303,7 +303,7 @@ class DDPG(ActorCritic):
         """
         if self._ratio is None:
             raise ValueError(f'importance {self.config.importance!r} has no weights of its own')
-        weight: Array = self._weights(self._ratio, self._known(batch)).cpu().numpy()
+        weight: Array32 = self._weights(self._ratio, self._known(batch)).cpu().numpy()
         return weight
 
     def modules(self) -> dict[str, nn.Module]:

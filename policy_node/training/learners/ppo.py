@@ -13,13 +13,13 @@ import math
 import torch
 from torch import Tensor
 
+from msgs_spec.arrays import Array32
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.rollouts import RolloutTransitions
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.episode_replay import Array
 from policy_node.training.replay.transitions import Transitions
 
 # How far an update may move the probability of an action (the paper's value).
@@ -76,18 +76,18 @@ class PPO(ActorCritic):
         return loss
 
     @torch.no_grad()
-    def values(self, observation: Array, goal: Array) -> Array:
+    def values(self, observation: Array32, goal: Array32) -> Array32:
         """Values (...,) of states (..., observation_size) for goals (..., goal_size)."""
         features = self.actor.features(self.tensor(observation), self.tensor(goal))
-        value: Array = self.critic(features).squeeze(-1).cpu().numpy()
+        value: Array32 = self.critic(features).squeeze(-1).cpu().numpy()
         return value
 
     @torch.no_grad()
-    def log_probabilities(self, observation: Array, goal: Array, action: Array) -> Array:
+    def log_probabilities(self, observation: Array32, goal: Array32, action: Array32) -> Array32:
         """Logarithms (...,) of the densities of actions (..., action_size)."""
         mean = self.actor(self.actor.features(self.tensor(observation), self.tensor(goal)))
         logs = log_probability(mean, self.config.noise_std, self.tensor(action))
-        found: Array = logs.cpu().numpy()
+        found: Array32 = logs.cpu().numpy()
         return found
 
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.arrays import Array32
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.replay.episode_replay import Array
 
 Goals = NDArray[np.float64]
 # Of the layer that takes the inputs, in actors and critics alike.
@@ -47,7 +47,7 @@ class Threshold:
         low, high = np.log(SMALLEST_THRESHOLD), np.log(self.widest)
         return np.asarray(np.exp(generator.uniform(low, high, count)))
 
-    def inputs(self, drawn: NDArray[np.float64]) -> Array:
+    def inputs(self, drawn: NDArray[np.float64]) -> Array32:
         """What the networks see of them, (count, 1): their logarithms."""
         return np.log(drawn).astype(np.float32)[:, None]
 
@@ -85,7 +85,7 @@ class Horizon:
         """Draws from 1 to the length of an episode."""
         return generator.integers(1, self.ticks + 1, count).astype(np.float64)
 
-    def inputs(self, drawn: NDArray[np.float64]) -> Array:
+    def inputs(self, drawn: NDArray[np.float64]) -> Array32:
         """The share of an episode."""
         return (drawn / self.ticks).astype(np.float32)[:, None]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
-Array64 = NDArray[np.float64]
+from msgs_spec.arrays import Array, Array32
+
 # An episode counts as moved when its achieved goal has left its start by this much: metres, and for
 # poses units of the quaternion, whose 0.01 is a rotation by 0.02 rad.
 MOVED_DISTANCE = 0.01
@@ -26,10 +26,10 @@ class Episodes:
         action: (episodes, T, action_size).
     """
 
-    observation: Array
-    achieved_goal: Array
-    desired_goal: Array
-    action: Array
+    observation: Array32
+    achieved_goal: Array32
+    desired_goal: Array32
+    action: Array32
 
     def __len__(self) -> int:
         return len(self.action)
@@ -169,7 +169,7 @@ class EpisodeReplay:
         return row
 
 
-def draw_by(sums: Array64, count: int, generator: np.random.Generator) -> NDArray[np.int64]:
+def draw_by(sums: Array, count: int, generator: np.random.Generator) -> NDArray[np.int64]:
     """Draws rows in proportion to what each adds to `sums`."""
     # A draw may round up to the last sum: the last row that adds something is meant.
     last = np.searchsorted(sums, sums[-1])

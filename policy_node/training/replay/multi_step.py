@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from policy_node.training.replay.episode_replay import Array
+from msgs_spec.arrays import Array32
 from policy_node.training.replay.transitions import Starts
 
 CORRECTIONS = ('none', 'lambda', 'cut')
 
-Act = Callable[[Array, Array], Array]
+Act = Callable[[Array32, Array32], Array32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class StepCounter:
     cut_distance: float = 0.3
 
     def count(
-        self, starts: Starts, goal: Array, generator: np.random.Generator, act: Act | None
+        self, starts: Starts, goal: Array32, generator: np.random.Generator, act: Act | None
     ) -> NDArray[np.int64]:
         """Returns the number of steps (batch,) from 1 to `most`, never beyond the episode.
 
@@ -57,7 +57,7 @@ class StepCounter:
         return most
 
     def _until_cut(
-        self, starts: Starts, most: NDArray[np.int64], goal: Array, act: Act
+        self, starts: Starts, most: NDArray[np.int64], goal: Array32, act: Act
     ) -> NDArray[np.int64]:
         steps = np.ones_like(most)
         episodes = starts.episodes
@@ -75,7 +75,7 @@ class StepCounter:
 def discounted_rewards(
     starts: Starts,
     steps: NDArray[np.int64],
-    reward_after: Callable[[Array, NDArray[np.int64]], NDArray[np.float64]],
+    reward_after: Callable[[Array32, NDArray[np.int64]], NDArray[np.float64]],
     gamma: float,
 ) -> NDArray[np.float64]:
     """Sums of the rewards (batch,) of the first `steps` steps.

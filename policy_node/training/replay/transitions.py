@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from policy_node.training.replay.episode_replay import Array, Episodes
+from msgs_spec.arrays import Array32
+from policy_node.training.replay.episode_replay import Episodes
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +55,11 @@ class Transitions:
         next_condition: (batch, 1) the same in the next state.
     """
 
-    observation: Array
-    next_observation: Array
-    goal: Array
-    action: Array
-    reward: Array
-    discount: Array
-    condition: Array | None = None
-    next_condition: Array | None = None
+    observation: Array32
+    next_observation: Array32
+    goal: Array32
+    action: Array32
+    reward: Array32
+    discount: Array32
+    condition: Array32 | None = None
+    next_condition: Array32 | None = None

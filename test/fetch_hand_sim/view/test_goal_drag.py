@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -93,8 +95,9 @@ def test_nothing_is_taken_beside_the_goal():
 
 
 @pytest.mark.parametrize('task', ['FetchPush', 'FetchSlide'])
-def test_goals_on_the_table_stay_on_it(task):
-    spec = TASKS[task]
+@pytest.mark.parametrize('name', [None, 'OfMyOwn'])
+def test_goals_on_the_table_stay_on_it(task, name):
+    spec = replace(TASKS[task], name=name or task)
     goal = np.array([1.3, 0.7, 0.42])
     (handle,) = handles(spec, goal)
     place = np.array([1.2, 0.8, 0.42])
@@ -102,8 +105,9 @@ def test_goals_on_the_table_stay_on_it(task):
     np.testing.assert_allclose(moved, place, atol=1e-9)
 
 
-def test_the_block_of_rotate_z_turns_about_z_alone():
-    spec = TASKS['HandManipulateBlockRotateZ']
+@pytest.mark.parametrize('name', ['HandManipulateBlockRotateZ', 'OfMyOwn'])
+def test_the_block_of_rotate_z_turns_about_z_alone(name):
+    spec = replace(TASKS['HandManipulateBlockRotateZ'], name=name)
     goal = example_goal(spec)
     (handle,) = handles(spec, goal)
     moved = moved_goal(spec, goal, handle, ray_at(handle.position), True, np.array([0.3, 0.4]))

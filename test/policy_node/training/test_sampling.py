@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.arrays import Array32
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
@@ -15,7 +16,7 @@ from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.networks.conditions import Horizon, Threshold, fold
-from policy_node.training.replay.episode_replay import Array, Episodes
+from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.multi_step import StepCounter
 from policy_node.training.replay.transitions import Transitions
 from support.refusals import assert_refused
@@ -49,13 +50,13 @@ def draw(
 class Judge:
     """Acts as the walk does before place 3 and otherwise after; likes goals near 5."""
 
-    def act(self, observation: Array, goal: Array) -> Array:
+    def act(self, observation: Array32, goal: Array32) -> Array32:
         return np.where(observation < 3.0, 1.0, -1.0).astype(np.float32)
 
-    def surprise(self, batch: Transitions) -> Array:
+    def surprise(self, batch: Transitions) -> Array32:
         return -np.abs(batch.goal[:, 0] - 5.0)
 
-    def disagreement(self, batch: Transitions) -> Array:
+    def disagreement(self, batch: Transitions) -> Array32:
         return batch.goal[:, 0]
 
 
