@@ -235,6 +235,7 @@ def test_a_robot_of_a_rate_that_physics_has_not_is_refused(start_process: Start)
     """By a policy for any rate, too; what is no rate at all comes from no robot."""
     policy = start_process(*POLICY_NODE, *ros_args(policy='random'))
     with client(REACH) as robot:
+        robot.connect('episode_status')
         for control_hz in ('0', '30.0'):
             publish_status(robot, control_hz=control_hz)
             robot.spin(0.5)
