@@ -156,9 +156,10 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             actions: (N, action size); what lies outside [-1, 1] is clipped.
 
         Returns:
-            Observations, rewards, terminated (never), truncated (at the end of an episode, or when
-            MuJoCo lost the simulation) and a dictionary with `is_success` and `diverged`, masked by
-            `_is_success` and `_diverged` where an episode only started. In mode `SAME_STEP` also
+            Observations (N, ...), rewards (N,), terminated (N,), never, truncated (N,), at the end
+            of an episode, or when MuJoCo lost the simulation, and a dictionary with `is_success`
+            and `diverged` (N,), masked by `_is_success` and `_diverged` where an episode only
+            started. In mode `SAME_STEP` also
             `final_obs` (N,), a dictionary for each episode that ended, and `final_info`.
 
         Raises:

@@ -72,7 +72,7 @@ def default_view(spec: TaskSpec) -> View:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What is known of a robot at one tick.
+    """What is known of a robot at one tick; goals and poses in the world frame.
 
     Attributes:
         joint_position: (joints,) in the order of `joint_states`, rad or m.

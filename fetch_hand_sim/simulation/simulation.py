@@ -59,10 +59,10 @@ class StepResult:
 
     Attributes:
         observation: `observation`, `achieved_goal`, `desired_goal`, each (N, ...), fresh arrays.
-        reward: (N,).
-        success: (N,) booleans.
+        reward: (N,), sparse -1 or 0, dense minus the distance (m; poses 10 x m + rad).
+        success: (N,) booleans, of this tick.
         diverged: (N,) booleans: MuJoCo lost this simulation during the tick and it was reset, so
-            that its observation is the first of a new episode.
+            that its observation, reward and success are of a new episode.
     """
 
     observation: Observation
@@ -96,6 +96,7 @@ class Simulation:
         timing: As given.
         metric: What rewards and success are; it may be replaced between steps.
         goals: (N, goal size) the desired goals, live: what is written counts from the next step.
+            World frame; points and fingertips in m, poses in m and as quaternion wxyz.
         divergences: How often MuJoCo has lost a simulation.
 
     Raises:
@@ -164,7 +165,10 @@ class Simulation:
         return self._task.batch.get_data(index)
 
     def read_data(self, index: int, data: Any) -> None:
-        """Writes simulation `index` into a `mujoco.MjData`; what is derived needs `keeps_data`."""
+        """Writes simulation `index` into a `mujoco.MjData`; what is derived needs `keeps_data`.
+
+        Goals, generators and counters of divergences are no part of it, here and in `write_data`.
+        """
         self._task.read_data(index, data)
 
     def write_data(self, index: int, data: Any) -> None:
@@ -203,6 +207,8 @@ class Simulation:
         Raises:
             ValueError: If a seed is negative, or ids or seeds do not fit.
             TypeError: If a seed is not an integer.
+            RuntimeError: If an object never stays on the palm, or this process was forked and has
+                no threads of the batch.
         """
         selected = self._select(ids)
         fresh = generators(seed, selected)
@@ -222,6 +228,7 @@ class Simulation:
             ValueError: If the shape is wrong, or a value is not finite or out of range; nothing has
                 moved then.
             gymnasium.error.ResetNeeded: If a simulation has never been reset.
+            RuntimeError: If this process was forked and has no threads of the batch.
         """
         checked = self._finite('actions', actions)
         if checked.size and (np.abs(checked) > 1.0).any():
@@ -241,6 +248,7 @@ class Simulation:
         Raises:
             ValueError: If the shape is wrong or a value is not finite.
             gymnasium.error.ResetNeeded: If a simulation has never been reset.
+            RuntimeError: If this process was forked and has no threads of the batch.
         """
         return self._result(self.advance(commands))
 
@@ -255,13 +263,25 @@ class Simulation:
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
     ) -> Array:
-        """Reward of goals of any batch shape (..., goal size)."""
+        """Reward of goals, as `step` gives it.
+
+        Args:
+            achieved_goal: (..., goal size), any batch shape.
+            desired_goal: Likewise, of the same shape.
+            info: Of no account; Gymnasium's interface has it.
+
+        Returns:
+            (...,) rewards.
+
+        Raises:
+            ValueError: If the last axis is not the goal's, or the shapes differ.
+        """
         return self.metric.reward(achieved_goal, desired_goal, info)
 
     def compute_success(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike
     ) -> NDArray[np.bool_]:
-        """Success of goals of any batch shape (..., goal size)."""
+        """Success of goals of any batch shape, (..., goal size) -> (...,); as `compute_reward`."""
         return self.metric.success(achieved_goal, desired_goal)
 
     def set_goal(self, goals: ArrayLike, ids: ArrayLike | None = None) -> None:
@@ -271,7 +291,8 @@ class Simulation:
         `gymnasium` success rule tells q from -q.
 
         Args:
-            goals: (n, goal size) for the n simulations of `ids`, in their order.
+            goals: (n, goal size) for the n simulations of `ids`, in their order; units and frame as
+                `Simulation.goals` has them.
             ids: Which simulations; None for all.
 
         Raises:
