@@ -128,7 +128,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             options: `reset_mask`, booleans (N,): which environments start again; default all.
 
         Returns:
-            The observations of all environments, and an empty dictionary.
+            The observations of all environments, in the order of the space, and an empty
+            dictionary.
 
         Raises:
             TypeError: If options is not a dictionary, the mask is no boolean array or a seed is no
@@ -145,7 +146,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
                 self._seeds[index] = seeds[index]
         self._elapsed[mask] = 0
         self._ended[mask] = False
-        return observation, {}
+        return self._ordered(observation), {}
 
     def step(
         self, actions: NDArray[np.float32]
@@ -159,8 +160,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             Observations (N, ...), rewards (N,), terminated (N,), never, truncated (N,), at the end
             of an episode, or when MuJoCo lost the simulation, and a dictionary with `is_success`
             and `diverged` (N,), masked by `_is_success` and `_diverged` where an episode only
-            started. In mode `SAME_STEP` also
-            `final_obs` (N,), a dictionary for each episode that ended, and `final_info`.
+            started. In mode `SAME_STEP` also `final_obs` (N,), a dictionary for each episode that
+            ended, and `final_info`.
 
         Raises:
             ValueError: If the actions have a wrong shape or are not finite.
@@ -186,7 +187,11 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         if self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
             observation, info = self._start_next(observation, info, truncated)
         terminated = np.zeros(self.num_envs, dtype=bool)
-        return observation, reward, terminated, truncated.copy(), info
+        return self._ordered(observation), reward, terminated, truncated.copy(), info
+
+    def _ordered(self, observation: Observation) -> Observation:
+        """An observation with its parts in the order of the space, as Gymnasium's batches."""
+        return {name: observation[name] for name in sorted(observation)}
 
     def _rewards(self, result: StepResult) -> Array:
         """Rewards (N,) of a step."""

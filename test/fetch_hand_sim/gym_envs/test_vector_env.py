@@ -48,6 +48,7 @@ def test_the_batch_is_described_like_its_members(task):
     assert env.metadata['autoreset_mode'] is AutoresetMode.NEXT_STEP
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
+    assert list(observation) == list(env.observation_space)
 
 
 @pytest.mark.parametrize('mode', [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
@@ -64,6 +65,7 @@ def test_it_equals_gymnasiums_vectorisation_over_several_episodes(task, mode):
     for _ in range(13):
         actions = env.action_space.sample()
         ours, theirs = env.step(actions), reference.step(actions)
+        assert list(ours[0]) == list(theirs[0])
         for mine, other in zip(ours[:4], theirs[:4], strict=True):
             assert_same(mine, other)
         assert_same(ours[4]['is_success'], theirs[4].get('is_success', np.zeros(3)))
