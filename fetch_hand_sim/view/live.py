@@ -183,6 +183,7 @@ class LiveRobot:
             self._follow_replay(replay.name)
         elif self.spec is not None and time.monotonic() - self._heard > _SILENCE:
             self._notice_silence()
+        # Read once it is known; `_update_facts` ticks off what an answer brings, by the same names.
         for name, read in (
             ('speed', self._requests.read_speed),
             ('actor', self._requests.read_actor),

@@ -70,6 +70,11 @@ def test_older_rclpy_without_events_executor(node, monkeypatch):
         loop.serve_pending(100)
         loop.wait(0.01)
     assert received == [7.0]
+    for number in range(5):
+        publisher.publish(Float64(data=float(number)))
+    time.sleep(0.2)
+    loop.serve_pending(100)
+    assert received == [7.0, 0.0, 1.0, 2.0, 3.0, 4.0]
     loop.close()
 
 

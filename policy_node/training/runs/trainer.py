@@ -92,7 +92,7 @@ class Trainer:
         self.counters = Counters()
         self._part_noise()
         self._stop_reason = ''
-        self._refill = 0
+        self._steps_to_refill = 0
 
     def _build_simulations(self) -> None:
         config, share = self.config, self.workers.share
@@ -157,14 +157,16 @@ class Trainer:
         self.experience.generator = self._seed(self.counters.env_steps)
         limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
         held = self.experience.replay.capacity * self.spec.episode_ticks
-        self._refill = min(self.workers.share(min(limits)), held)
+        self._steps_to_refill = min(self.workers.share(min(limits)), held)
         file = self._saver.folder.replay_file(self.workers.rank)
         try:
             load_replay(file, self.experience.replay)
         except ValueError as error:
             if file.exists():
                 complain(NAME, error)
-            complain(NAME, f'{self._refill:,} steps fill the replay before learning goes on')
+            complain(
+                NAME, f'{self._steps_to_refill:,} steps fill the replay before learning goes on'
+            )
 
     def _let_critic_learn_first(self) -> None:
         """Holds an actor back that began without all its critics."""
@@ -212,10 +214,12 @@ class Trainer:
                 job = None
                 if self.config.overlap:
                     # At the end the actor after this cycle is evaluated, not the one before it.
-                    job = submit(self._collect, *self._request(may_evaluate=not self._limit()))
+                    job = submit(
+                        self._collect, *self._prepare_collection(may_evaluate=not self._limit())
+                    )
                 losses = self._learn()
                 if job is None:
-                    job = submit(self._collect, *self._request())
+                    job = submit(self._collect, *self._prepare_collection())
                 collected = self._collect_or_explain(job)
                 clock.write(self.counters)
                 self._check(losses)
@@ -239,17 +243,17 @@ class Trainer:
         None where the run is stopped before: it has nothing to learn from yet.
         """
         while True:
-            actor, random, _ = self._request(may_evaluate=False)
+            actor, random, _ = self._prepare_collection(may_evaluate=False)
             collected = self._collect_or_explain(submit(self._collect, actor, random, None))
-            filled = self.experience.transitions >= self._refill
+            filled = self.experience.transitions >= self._steps_to_refill
             if not self.workers.any(not filled):
                 return collected
             self.experience.replay.add(collected.episodes)
             if self.workers.any(bool(self._stop_reason)):
                 return None
 
-    def _request(self, may_evaluate: bool = True) -> tuple[Actor, bool, Actor | None]:
-        """What to collect next: with which actor, whether at random, and which to evaluate."""
+    def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Actor, bool, Actor | None]:
+        """Readies the collector and says with which actor, whether at random, and whom to evaluate."""
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
         self.collector.proposer = self.learner.proposer()

@@ -10,6 +10,7 @@ import rclpy
 
 from fetch_hand_sim.view.page import robot_panel, time_controls
 from fetch_hand_sim.view.picture import Facts, Picture
+from fetch_hand_sim.view.replay_watch import Replay
 from fetch_hand_sim.view.requests import (
     ChooseActor,
     OpenEpisode,
@@ -80,6 +81,17 @@ def test_a_push_beyond_the_limit_leaves_within_it(desk):
     sent = decode(desk.source, message)
     np.testing.assert_allclose(sent, 0.2 * WRENCH, rtol=1e-6)
     assert np.linalg.norm(sent[:3]) <= 10.0
+
+
+@pytest.mark.parametrize('desk', ['perturb'], indirect=True)
+def test_replays_that_come_and_go_leave_nothing_behind(desk):
+    before = len(list(desk.node.clients))
+    for number in range(3):
+        desk.requests.take_replay(Replay(f'/replay{number}', f'/replay{number}/pause'))
+        desk.requests.perform(SetPaused(True))
+        assert len(list(desk.node.clients)) > before
+    desk.requests.take_replay(None)
+    assert len(list(desk.node.clients)) == before
 
 
 @pytest.mark.parametrize('desk', ['commands'], indirect=True)
