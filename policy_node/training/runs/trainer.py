@@ -253,7 +253,7 @@ class Trainer:
                 return None
 
     def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Actor, bool, Actor | None]:
-        """Readies the collector and says with which actor, whether at random, and whom to evaluate."""
+        """Readies the collector; with which actor, whether at random, and which to evaluate."""
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
         self.collector.proposer = self.learner.proposer()

@@ -382,7 +382,7 @@ def test_evaluation_sees_nothing_of_what_training_may_change(tmp_path: Path) -> 
         trainer = Trainer(config, tmp_path, Workers())
         actor = trainer.learner.evaluation_actor()
         trainer.counters.updates = 1
-        actor, _, evaluated = trainer._request()
+        actor, _, evaluated = trainer._prepare_collection()
         outcomes = trainer._collect(actor, True, evaluated).evaluation
         assert outcomes is not None
         results.append([getattr(outcomes, name) for name in outcomes.__slots__])
