@@ -23,13 +23,8 @@ import rclpy  # noqa: E402
 from bench_rate import Watcher, report  # noqa: E402
 from bench_view import start  # noqa: E402
 
-from msgs_spec.event_loop import (  # noqa: E402
-    EventLoop,
-)
-from msgs_spec.ros import (  # noqa: E402
-    rclpy_profile,
-    ros_message_class,
-)
+from msgs_spec.event_loop import EventLoop  # noqa: E402
+from msgs_spec.ros import rclpy_profile, ros_message_class  # noqa: E402
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
 from msgs_spec.transport import keep_discovery_local  # noqa: E402

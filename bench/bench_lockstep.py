@@ -32,14 +32,9 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
 from msgs_spec.cdr import TopicCodec  # noqa: E402
 from msgs_spec.codecs import decode_status  # noqa: E402
-from msgs_spec.event_loop import (  # noqa: E402
-    EventLoop,
-)
+from msgs_spec.event_loop import EventLoop  # noqa: E402
 from msgs_spec.observations import ObservationAssembler  # noqa: E402
-from msgs_spec.ros import (  # noqa: E402
-    rclpy_profile,
-    ros_message_class,
-)
+from msgs_spec.ros import rclpy_profile, ros_message_class  # noqa: E402
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec  # noqa: E402
 from msgs_spec.tick import TickEncoder  # noqa: E402
 from msgs_spec.topics import (  # noqa: E402

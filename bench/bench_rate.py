@@ -27,13 +27,8 @@ import numpy as np  # noqa: E402
 import rclpy  # noqa: E402
 
 from msgs_spec.codecs import decode_status  # noqa: E402
-from msgs_spec.event_loop import (  # noqa: E402
-    EventLoop,
-)
-from msgs_spec.ros import (  # noqa: E402
-    rclpy_profile,
-    ros_message_class,
-)
+from msgs_spec.event_loop import EventLoop  # noqa: E402
+from msgs_spec.ros import rclpy_profile, ros_message_class  # noqa: E402
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic  # noqa: E402
 from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402

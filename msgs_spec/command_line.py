@@ -263,7 +263,7 @@ def on_stop_signals(
     """Calls `stop` when one of these signals comes for the first time; again, it ends the process.
 
     But not a second SIGHUP: a closed terminal sends one, and the shell in it another; so after the
-    first they are ignored.
+    first they are ignored. One that is ignored from the start, as `nohup` has it, stays so.
 
     Yields:
         A list that will hold the numbers of those that came.
@@ -276,7 +276,7 @@ def on_stop_signals(
         discard_unread_output()
         stop(number, frame)
 
-    before = {number: signal.signal(number, handle) for number in numbers}
+    before = {number: signal.signal(number, handle) for number in heard(numbers)}
     try:
         yield received
     finally:
@@ -285,6 +285,12 @@ def on_stop_signals(
             # one must not kill what ends.
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, handler)
+
+
+def heard(numbers: Iterable[signal.Signals]) -> list[signal.Signals]:
+    """Those of these signals that may be taken: all but a SIGHUP that `nohup` has ignored."""
+    ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    return [number for number in numbers if number != signal.SIGHUP or not ignored]
 
 
 def _nobodys_signals() -> list[signal.Signals]:

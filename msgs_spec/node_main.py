@@ -15,6 +15,7 @@ from msgs_spec.command_line import (
     CommandError,
     UsageError,
     complain,
+    heard,
     require_extra,
 )
 from msgs_spec.last_resort import ends_within
@@ -46,9 +47,8 @@ class StopSignals:
 
     def __init__(self) -> None:
         self.received: str | None = None
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                signal.signal(number, self._handle)
+        for number in heard([signal.SIGINT, signal.SIGTERM, signal.SIGHUP]):
+            signal.signal(number, self._handle)
 
     def __bool__(self) -> bool:
         """Whether to stop."""

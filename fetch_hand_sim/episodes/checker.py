@@ -17,7 +17,6 @@ from fetch_hand_sim.episode_log.errors import one_line
 from fetch_hand_sim.episode_log.model import former_model_sha256, model_sha256
 from fetch_hand_sim.episode_log.reader import DAMAGED
 from fetch_hand_sim.episode_log.ticks import LoggedTick, split_ticks
-from fetch_hand_sim.episodes.context import source_revision
 from fetch_hand_sim.episodes.goals import accept_goal
 from fetch_hand_sim.episodes.perturbations import accept_perturbation
 from fetch_hand_sim.episodes.recorder import episode_result
@@ -27,6 +26,7 @@ from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode
 from msgs_spec.command_line import printable
 from msgs_spec.schemas import deserialize
+from msgs_spec.source_revision import source_revision
 from msgs_spec.tasks import RewardType, SuccessRule, Timing
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import TopicSpec

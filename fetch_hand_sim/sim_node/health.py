@@ -69,8 +69,7 @@ class Health:
         """
         robot, growth = self._robot, self._growth
         seconds, self._then = max(now - self._then, 1e-9), now
-        ticks = growth['ticks'].since(robot.counters.ticks)
-        rate = ticks / seconds
+        rate = growth['ticks'].since(robot.counters.ticks) / seconds
         simulated = growth['simulated'].since(robot.runner.stamp_ns) * 1e-9
         self.real_time_factor = simulated / seconds
         task = robot.runner.spec.name
@@ -80,7 +79,7 @@ class Health:
             self._values(rate, surroundings),
             f'{task} {self._state()}, {rate:.1f} ticks per second',
         )
-        self._judge_period(report, ticks, seconds)
+        self._judge_period(report, rate, seconds)
         if surroundings.has_log_failed:
             report.fail(surroundings.log)
         report.problems += lasting_problems(robot, surroundings)
@@ -133,7 +132,7 @@ class Health:
         own = [self._name] if surroundings.publishes_clock else []
         return sorted([*surroundings.clock_publishers, *own])
 
-    def _judge_period(self, report: Report, ticks: float, seconds: float) -> None:
+    def _judge_period(self, report: Report, rate: float, seconds: float) -> None:
         """Reports what went wrong since the last report."""
         robot, growth = self._robot, self._growth
         diverged = growth['diverged'].since(robot.runner.simulation.divergences)
@@ -147,10 +146,8 @@ class Health:
             report.warn(f'{missed:.0f} ticks missed')
         elif asked and self._pace_before == pace_before:
             # In slow motion a period may end just before a tick.
-            if ticks < (1.0 - _RATE_TOLERANCE) * asked * seconds - 1.0:
-                report.warn(
-                    f'{ticks / seconds:.1f} ticks per second, not the {asked:.1f} asked for'
-                )
+            if rate < (1.0 - _RATE_TOLERANCE) * asked - 1.0 / seconds:
+                report.warn(f'{rate:.1f} ticks per second, not the {asked:.1f} asked for')
         rejected = growth['rejected'].since(robot.buffer.rejected.total())
         if rejected:
             report.warn(f'{rejected:.0f} commands rejected; {robot.buffer.last_rejection}')

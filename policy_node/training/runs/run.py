@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from fetch_hand_sim.episodes.context import source_revision
 from msgs_spec.command_line import (
     CommandError,
     UsageError,
@@ -18,6 +17,7 @@ from msgs_spec.command_line import (
     on_stop_signals,
     require_extra,
 )
+from msgs_spec.source_revision import source_revision
 from policy_node.policies.files import one_line
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.machine.devices import choose_device
@@ -195,8 +195,6 @@ def _initial_networks(config: TrainConfig) -> InitialNetworks:
 def _stop_on_signals(trainer: Trainer) -> Iterator[list[int]]:
     """Ctrl-C, SIGTERM and SIGHUP end the run after the cycle; a second one ends it at once.
 
-    A SIGHUP that is ignored from the start, as `nohup` has it, stays so.
-
     Yields:
         A list that will hold the number of the signal.
     """
@@ -206,8 +204,6 @@ def _stop_on_signals(trainer: Trainer) -> Iterator[list[int]]:
         trainer.stop(f'stopped by {signal.Signals(number).name}')
         complain(NAME, 'stopping after this cycle; once more stops at once')
 
-    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
-        numbers.remove(signal.SIGHUP)
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     with on_stop_signals(numbers, stop) as received:
         yield received

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fetch_hand_sim.episodes.context import revision_of
+from msgs_spec.source_revision import revision_of
 
 
 def git(root: Path, *arguments: str) -> str:
