@@ -55,13 +55,19 @@ def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
     needs `max_episode_steps` too.
 
     Args:
-        name: The id, or what `spec` of an environment says.
+        name: The task, the id, or what `spec` of an environment says.
         **arguments: As `gymnasium.make` and `FetchHandEnv` have them.
 
     Raises:
         ValueError: If an argument is not allowed.
     """
+    name = _id_of(name)
     return gymnasium.make(name, **_with_length(name, arguments))
+
+
+def _id_of(name: str | EnvSpec) -> str | EnvSpec:
+    """The id of a task that is called by its own name; anything else as it is."""
+    return environment_id(name) if isinstance(name, str) and name in TASKS else name
 
 
 def _with_length(name: str | EnvSpec, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -98,7 +104,7 @@ def make_vec(
     Episodes are as long in seconds at every rate, as those of `make`.
 
     Args:
-        name: The id, or what `spec` of an environment says.
+        name: The task, the id, or what `spec` of an environment says.
         num_envs: Number of copies.
         wrappers: What goes around the batch, the innermost first: wrappers of
             `gymnasium.wrappers.vector`, or those of single environments that have one of the same
@@ -108,6 +114,7 @@ def make_vec(
     Raises:
         ValueError: If a wrapper is for single environments only, or an argument is not allowed.
     """
+    name = _id_of(name)
     chosen = [_wrapper_of_batches(wrapper) for wrapper in wrappers]
     env = gymnasium.make_vec(
         name,

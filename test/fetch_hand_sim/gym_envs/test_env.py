@@ -13,6 +13,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3 import DDPG, HerReplayBuffer
 
+import fetch_hand_sim
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv
 from fetch_hand_sim.gym_envs.registration import environment_id
@@ -448,3 +449,13 @@ def test_a_goal_is_as_many_finite_numbers_as_the_task_has(goal):
     )
     with pytest.raises(ValueError, match='a goal of FetchReach is 3 finite numbers, not '):
         batch.set_attr('goal', [goal, goal])
+
+
+def test_a_task_is_made_by_its_name_alone():
+    env = fetch_hand_sim.make('FetchReach', reward_type='dense', control_hz=50)
+    assert env.spec.id == 'fetch_hand_sim/FetchReach-v0' and env.spec.max_episode_steps == 100
+    assert env.unwrapped.reward_type == 'dense'
+    batch = fetch_hand_sim.make_vec('FetchReach', num_envs=2)
+    assert batch.num_envs == 2 and batch.spec.id == env.spec.id
+    with pytest.raises(gymnasium.error.NameNotFound, match='Did you mean: `FetchReach'):
+        fetch_hand_sim.make('fetch_hand_sim/FetchReech-v0')
