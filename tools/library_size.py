@@ -37,7 +37,7 @@ ABILITIES = {
     'tasks of other packages': r'.*/foreign_tasks\.py',
     'pushes': r'.*/perturbations\.py',
     'inputs that know geometry, prioritised replay': (
-        r'.*/(goal_features|episode_weights|initial_networks|replay_file)\.py'
+        r'.*/(goal_features|episode_weights|initial_networks|mean_networks|read_networks|replay_file)\.py'
     ),
     'more ways to learn, and studies of them': (
         r'.*/benchmark/(final|measures|research\w*)\.py|.*/learning/(conditions|critics|density_ratio'

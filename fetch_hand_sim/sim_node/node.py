@@ -21,17 +21,16 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node import NODE_NAME
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
-from fetch_hand_sim.sim_node.health import Health, Surroundings, lasting_problems, waiting_line
 from fetch_hand_sim.sim_node.latest_tick import LatestTick
 from fetch_hand_sim.sim_node.pacing import RealTimePacer
 from fetch_hand_sim.sim_node.receivers import Receivers
+from fetch_hand_sim.sim_node.reporter import WAITING_PERIOD, LogState, Reporter
 from fetch_hand_sim.sim_node.robot import Messages, Robot
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.cdr import TopicCodec
 from msgs_spec.command_line import UsageError
-from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports, next_report
+from msgs_spec.diagnostics import REPORT_PERIOD, next_report
 from msgs_spec.event_loop import BEAT, EventLoop
 from msgs_spec.node_main import NodeFailure, StopSignals
 from msgs_spec.parameters import SIM_NODE
@@ -43,7 +42,7 @@ from msgs_spec.ros import (
 )
 from msgs_spec.ros_parameters import declare_parameters, set_callback
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
-from msgs_spec.topics import DIAGNOSTICS, LATEST_TICK, MONITORING, REAL_TIME_FACTOR, topics
+from msgs_spec.topics import LATEST_TICK, MONITORING, topics
 
 _WARN_PERIOD = 1.0
 # Seconds a beat may take: none begins that close to a tick.
@@ -52,8 +51,6 @@ _BEAT_TIME = 0.01
 _SERVED_FIRST = 100
 # Seconds a robot waits for the name of a commander who is about to give it.
 _INTRODUCTION_TIME = 1.0
-# Seconds between two lines about what a robot waits for, and before the first command of all.
-_WAITING_PERIOD = 5.0
 
 
 class SimNode(Node):
@@ -76,11 +73,7 @@ class SimNode(Node):
         self._watch = GraphWatch(self, self._robot.runner.spec, self._outputs)
         open_services(self, self._robot)
         now = time.monotonic()
-        self._health = Health(self._robot, self.get_fully_qualified_name(), now)
-        self._factor_codec = TopicCodec(REAL_TIME_FACTOR)
-        self._said: set[str] = set()
-        self._has_said_far_out = False
-        self._commanders: list[str] = []
+        self._reporter = Reporter(self, self._robot, self._watch, self._log_state)
         self._has_introduction = False
         self._beat_due = self._ticked_at = now
         self._report_due = now + REPORT_PERIOD
@@ -198,6 +191,9 @@ class SimNode(Node):
     def _has_log_failed(self) -> bool:
         return self._recorder is not None and self._recorder.has_failed
 
+    def _log_state(self) -> LogState:
+        return LogState(self._settings['episode_dir'], self._has_log_failed)
+
     def _introduction(self) -> str:
         """What is simulated, how fast, where to find it and who is to command it."""
         values = self._settings
@@ -258,7 +254,9 @@ class SimNode(Node):
             self._stand_still(now)
         if now >= self._report_due:
             self._report_due = next_report(self._report_due, now)
-            self._report(now)
+            self._watch.update()
+            self._forget_who_left()
+            self._publish(self._reporter.report(now))
 
     def _stand_still(self, now: float) -> None:
         """Keeps time alive without ticks; lets whoever comes late hear the last one."""
@@ -274,10 +272,9 @@ class SimNode(Node):
                 self._publish(robot.last_messages)
                 self._latest_tick.repeat()
         elif not has_started:
-            is_waiting = now - self._ticked_at > _WAITING_PERIOD
+            is_waiting = now - self._ticked_at > WAITING_PERIOD
         if is_waiting:
-            line = waiting_line(robot, self._surroundings())
-            self.get_logger().warning(line, **seldom(_WAITING_PERIOD))
+            self._reporter.say_what_is_waited_for()
 
     def _emit(self, tick: Tick, messages: Messages) -> None:
         if self._watch.has_newcomer and self._watch.is_heard():
@@ -312,53 +309,11 @@ class SimNode(Node):
             self._recorder.close(stop.received or 'end of the run')
         await_acknowledgements(self._outputs.values())
 
-    # Reports
-
-    def _report(self, now: float) -> None:
-        self._watch.update()
-        self._forget_who_left()
-        surroundings = self._surroundings()
-        report = self._health.report(surroundings, now)
-        self._say_news(surroundings)
-        factor = self._factor_codec.encode(0, [self._health.real_time_factor])
-        self._publish([(DIAGNOSTICS, encode_reports(report))])
-        self._publish([(REAL_TIME_FACTOR, factor)])
-
-    def _surroundings(self) -> Surroundings:
-        directory, watch = self._settings['episode_dir'], self._watch
-        has_failed = self._has_log_failed
-        names = watch.commanders.names
-        return Surroundings(
-            commanders=names,
-            commander_problems=watch.commanders.problems(),
-            robots=watch.robots,
-            waiting_elsewhere=watch.waiting_elsewhere() if not names else [],
-            clock_publishers=watch.clock_publishers,
-            publishes_clock=self._settings['publish_clock'],
-            log=f'logging to {directory} has failed' if has_failed else directory or 'off',
-            has_log_failed=has_failed,
-        )
-
-    def _say_news(self, surroundings: Surroundings) -> None:
-        """Logs who commands when it changes, and each problem once when it begins."""
-        if surroundings.commanders != self._commanders:
-            self._commanders = list(surroundings.commanders)
-            names = ', '.join(self._commanders) or 'nobody any more'
-            self.get_logger().info(f'commands come from {names}')
-        if self._robot.buffer.far_out and not self._has_said_far_out:
-            self._has_said_far_out = True
-            line = self._robot.buffer.last_far_out
-            self.get_logger().warning(f'command clipped from far out of range: {line}')
-        problems = {line for _, line in lasting_problems(self._robot, surroundings)}
-        for line in sorted(problems - self._said):
-            self.get_logger().warning(line)
-        self._said = problems
+    # Callbacks
 
     def _on_logged(self, episode: LoggedEpisode) -> None:
         end = '' if episode.is_complete else ', cut short'
         self.get_logger().info(f'{_episode_line(episode.status)}{end}, {episode.path}')
-
-    # Callbacks
 
     def _warn(self, line: str) -> None:
         self.get_logger().warning(line, **seldom(_WARN_PERIOD))

@@ -65,6 +65,39 @@ def finite_goal(goal: ArrayLike, spec: TaskSpec) -> Array:
     return array
 
 
+def finite_goals(goals: ArrayLike, count: int, spec: TaskSpec) -> Array:
+    """Goals of so many simulations, (count, goal size), a fresh array.
+
+    Raises:
+        ValueError: If they have another shape, or something is no finite number.
+    """
+    array = np.array(goals, dtype=np.float64)
+    shape = (count, spec.goal.size)
+    if array.shape != shape:
+        raise ValueError(f'goals of {spec.name} have shape {shape}, not {array.shape}')
+    if not np.isfinite(array).all():
+        raise ValueError(f'goals must be finite, not {array.tolist()}')
+    return array
+
+
+def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
+    """Poses with unit quaternions, of q and -q the one that is nearer to the object's.
+
+    Args:
+        goals: (n, 7), position in m and quaternion wxyz.
+        achieved_goals: (n, 7) where the objects are.
+
+    Raises:
+        ValueError: If a quaternion is zero.
+    """
+    norm = np.linalg.norm(goals[:, 3:], axis=1, keepdims=True)
+    if not (norm > 1e-6).all():
+        raise ValueError('a goal quaternion must not be zero')
+    quaternions = goals[:, 3:] / norm
+    quaternions[(quaternions * achieved_goals[:, 3:]).sum(axis=1) < 0.0] *= -1.0
+    return np.concatenate([goals[:, :3], quaternions], axis=1)
+
+
 def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
     """The simulations of indices or of a boolean mask (N,), in the order in which they are named.
 

@@ -17,17 +17,19 @@ import mujoco
 import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
-from mujoco import mjtWarning
 from mujoco.batch import SimulationError
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation.arguments import (
     Seeds,
+    finite_goals,
     finite_numbers,
     generators,
+    nearest_quaternions,
     require_whole,
     selected_simulations,
 )
+from fetch_hand_sim.simulation.divergence import DivergenceWatch
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.actions import command_from_action
@@ -45,12 +47,6 @@ from msgs_spec.tasks import (
 Observation = dict[str, Array]
 
 _LOGGER = logging.getLogger(__name__)
-# MuJoCo warnings after which it has thrown the state away.
-_DIVERGENCE = (
-    mjtWarning.mjWARN_BADQPOS.value,
-    mjtWarning.mjWARN_BADQVEL.value,
-    mjtWarning.mjWARN_BADQACC.value,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +133,7 @@ class Simulation:
         self.timing = timing
         self.metric = self._task.goal_metric(success_rule, reward_type)
         self.divergences = 0
-        self._warnings = np.zeros(num_envs, dtype=np.int64)
+        self._divergence = DivergenceWatch(self._task.batch)
         self.goals = np.zeros((num_envs, self.spec.goal.size))
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._all = np.arange(num_envs)
@@ -299,20 +295,9 @@ class Simulation:
             ValueError: If the shape is wrong, a value is not finite or a quaternion is zero.
         """
         selected = self._select(ids)
-        wanted = np.array(goals, dtype=np.float64)
-        shape = (selected.size, self.spec.goal.size)
-        if wanted.shape != shape:
-            raise ValueError(f'goals of {self.spec.name} have shape {shape}, not {wanted.shape}')
-        if not np.isfinite(wanted).all():
-            raise ValueError(f'goals must be finite, not {wanted.tolist()}')
+        wanted = finite_goals(goals, selected.size, self.spec)
         if self.spec.goal is GoalKind.POSE:
-            norm = np.linalg.norm(wanted[:, 3:], axis=1, keepdims=True)
-            if not (norm > 1e-6).all():
-                raise ValueError('a goal quaternion must not be zero')
-            wanted[:, 3:] /= norm
-            achieved = self._task.observe()[1][selected]
-            flipped = (wanted[:, 3:] * achieved[:, 3:]).sum(axis=1) < 0.0
-            wanted[flipped, 3:] *= -1.0
+            wanted = nearest_quaternions(wanted, self._task.observe()[1][selected])
         self.goals[selected] = wanted
 
     def perturb(self, body: str, wrench: ArrayLike, index: int = 0) -> None:
@@ -375,7 +360,7 @@ class Simulation:
             self.apply_model_changes()
         self.metric = state['metric']
         self._task.set_physics_state(state['physics'])
-        self._warnings = self._count_warnings()
+        self._divergence.forget()
         self.goals[:] = state['goals']
         self._generators = state['generators']
         self.divergences = state['divergences']
@@ -407,7 +392,7 @@ class Simulation:
         if self._is_pushed:
             self._pushes[:] = 0.0
             self._is_pushed = False
-        diverged = failed | self._has_diverged()
+        diverged = failed | self._divergence.found()
         if diverged.any():
             self._restart(diverged)
         return diverged
@@ -416,17 +401,6 @@ class Simulation:
         observation = self.observe()
         reward, success = self.metric.evaluate(observation['achieved_goal'], self.goals)
         return StepResult(observation, reward, success, diverged)
-
-    def _has_diverged(self) -> NDArray[np.bool_]:
-        """Which simulations MuJoCo has given up since the last reset or step, (N,)."""
-        before, self._warnings = self._warnings, self._count_warnings()
-        return np.asarray(self._warnings > before)
-
-    def _count_warnings(self) -> NDArray[np.int64]:
-        """How often MuJoCo has given each simulation up, (N,)."""
-        # The last axis of `Batch.warning` is (last info, number).
-        first, second, third = (self._task.batch.warning[:, kind, 1] for kind in _DIVERGENCE)
-        return np.asarray(first + second + third)
 
     def _restart(self, diverged: NDArray[np.bool_]) -> None:
         ids = np.flatnonzero(diverged)
@@ -442,7 +416,7 @@ class Simulation:
         """Begins episodes; what MuJoCo warned of before counts no more."""
         self._require_threads()
         self.goals[ids] = self._task.reset(ids, [self.generator(i) for i in ids.tolist()])
-        self._warnings = self._count_warnings()
+        self._divergence.forget()
         self._is_started[ids] = True
 
     def _require_threads(self) -> None:

@@ -24,14 +24,13 @@ from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import is_first_worker, join_workers, leave_workers
 from policy_node.training.machine.memory import available_memory, why_too_large
 from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.runs.initial_networks import (
-    InitialNetworks,
-    read_initial_networks,
-)
+from policy_node.training.runs.finite_checks import TrainingError
+from policy_node.training.runs.initial_networks import InitialNetworks
+from policy_node.training.runs.read_networks import read_initial_networks
 from policy_node.training.runs.run_folder import COMMAND_FILE, LOCK_FILE, STATE_FILE
 from policy_node.training.runs.run_log import RunLog, draw_curve, read_progress
 from policy_node.training.runs.saving import NAME
-from policy_node.training.runs.trainer import Trainer, TrainingError
+from policy_node.training.runs.trainer import Trainer
 from policy_node.training.runs.training_state import Counters
 
 

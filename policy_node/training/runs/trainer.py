@@ -19,7 +19,7 @@ from policy_node.training.collection.simulations import make_simulation
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator, success_rate
-from policy_node.training.experience.sampling import make_sampler, narrowed
+from policy_node.training.experience.sampling import make_sampler
 from policy_node.training.learners.actor_critic import Losses
 from policy_node.training.learners.make_learner import make_learner
 from policy_node.training.machine.devices import choose_device
@@ -27,8 +27,11 @@ from policy_node.training.machine.distributed import Workers
 from policy_node.training.machine.threads import split_threads
 from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.replay_file import load_replay
+from policy_node.training.runs.finite_checks import require_finite_episodes, require_finite_losses
 from policy_node.training.runs.initial_networks import CRITIC_FIRST, InitialNetworks
+from policy_node.training.runs.narrowing import Narrowing
 from policy_node.training.runs.progress_row import progress_row
+from policy_node.training.runs.run_clock import RunClock
 from policy_node.training.runs.run_folder import RunFolder
 from policy_node.training.runs.run_log import RunLog
 from policy_node.training.runs.saving import NAME, Saver
@@ -36,10 +39,6 @@ from policy_node.training.runs.training_state import Counters, load_networks, lo
 
 # Steps that a resumed run without these episodes collects before it goes on.
 MOST_REFILLED = 100_000
-
-
-class TrainingError(RuntimeError):
-    """Training cannot go on; the message names the step and the cause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +119,7 @@ class Trainer:
         self.learner, self.experience = make_learner(
             config, spec, self.device, self.workers, sampler, generator
         )
+        self._narrowing = Narrowing(config, self.simulation.metric, self.experience, self.workers)
 
     def _part_noise(self) -> None:
         """Lets workers that began with the same networks draw noise of their own."""
@@ -144,7 +144,7 @@ class Trainer:
         state = load_state(path, self.learner, self.experience.statistics)
         self.counters = state.counters
         self._part_noise()
-        self.experience.narrow(self._narrowing)
+        self._narrowing.resume(self.counters)
         origin = state.extra.get('init_from', {})
         self._saver.folder = replace(self._saver.folder, init_from=origin)
         self._let_critic_learn_first()
@@ -199,7 +199,7 @@ class Trainer:
         """
         if self.counters.env_steps >= self.config.total_steps:
             return f'{self.config.total_steps:,} environment steps were done before'
-        clock = _Clock(self.counters)
+        clock = RunClock(self.counters)
         # The number of tensor threads belongs to a thread: without its own, the collector's small
         # products would start one per core, which then spin against the simulation and the learner.
         with ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,)) as executor:
@@ -222,7 +222,7 @@ class Trainer:
                     job = submit(self._collect, *self._prepare_collection())
                 collected = self._collect_or_explain(job)
                 clock.write(self.counters)
-                self._check(losses)
+                require_finite_losses(losses, self.counters)
                 knows = self.counters.updates > 0 or bool(self.config.init_from)
                 if collected.evaluation is None and knows and self._limit():
                     # Noise and learning rate have fallen, and nothing else would measure it.
@@ -288,11 +288,7 @@ class Trainer:
 
     def _collect_or_explain(self, job: Future[Collected]) -> Collected:
         collected = job.result()
-        for name in ('observation', 'achieved_goal', 'desired_goal', 'action'):
-            if not np.isfinite(getattr(collected.episodes, name)).all():
-                raise TrainingError(
-                    f'{name} is not finite after {self.counters.env_steps} environment steps'
-                )
+        require_finite_episodes(collected.episodes, self.counters)
         return collected
 
     def _absorb(self, collected: Collected) -> None:
@@ -304,26 +300,7 @@ class Trainer:
         self.counters.episodes += int(count)
         self.counters.env_steps += int(count) * self.spec.episode_ticks
         self.experience.normalize(episodes, self.learner.actor, self.counters.env_steps)
-        if self.config.narrows:
-            self._narrow(episodes, int(count))
-
-    @property
-    def _narrowing(self) -> float:
-        """How far goals have narrowed, 0 ... 1."""
-        return self.counters.narrowing_steps / self.config.total_steps
-
-    def _narrow(self, episodes: Episodes, count: int) -> None:
-        """Narrows goals by one cycle of `count` episodes, unless too few of these met theirs."""
-        counters, config = self.counters, self.config
-        if config.narrow_above == 0.0:
-            counters.narrowing_steps = counters.env_steps
-        elif counters.updates > 0:
-            metric = narrowed(self.simulation.metric, config, self._narrowing)
-            found = self.experience.count_met(episodes, metric.success)
-            met = self.workers.sum(torch.tensor([found])).item()
-            if met >= config.narrow_above * count:
-                counters.narrowing_steps += count * self.spec.episode_ticks
-        self.experience.narrow(self._narrowing)
+        self._narrowing.go_on(episodes, int(count), self.counters)
 
     def _learn(self) -> list[Losses]:
         first = self.workers.share(self.config.learning_starts) if self.counters.updates == 0 else 0
@@ -340,19 +317,6 @@ class Trainer:
         self.learner.average()
         self.counters.updates = self.learner.updates
         return losses
-
-    def _check(self, losses: list[Losses]) -> None:
-        """Stops on the first loss that is not finite."""
-        first = self.counters.updates - len(losses)
-        for name in ('critic', 'actor'):
-            values = [getattr(loss, name) for loss in losses]
-            finite = torch.isfinite(torch.stack(values)).tolist() if values else []
-            if not all(finite):
-                update = first + finite.index(False) + 1
-                raise TrainingError(
-                    f'{name} loss is {float(values[finite.index(False)])} in update {update}, '
-                    f'after {self.counters.env_steps} environment steps'
-                )
 
     def _keep_best(self, collected: Collected) -> None:
         outcomes, actor = collected.evaluation, collected.evaluated
@@ -396,19 +360,6 @@ class Trainer:
         if collected.guided is not None:
             row['eval_guided'] = success_rate(collected.guided, rule)
         return row
-
-
-class _Clock:
-    """Time that a run has taken, over all its parts."""
-
-    def __init__(self, counters: Counters) -> None:
-        self._started = time.monotonic() - counters.seconds
-        self._processor_started = time.process_time() - counters.processor_seconds
-
-    def write(self, counters: Counters) -> None:
-        """Writes both times into the counters."""
-        counters.seconds = time.monotonic() - self._started
-        counters.processor_seconds = time.process_time() - self._processor_started
 
 
 def _run_now(function: Callable[..., Collected], *arguments: Any) -> Future[Collected]:

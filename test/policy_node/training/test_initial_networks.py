@@ -16,12 +16,10 @@ from policy_node.policies.shipped import shipped_actors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.runs.initial_networks import (
-    CRITIC_FIRST,
-    network_shape,
-    read_initial_networks,
-)
+from policy_node.training.networks.network_shape import network_shape
+from policy_node.training.runs.initial_networks import CRITIC_FIRST
 from policy_node.training.runs.origins import steps_behind
+from policy_node.training.runs.read_networks import read_initial_networks
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.trainer import Trainer

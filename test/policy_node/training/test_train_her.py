@@ -25,12 +25,9 @@ from policy_node.training.generate_episodes import main as generate_episodes
 from policy_node.training.goals.graded import GradedReward, parse_grades
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.replay.logged_episodes import read_experience
+from policy_node.training.runs.finite_checks import TrainingError
 from policy_node.training.runs.run_log import RunLog, read_progress
-from policy_node.training.runs.trainer import (
-    Collected,
-    Trainer,
-    TrainingError,
-)
+from policy_node.training.runs.trainer import Collected, Trainer
 from policy_node.training.runs.training_state import read_state
 from policy_node.training.ship_actor import main as ship_actor
 from policy_node.training.train_her import main

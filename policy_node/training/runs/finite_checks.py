@@ -1,0 +1,47 @@
+"""Numbers that are not finite end a run before they reach a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from policy_node.training.learners.actor_critic import Losses
+from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.runs.training_state import Counters
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on; the message names the step and the cause."""
+
+
+def require_finite_episodes(episodes: Episodes, counters: Counters) -> None:
+    """Stops on the first episode that holds what is no number.
+
+    Raises:
+        TrainingError: If there is one.
+    """
+    for name in ('observation', 'achieved_goal', 'desired_goal', 'action'):
+        if not np.isfinite(getattr(episodes, name)).all():
+            raise TrainingError(
+                f'{name} is not finite after {counters.env_steps} environment steps'
+            )
+
+
+def require_finite_losses(losses: Sequence[Losses], counters: Counters) -> None:
+    """Stops on the first loss, of the newest updates, that is no number.
+
+    Raises:
+        TrainingError: If there is one.
+    """
+    first = counters.updates - len(losses)
+    for name in ('critic', 'actor'):
+        values = [getattr(loss, name) for loss in losses]
+        finite = torch.isfinite(torch.stack(values)).tolist() if values else []
+        if not all(finite):
+            update = first + finite.index(False) + 1
+            raise TrainingError(
+                f'{name} loss is {float(values[finite.index(False)])} in update {update}, '
+                f'after {counters.env_steps} environment steps'
+            )
