@@ -13,7 +13,7 @@ from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.networks.conditions import first_weights, with_input
 from policy_node.training.networks.critics import Ensemble, count_critics, critic_tensors
-from policy_node.training.networks.network_shape import network_shape
+from policy_node.training.networks.shape_from_config import network_shape
 from policy_node.training.networks.widening import can_widen, widened
 from policy_node.training.runs.training_state import part_of
 

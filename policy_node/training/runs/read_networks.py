@@ -13,7 +13,7 @@ from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_rules import unusual_networks
 from policy_node.training.configuration.config_values import config_from_dict
 from policy_node.training.networks.conditions import ACTING_INPUT, without_input
-from policy_node.training.networks.network_shape import network_shape
+from policy_node.training.networks.shape_from_config import network_shape
 from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.mean_networks import mean_of
 from policy_node.training.runs.origins import steps_behind

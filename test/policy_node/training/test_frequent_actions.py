@@ -23,7 +23,7 @@ from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.sampling import TransitionSampler, make_sampler
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.networks.network_shape import network_shape
+from policy_node.training.networks.shape_from_config import network_shape
 from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.transitions import Starts, Transitions
 from support.refusals import assert_refused
