@@ -288,7 +288,12 @@ def on_stop_signals(
 
 
 def heard(numbers: Iterable[signal.Signals]) -> list[signal.Signals]:
-    """Those of these signals that may be taken: all but a SIGHUP that `nohup` has ignored."""
+    """Those of these signals that may be taken: all but a SIGHUP that `nohup` has ignored.
+
+    None in a thread: Python hands signals to the main one.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return []
     ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     return [number for number in numbers if number != signal.SIGHUP or not ignored]
 
@@ -299,7 +304,7 @@ def _nobodys_signals() -> list[signal.Signals]:
     What a shell starts in the background ignores Ctrl-C, and SIGTERM ends it all the same.
     """
     ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    if threading.current_thread() is not threading.main_thread() or not (is_nobodys() or ignored):
+    if not (is_nobodys() or ignored):
         return []
     others = (signal.SIGTERM, signal.SIGHUP)
     found = [each for each in others if signal.getsignal(each) == signal.SIG_DFL]

@@ -1,1 +1,1 @@
-"""Pictures and films of logged episodes."""
+"""Pictures and films of episodes."""

@@ -6,7 +6,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from PIL import Image
@@ -25,8 +25,8 @@ _SHORTEST_MS = 20
 _COMPRESSION = 1
 
 
-class _Roll:
-    """Pictures of one size, packed."""
+class Roll:
+    """Pictures (height, width, 3) of one size, packed."""
 
     def __init__(self) -> None:
         self._packed: list[bytes] = []
@@ -36,10 +36,12 @@ class _Roll:
         return len(self._packed)
 
     def add(self, picture: Picture) -> None:
+        """Appends one."""
         self._shape = picture.shape
         self._packed.append(zlib.compress(picture.tobytes(), _COMPRESSION))
 
     def picture(self, number: int) -> Picture:
+        """Returns one, read-only."""
         data = zlib.decompress(self._packed[number])
         return np.frombuffer(data, dtype=np.uint8).reshape(self._shape)
 
@@ -72,32 +74,35 @@ class _Film(Image.Image):
         return self._at
 
 
-def write_animation(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+def write_animation(
+    target: Path | IO[bytes], pictures: Iterable[Picture], fps: float, kind: str
+) -> None:
     """Writes pictures (height, width, 3) of one size.
 
     Args:
-        path: Ending in .gif or .webp.
+        target: Where to.
         pictures: Drawn as they come.
         fps: Pictures per second; of more than 50 every n-th is taken.
+        kind: `.gif` or `.webp`.
     """
-    every, roll, count = _kept_every(fps), _Roll(), 0
+    every, roll, count = _kept_every(fps), Roll(), 0
     for count, picture in enumerate(pictures, start=1):
         if (count - 1) % every == 0:
             roll.add(picture)
     options: dict[str, Any] = {'quality': _QUALITY, 'method': 4}
     film = _Film(len(roll), lambda number: Image.fromarray(roll.picture(number)))
-    if path.suffix == '.gif':
+    if kind == '.gif':
         palette = _palette(roll)
         film = _Film(
             len(roll),
             lambda number: Image.fromarray(roll.picture(number)).quantize(palette=palette),
         )
         options = {'optimize': True}
-    durations = _durations(count, fps, _UNITS[path.suffix])
-    film.save(path, save_all=True, duration=durations, loop=0, **options)
+    durations = _durations(count, fps, _UNITS[kind])
+    film.save(target, format=kind[1:], save_all=True, duration=durations, loop=0, **options)
 
 
-def _palette(roll: _Roll) -> Image.Image:
+def _palette(roll: Roll) -> Image.Image:
     """One palette for all, or colours flicker; made of some, because goals change their colour."""
     some = range(0, len(roll), max(1, len(roll) // _SAMPLES))
     samples = Image.fromarray(np.concatenate([roll.picture(number) for number in some]))

@@ -74,7 +74,7 @@ def write_film(
         if path.suffix.lower() == '.mp4':
             _write_mp4(hidden, pictures, fps, keyframe_every)
         else:
-            write_animation(hidden, pictures, fps)
+            write_animation(hidden, pictures, fps, path.suffix.lower())
 
 
 def write_picture(path: Path, picture: Picture) -> None:

@@ -22,7 +22,7 @@ from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_options import add_field_options, given_fields
 from policy_node.training.configuration.config_rules import RECIPES
-from policy_node.training.configuration.config_values import config_from_dict, parse_assignment
+from policy_node.training.configuration.config_values import parse_assignment
 from policy_node.training.configuration.recipes import recipe_config
 
 if TYPE_CHECKING:
@@ -32,12 +32,6 @@ if TYPE_CHECKING:
 _NAME = 'train_her'
 # Fields that say which recipe there is to start from.
 _OWN_OPTIONS = ('task', 'recipe')
-# What networks are made of, and what their values and the replay are of: they stay with a run.
-_NETWORK_FIELDS = (
-    'hidden_sizes layer_norm goal_features algorithm critics quantiles norm advantage condition '
-    'longest_hold subgoal_every'
-).split()
-_EXPERIENCE_FIELDS = 'control_hz reward_type discount gamble'.split()
 # A process that a signal ended returns 128 + its number, as shells say it.
 EXIT_SIGNAL = 128
 
@@ -73,9 +67,15 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
         if overrides.get('strategy', 'none') != 'none':
             raise ValueError(f'--no-her excludes --strategy {overrides["strategy"]}')
         overrides['strategy'] = 'none'
-    if options.resume is not None:
-        return _resumed_config(options, overrides)
     task, recipe = (_own_option(options, overrides, name) for name in _OWN_OPTIONS)
+    if options.resume is not None:
+        if options.output is not None:
+            raise ValueError(f'--output excludes --resume: the run goes on in {options.resume}')
+        if overrides.get('init_from'):
+            raise ValueError('--init-from excludes --resume: a run goes on with its own networks')
+        from policy_node.training.runs.resumed_config import resumed_config
+
+        return resumed_config(options.resume, task, recipe, overrides)
     if task is None:
         raise ValueError(f'--task is missing; allowed: {", ".join(TASKS)}')
     return recipe_config(task, recipe or 'best', **overrides)
@@ -92,33 +92,6 @@ def _own_option(options: argparse.Namespace, overrides: dict[str, Any], name: st
     if None not in (option, assigned) and option != assigned:
         raise ValueError(f'--{name} {option} excludes --set {name}={assigned}')
     return option or assigned
-
-
-def _resumed_config(options: argparse.Namespace, overrides: dict[str, Any]) -> TrainConfig:
-    """The configuration of a run that goes on, with what may change in it."""
-    from policy_node.training.runs.run_folder import STATE_FILE
-    from policy_node.training.runs.training_state import read_state
-
-    if options.output is not None:
-        raise ValueError(f'--output excludes --resume: the run goes on in {options.resume}')
-    if overrides.get('init_from'):
-        raise ValueError('--init-from excludes --resume: a run goes on with its own networks')
-    if not (options.resume / STATE_FILE).is_file():
-        raise ValueError(f'{options.resume} is no folder of a run to go on with: no {STATE_FILE}')
-    stored = read_state(options.resume / STATE_FILE).extra['config']
-    for name in _OWN_OPTIONS:
-        chosen = (getattr(options, name), overrides.get(name))
-        wrong = [value for value in chosen if value not in (None, stored.get(name))]
-        if wrong:
-            raise ValueError(f'{options.resume} is a run of {stored.get(name)}, not of {wrong[0]}')
-    before, config = config_from_dict(stored), config_from_dict({**stored, **overrides})
-    fixed = {name: 'networks' for name in _NETWORK_FIELDS}
-    fixed |= {name: 'experience' for name in _EXPERIENCE_FIELDS}
-    for name, kind in fixed.items():
-        old, new = getattr(before, name), getattr(config, name)
-        if old != new:
-            raise ValueError(f'{options.resume} has {kind} of {name} {old}, which stay; not {new}')
-    return config
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import types
 import typing
+from collections.abc import Mapping
 from typing import Any
 
 from msgs_spec.hints import did_you_mean
@@ -63,11 +64,21 @@ def config_from_dict(values: dict[str, Any]) -> TrainConfig:
     Raises:
         ValueError: If a field is unknown or a value not allowed.
     """
+    return TrainConfig(**typed_fields(values))
+
+
+def typed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of `TrainConfig` with values of their types: lists become tuples.
+
+    Raises:
+        ValueError: If there is no such field or a value is not of its type.
+    """
     hints = typing.get_type_hints(TrainConfig)
     unknown = sorted(values.keys() - hints.keys())
     if unknown:
-        raise ValueError(f'unknown configuration fields: {", ".join(unknown)}')
-    return TrainConfig(**{name: _typed(name, value, hints[name]) for name, value in values.items()})
+        near = did_you_mean(unknown[0], list(hints))
+        raise ValueError(f'unknown configuration fields: {", ".join(unknown)}{near}')
+    return {name: _typed(name, value, hints[name]) for name, value in values.items()}
 
 
 def _typed(name: str, value: Any, kind: Any) -> Any:

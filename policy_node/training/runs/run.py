@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -28,10 +28,13 @@ from policy_node.training.runs.finite_checks import TrainingError
 from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.read_networks import read_initial_networks
 from policy_node.training.runs.run_folder import COMMAND_FILE, LOCK_FILE, STATE_FILE
-from policy_node.training.runs.run_log import RunLog, draw_curve, read_progress
+from policy_node.training.runs.run_log import Row, RunLog, draw_curve, read_progress
 from policy_node.training.runs.saving import NAME
 from policy_node.training.runs.trainer import Trainer
 from policy_node.training.runs.training_state import Counters
+
+# Told of a cycle with what `progress.csv` has of it; what it returns matters if it is False.
+OnCycle = Callable[[Row], object]
 
 
 class RunTakenError(CommandError):
@@ -60,6 +63,8 @@ def train_run(
     resume: bool = False,
     command: str = '',
     experience: Episodes | None = None,
+    on_cycle: OnCycle | None = None,
+    quiet: bool = False,
 ) -> Ending:
     """Trains as configured, in this process, until a limit or a signal ends it.
 
@@ -69,6 +74,8 @@ def train_run(
         resume: Continue the run in the folder; else it must hold none.
         command: Command line, for the record.
         experience: Episodes to learn from as well.
+        on_cycle: Is told of each cycle; the run ends when it returns False.
+        quiet: Whether progress is not shown.
 
     Raises:
         UsageError: If something that the run needs is missing or does not fit; nothing is written
@@ -95,7 +102,7 @@ def train_run(
         if why := _too_large(trainer):
             complain(NAME, why)
         try:
-            ending = _train(trainer, output, command)
+            ending = _train(trainer, output, command, on_cycle, quiet)
         except (TrainingError, OSError) as error:
             raise CommandError(f'{error}; {_kept(output)}') from None
         finally:
@@ -133,12 +140,20 @@ def _too_large(trainer: Trainer) -> str:
     return why_too_large(needed, available_memory())
 
 
-def _train(trainer: Trainer, output: Path, command: str) -> Ending:
+def _train(
+    trainer: Trainer, output: Path, command: str, on_cycle: OnCycle | None, quiet: bool
+) -> Ending:
     config, counters, log = trainer.config, trainer.counters, None
+
+    def tell(row: Row) -> None:
+        if on_cycle is not None and on_cycle(row) is False:
+            trainer.stop('stopped by on_cycle')
+
     if trainer.workers.is_first:
         with (output / COMMAND_FILE).open('a') as file:
             file.write(command + '\n')
-        log = RunLog(output, config.total_steps, config.time_limit, counters.env_steps)
+        limits = config.total_steps, config.time_limit
+        log = RunLog(output, *limits, counters.env_steps, quiet=quiet, on_row=tell)
     try:
         with _stop_on_signals(trainer) as received:
             reason = trainer.train(log)

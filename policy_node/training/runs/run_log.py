@@ -6,7 +6,7 @@ import csv
 import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -39,6 +39,8 @@ COLUMNS = (
     'samples_per_second',
     'processor_seconds',
 )
+# A cycle by those names; None is what it did not measure.
+Row = dict[str, float | None]
 # Seconds between lines where the output is no terminal.
 _PLAIN_INTERVAL = 15.0
 
@@ -52,10 +54,18 @@ class RunLog:
         time_limit: Its limit, seconds; 0 is none.
         resumed_steps: Environment steps of the checkpoint the run goes on from. What was logged
             after it, and is about to be run again, is removed.
+        quiet: Whether nothing is shown.
+        on_row: Called with each row when it is written.
     """
 
     def __init__(
-        self, output: Path, total_steps: int, time_limit: float, resumed_steps: int = 0
+        self,
+        output: Path,
+        total_steps: int,
+        time_limit: float,
+        resumed_steps: int = 0,
+        quiet: bool = False,
+        on_row: Callable[[Row], None] | None = None,
     ) -> None:
         self.path = output / 'progress.csv'
         self._total_steps = total_steps
@@ -76,10 +86,11 @@ class RunLog:
         self._live = Live(console=self._console, refresh_per_second=4, transient=False)
         self._last_plain = 0.0
         self._last_eval = ''
-        if self._console.is_terminal:
+        self._quiet, self._on_row = quiet, on_row
+        if self._console.is_terminal and not quiet:
             self._live.start()
 
-    def write(self, row: dict[str, float | None]) -> None:
+    def write(self, row: Row) -> None:
         """Records one cycle; None leaves a column empty."""
         self._writer.writerow({name: _short(row.get(name)) for name in COLUMNS})
         self._file.flush()
@@ -87,7 +98,10 @@ class RunLog:
             for name, value in row.items():
                 if value is not None and name != 'env_steps':
                     self._board.add_scalar(name, value, int(row['env_steps'] or 0))
-        self._show(row)
+        if not self._quiet:
+            self._show(row)
+        if self._on_row is not None:
+            self._on_row(row)
 
     def close(self) -> None:
         """Ends the live line and closes the files."""
@@ -98,7 +112,7 @@ class RunLog:
         if self._board is not None:
             self._board.close()
 
-    def _show(self, row: dict[str, float | None]) -> None:
+    def _show(self, row: Row) -> None:
         if row.get('eval_success') is not None:
             self._last_eval = f'{row["eval_success"]:.3f} of {row["eval_episodes"]:.0f}'
         steps, seconds = row['env_steps'] or 0, row['seconds'] or 0

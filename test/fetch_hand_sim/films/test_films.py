@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import errno
+import io
+import re
 import shutil
 import subprocess
 import sys
@@ -12,10 +15,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import fetch_hand_sim
 from fetch_hand_sim.commands.render_episode import main as render_episode
 from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.films.film import check_kind, check_size, write_film, write_picture
 from fetch_hand_sim.films.pictures import Studio, grid, sheets, tile, with_frame
+from fetch_hand_sim.films.playing import Film, film_episode
 from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from msgs_spec.command_line import CommandError, UsageError
@@ -381,3 +386,68 @@ def test_without_opengl_it_says_what_to_install(folder, tmp_path):
         'render_episode: rendering needs OpenGL: apt install libegl1 libgl1-mesa-dri, or apt '
         'install libosmesa6\n'
     )
+
+
+def test_a_film_in_memory_gives_back_every_picture_and_plays_in_a_notebook(tmp_path):
+    film = Film(PICTURES, fps=25.0)
+    assert len(film) == 5
+    assert [picture.tolist() for picture in film] == [picture.tolist() for picture in PICTURES]
+    assert repr(film) == 'Film(5 pictures of 7x5, 0.2 s)'
+    shown = film._repr_html_()
+    data = base64.b64decode(shown.split('base64,')[1].split('"')[0])
+    with Image.open(io.BytesIO(data)) as image:
+        assert (image.format, image.n_frames, image.size) == ('WEBP', 5, (7, 5))
+    for name in ('film.gif', 'film.webp'):
+        with Image.open(film.save(tmp_path / name)) as image:
+            assert image.n_frames == 5
+
+
+@pytest.mark.parametrize(
+    ('pictures', 'fps', 'said'),
+    [
+        ([], 25.0, 'no pictures; allowed: one or more'),
+        (PICTURES, 0.0, 'fps 0; allowed: more than 0'),
+        (PICTURES, float('nan'), 'fps nan'),
+        ([*PICTURES, np.zeros((5, 8, 3), np.uint8)], 25.0, 'picture 5 is uint8 (5, 8, 3)'),
+        ([np.zeros((5, 7, 3))], 25.0, 'picture 0 is float64 (5, 7, 3); allowed: uint8'),
+        ([None], 25.0, 'picture 0 is object ()'),
+    ],
+)
+def test_what_is_no_film_is_refused(pictures, fps, said):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        Film(pictures, fps)
+
+
+@pytest.mark.parametrize('name', ['film.png', 'film', 'nowhere/film.gif'])
+def test_a_film_is_saved_only_where_and_as_what_it_can_be(name, tmp_path):
+    with pytest.raises(ValueError, match='film') as error:
+        Film(PICTURES).save(tmp_path / name)
+    assert '--out' not in str(error.value)
+
+
+def test_the_film_of_an_episode_is_that_of_the_command(folder, opengl, tmp_path):
+    episode = sorted(folder.iterdir())[0]
+    film = Film.of_episode(episode, width=64, height=48)
+    out = tmp_path / 'film.gif'
+    assert render_episode([str(episode), '--out', str(out), '--size', '64x48']) == 0
+    assert film.save(tmp_path / 'same.gif').read_bytes() == out.read_bytes()
+    with pytest.raises(ValueError, match='nowhere'):
+        Film.of_episode(tmp_path / 'nowhere')
+
+
+def test_film_episode_plays_to_the_end_with_a_policy_or_a_function(opengl):
+    env = fetch_hand_sim.make('FetchReach', render_mode='rgb_array', width=64, height=48)
+    rests = np.zeros(4, dtype=np.float32)
+
+    class Resting:
+        def predict(self, observation, deterministic=False):
+            assert deterministic and set(observation) == set(env.observation_space.spaces)
+            return rests, None
+
+    film = film_episode(env, Resting(), seed=3)
+    assert (len(film), film.fps) == (51, 25)
+    same = film_episode(env, lambda observation: rests, seed=3)
+    assert all((a == b).all() for a, b in zip(film, same, strict=True))
+    assert not all((a == b).all() for a, b in zip(film, film_episode(env, Resting()), strict=True))
+    with pytest.raises(ValueError, match=re.escape("render_mode None; allowed: 'rgb_array'")):
+        film_episode(fetch_hand_sim.make('FetchReach'), Resting())

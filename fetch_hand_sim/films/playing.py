@@ -1,0 +1,163 @@
+"""Films in memory: a notebook plays them, and `save` writes them."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from fetch_hand_sim.films.animation import Roll, write_animation
+from fetch_hand_sim.films.film import MOVING, check_kind, check_size, write_film
+from fetch_hand_sim.films.pictures import Studio
+from fetch_hand_sim.films.recording import load_recordings
+from msgs_spec.arrays import Picture
+from msgs_spec.command_line import UsageError
+
+
+class Film:
+    """Moving pictures; as the last line of a cell, a notebook plays them.
+
+    Args:
+        pictures: (height, width, 3) uint8, of one size, as `render` of an environment gives them.
+        fps: Pictures per second.
+
+    Attributes:
+        fps: As given.
+
+    Raises:
+        ValueError: If there is no picture, or something else than a picture of the first one's
+            size.
+    """
+
+    def __init__(self, pictures: Iterable[Picture], fps: float = 25.0) -> None:
+        if not fps > 0.0:
+            raise ValueError(f'fps {fps:g}; allowed: more than 0')
+        self.fps = fps
+        self._roll = Roll()
+        self._shape: tuple[int, ...] = ()
+        self._html = ''
+        for picture in pictures:
+            self._add(picture)
+        if not self._shape:
+            raise ValueError('no pictures; allowed: one or more')
+
+    @classmethod
+    def of_episode(
+        cls, path: str | Path, width: int = 640, height: int = 480, camera: str | None = None
+    ) -> Film:
+        """Draws a logged episode; of a folder, the first.
+
+        Args:
+            path: A file of `episodes/`, its folder, or a folder of several.
+            width: Of pictures, pixels.
+            height: Likewise.
+            camera: Of the model, by name; None for the usual view.
+
+        Raises:
+            ValueError: If it cannot be read, or the model has no such camera.
+            RuntimeError: If there is no OpenGL.
+        """
+        (recording,) = load_recordings(Path(path), count=1)
+        studio = Studio(width, height, camera)
+        try:
+            hz = float(recording.arrays.metadata['control_hz'])
+            return cls(studio.pictures(recording), hz)
+        finally:
+            studio.close()
+
+    def __len__(self) -> int:
+        """How many pictures there are."""
+        return len(self._roll)
+
+    def __iter__(self) -> Iterator[Picture]:
+        """The pictures, one after the other."""
+        return (self._roll.picture(number) for number in range(len(self)))
+
+    def save(self, path: str | Path) -> Path:
+        """Writes it as .gif, .webp or .mp4; returns where.
+
+        Raises:
+            ValueError: If the ending, the folder or the size is not allowed, or .mp4 lacks ffmpeg.
+        """
+        file = Path(path)
+        try:
+            if file.suffix.lower() not in MOVING:
+                raise UsageError(f'a film ends in {", ".join(MOVING)}, not {file.name!r}')
+            check_kind(file)
+            check_size(file, self._shape[1], self._shape[0])
+            write_film(file, self, self.fps)
+        except UsageError as error:
+            raise ValueError(str(error).removeprefix('--out ')) from None
+        return file
+
+    def __repr__(self) -> str:
+        """Says how long and how large it is."""
+        height, width = self._shape[:2]
+        return f'Film({len(self)} pictures of {width}x{height}, {len(self) / self.fps:.1f} s)'
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the film itself, in the page, so that it is saved with it."""
+        if not self._html:
+            buffer = io.BytesIO()
+            write_animation(buffer, self, self.fps, '.webp')
+            data = base64.b64encode(buffer.getvalue()).decode()
+            self._html = f'<img alt="{self!r}" src="data:image/webp;base64,{data}">'
+        return self._html
+
+    def _add(self, picture: Picture) -> None:
+        array = np.asarray(picture)
+        is_picture = array.dtype == np.uint8 and array.ndim == 3 and array.shape[2] == 3
+        if not is_picture or self._shape not in ((), array.shape):
+            wanted = self._shape or '(height, width, 3)'
+            raise ValueError(
+                f'picture {len(self)} is {array.dtype} {array.shape}; allowed: uint8 {wanted}'
+            )
+        self._shape = array.shape
+        self._roll.add(array)
+
+
+def film_episode(env: gymnasium.Env[Any, Any], policy: Any, seed: int | None = None) -> Film:
+    """Plays one episode of an environment, and films it.
+
+    Args:
+        env: Made with `render_mode='rgb_array'`.
+        policy: An actor or any other model with `predict(observation, deterministic=True)`, as
+            those of Stable-Baselines3 are, or a function from observation to action.
+        seed: Of the reset; None lets the random generator go on.
+
+    Raises:
+        ValueError: If the environment does not render pictures.
+        RuntimeError: If there is no OpenGL.
+    """
+    if env.render_mode != 'rgb_array':
+        raise ValueError(f"render_mode {env.render_mode!r}; allowed: 'rgb_array'")
+    return Film(_played(env, _act(policy), seed), float(env.metadata.get('render_fps', 25)))
+
+
+def _act(policy: Any) -> Callable[[Any], Any]:
+    if hasattr(policy, 'predict'):
+        return lambda observation: policy.predict(observation, deterministic=True)[0]
+    act: Callable[[Any], Any] = policy
+    return act
+
+
+def _played(
+    env: gymnasium.Env[Any, Any], act: Callable[[Any], Any], seed: int | None
+) -> Iterator[Picture]:
+    observation, _ = env.reset(seed=seed)
+    yield _rendered(env)
+    is_over = False
+    while not is_over:
+        observation, _, terminated, truncated, _ = env.step(act(observation))
+        is_over = terminated or truncated
+        yield _rendered(env)
+
+
+def _rendered(env: gymnasium.Env[Any, Any]) -> Picture:
+    picture: Picture = env.render()  # type: ignore[assignment]
+    return picture

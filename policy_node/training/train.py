@@ -1,0 +1,134 @@
+"""`train`: what `train_her` does, as a function."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from msgs_spec.command_line import CommandError, UsageError
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config_values import typed_fields
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.runs.resumed_config import resumed_config
+from policy_node.training.runs.run import Ending, OnCycle, train_run
+from policy_node.training.runs.run_folder import BEST_FILE, LATEST_FILE, STATE_FILE
+from policy_node.training.runs.run_log import read_progress
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A run of `train` that has ended.
+
+    Attributes:
+        folder: Where its files are.
+        config: How it was configured.
+        reason: Why it ended, for people.
+        env_steps: Environment steps, of all its parts.
+        seconds: Time spent, likewise.
+        best_success: Success at the last step of the best evaluation; -1.0 without one.
+    """
+
+    folder: Path
+    config: TrainConfig
+    reason: str
+    env_steps: int
+    seconds: float
+    best_success: float
+
+    @property
+    def actor(self) -> Path:
+        """File of the best actor, or of the newest where none was evaluated.
+
+        `policy_node.load_actor` and whatever takes a policy read it.
+        """
+        best = self.folder / BEST_FILE
+        return best if best.is_file() else self.folder / LATEST_FILE
+
+    def progress(self) -> list[dict[str, float]]:
+        """A row per cycle: `env_steps`, `train_success`, `eval_success` where evaluated, ..."""
+        return read_progress(self.folder / 'progress.csv')
+
+
+def train(
+    task: str,
+    output: str | Path | None = None,
+    *,
+    recipe: str | None = None,
+    resume: bool = False,
+    on_cycle: OnCycle | None = None,
+    quiet: bool = False,
+    **fields: Any,
+) -> Run:
+    """Trains an actor with DDPG and hindsight experience replay, in this process.
+
+    Ctrl-C (or "interrupt" of a notebook) ends it after the cycle with all saved, and raises
+    KeyboardInterrupt; `resume=True` goes on from there. In a thread other than the main one
+    signals do nothing.
+
+    Args:
+        task: One of the tasks (`msgs_spec.tasks.TASKS`).
+        output: Folder of the run; None is `runs/<task>_<recipe>_seed<seed>`.
+        recipe: `best` (the default), `paper` or `finetune`.
+        resume: Go on with the run in `output`, whose configuration stays but for `fields`.
+        on_cycle: Called after every cycle with what `progress.csv` says of it, None for what was
+            not measured. The run ends when it returns False, or with what it raises.
+        quiet: Whether progress is not shown.
+        **fields: Of `TrainConfig`, such as `total_steps`, `seed`, `success_target`.
+
+    Raises:
+        ValueError: If something is not allowed, or the folder cannot be used; nothing was trained.
+        RuntimeError: If training failed, or another process trains in the folder.
+        ModuleNotFoundError: If what the extra `train` brings is missing.
+    """
+    if resume:
+        if output is None:
+            raise ValueError('resume=True needs output, the folder of the run to go on with')
+        folder = Path(output)
+        config = resumed_config(folder, task, recipe, typed_fields(fields))
+    else:
+        config = recipe_config(task, recipe or 'best', **typed_fields(fields))
+        folder = Path(output or f'runs/{task}_{config.recipe}_seed{config.seed}')
+        if (folder / STATE_FILE).is_file():
+            raise ValueError(f'{folder} holds a run: resume=True goes on with it, or choose another')
+    with _left_as_it_was():
+        ending = _ending(config, folder, resume, on_cycle, quiet)
+    if ending.signal == signal.SIGINT:
+        raise KeyboardInterrupt(ending.reason)
+    if ending.signal:
+        raise SystemExit(128 + ending.signal)
+    counters = ending.counters
+    return Run(
+        folder, config, ending.reason, counters.env_steps, counters.seconds, counters.best_success
+    )
+
+
+def _ending(
+    config: TrainConfig, folder: Path, resume: bool, on_cycle: OnCycle | None, quiet: bool
+) -> Ending:
+    """Runs it; what commands say in one line are errors as Python has them."""
+    command = f'policy_node.train({config.task!r}, {str(folder)!r})'
+    try:
+        return train_run(
+            config, folder, resume=resume, command=command, on_cycle=on_cycle, quiet=quiet
+        )
+    except UsageError as error:
+        raise ValueError(str(error)) from error
+    except CommandError as error:
+        raise RuntimeError(str(error)) from error
+
+
+@contextlib.contextmanager
+def _left_as_it_was() -> Iterator[None]:
+    """Gives the program its number of threads and its random numbers back."""
+    threads = torch.get_num_threads()
+    with torch.random.fork_rng():
+        try:
+            yield
+        finally:
+            torch.set_num_threads(threads)

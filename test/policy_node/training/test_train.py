@@ -1,0 +1,168 @@
+"""`policy_node.train`: training as a function."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from policy_node import load_policy, train
+from policy_node.training.train import Run
+from support import script_environment
+
+torch.set_num_threads(1)
+
+SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
+SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'evaluate_every': 400, 'quiet': True}
+
+
+def test_a_run_leaves_an_actor_and_its_curve(tmp_path, capfd):
+    run = train('FetchReach', tmp_path / 'run', total_steps=1_200, **SMALL)
+    assert isinstance(run, Run)
+    assert (run.env_steps, run.reason) == (1_200, '1,200 environment steps done')
+    assert load_policy(run.actor).task == 'FetchReach'
+    assert [row['env_steps'] for row in run.progress()] == [400.0, 800.0, 1_200.0]
+    assert (tmp_path / 'run/curve.png').is_file()
+    assert capfd.readouterr() == ('', '')
+
+
+def test_it_trains_what_the_command_trains(tmp_path):
+    """To the same bits: the function is no second trainer."""
+    run = train('FetchReach', tmp_path / 'function', total_steps=800, overlap=False, **SMALL)
+    options = [f'--set={name}={value}' for name, value in SMALL.items() if name != 'quiet']
+    command = [sys.executable, '-m', 'policy_node.training.train_her', '--task', 'FetchReach']
+    command += [*options, '--set=overlap=false', '--steps=800', f'--output={tmp_path / "command"}']
+    subprocess.run(command, check=True, env=script_environment(), timeout=120)
+    zeros = {'observation': np.zeros(10), 'achieved_goal': np.zeros(3), 'desired_goal': np.ones(3)}
+    ours, theirs = (
+        load_policy(folder / 'latest.safetensors').policy.predict(zeros)[0]
+        for folder in (run.folder, tmp_path / 'command')
+    )
+    assert ours.tolist() == theirs.tolist()
+
+
+def test_the_program_around_it_keeps_its_threads_and_random_numbers(tmp_path):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        torch.manual_seed(3)
+        expected = torch.rand(1)
+        torch.manual_seed(3)
+        train('FetchReach', tmp_path / 'run', total_steps=400, **SMALL)
+        assert torch.rand(1) == expected
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_a_callback_sees_every_cycle_and_may_end_the_run(tmp_path):
+    rows = []
+
+    def on_cycle(row):
+        rows.append(row)
+        return len(rows) < 2
+
+    run = train('FetchReach', tmp_path / 'run', total_steps=4_000, on_cycle=on_cycle, **SMALL)
+    assert (run.env_steps, run.reason) == (800, 'stopped by on_cycle')
+    assert [row['env_steps'] for row in rows] == [400, 800]
+    resumed = train('FetchReach', run.folder, resume=True, total_steps=1_200, quiet=True)
+    assert resumed.env_steps == 1_200
+    assert resumed.config.num_envs == 8
+
+
+def test_what_a_callback_raises_ends_the_run_and_frees_the_folder(tmp_path):
+    def fail(row):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        train('FetchReach', tmp_path / 'run', total_steps=4_000, on_cycle=fail, **SMALL)
+    assert train('FetchReach', tmp_path / 'run', total_steps=400, **SMALL).env_steps == 400
+
+
+def test_it_trains_in_a_thread_too(tmp_path):
+    runs = []
+    thread = threading.Thread(
+        target=lambda: runs.append(train('FetchReach', tmp_path, total_steps=400, **SMALL))
+    )
+    thread.start()
+    thread.join()
+    assert runs[0].env_steps == 400
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'said'),
+    [
+        ({'task': 'FetchRech'}, "did you mean 'FetchReach'"),
+        ({'recipe': 'bst'}, "recipe 'bst'; allowed: paper, best, finetune"),
+        ({'total_stps': 3}, "total_stps; did you mean 'total_steps'"),
+        ({'total_steps': '3'}, "total_steps '3' is not of type int"),
+        ({'gamma': 2.0}, 'gamma 2.0; allowed'),
+        ({'resume': True}, 'is no folder of a run to go on with'),
+        ({'resume': True, 'output': None}, 'resume=True needs output'),
+        ({'output': '/proc/nothing'}, '/proc/nothing cannot hold a run'),
+        ({'init_from': 'nothing'}, "no actor 'nothing'"),
+    ],
+)
+def test_what_is_not_allowed_is_a_value_error_of_one_line(arguments, said, tmp_path):
+    with pytest.raises(ValueError, match=said) as error:
+        train(**{'task': 'FetchReach', 'output': tmp_path / 'run', 'quiet': True, **arguments})
+    assert '\n' not in str(error.value)
+
+
+def test_a_folder_that_holds_a_run_is_left_alone(tmp_path):
+    train('FetchReach', tmp_path, total_steps=400, **SMALL)
+    before = (tmp_path / 'training_state.safetensors').read_bytes()
+    with pytest.raises(ValueError, match='holds a run: resume=True goes on with it'):
+        train('FetchReach', tmp_path, total_steps=400, **SMALL)
+    with pytest.raises(ValueError, match='is a run of FetchReach, not of FetchPush'):
+        train('FetchPush', tmp_path, resume=True, quiet=True)
+    assert (tmp_path / 'training_state.safetensors').read_bytes() == before
+
+
+def test_ctrl_c_saves_the_run_and_ends_the_program_around_it(tmp_path):
+    code = f"""
+import os, signal
+from policy_node import train
+
+for seed in range(2):
+    train('FetchReach', {str(tmp_path)!r} + f'/{{seed}}', total_steps=100_000, seed=seed,
+          on_cycle=lambda row: os.kill(os.getpid(), signal.SIGINT), **{SMALL!r})
+"""
+    result = subprocess.run(
+        [sys.executable, '-c', code],
+        env=script_environment(),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert result.returncode == -signal.SIGINT, result.stderr
+    assert result.stderr.rstrip().endswith('KeyboardInterrupt: stopped by SIGINT')
+    assert sorted(os.listdir(tmp_path)) == ['0']
+    resumed = train('FetchReach', Path(tmp_path / '0'), resume=True, total_steps=800, quiet=True)
+    assert resumed.env_steps == 800
+
+
+def test_a_missing_extra_is_named(tmp_path):
+    (tmp_path / 'sitecustomize.py').write_text(
+        'import importlib.util as u\n'
+        'find = u.find_spec\n'
+        "u.find_spec = lambda name, *rest: None if name == 'torch' else find(name, *rest)\n"
+    )
+    environment = script_environment() | {'PYTHONPATH': str(tmp_path)}
+    result = subprocess.run(
+        [sys.executable, '-c', 'from policy_node import train'],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert result.stderr.rstrip().endswith(
+        "ModuleNotFoundError: torch missing: pip install 'fetch_hand_sim[train]'"
+    )
