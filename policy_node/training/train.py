@@ -95,7 +95,9 @@ def train(
         config = recipe_config(task, recipe or 'best', **typed_fields(fields))
         folder = Path(output or f'runs/{task}_{config.recipe}_seed{config.seed}')
         if (folder / STATE_FILE).is_file():
-            raise ValueError(f'{folder} holds a run: resume=True goes on with it, or choose another')
+            raise ValueError(
+                f'{folder} holds a run: resume=True goes on with it, or choose another'
+            )
     with _left_as_it_was():
         ending = _ending(config, folder, resume, on_cycle, quiet)
     if ending.signal == signal.SIGINT:

@@ -195,7 +195,13 @@ def _ensembles() -> tuple[Arm, ...]:
         Arm(f'updates{times}', f'{times} times the updates', factors={'updates_per_cycle': times})
         for times in (2, 4)
     ]
-    return (Arm('one', 'one critic', {'critics': 1}), *several, *quantiles, *more)
+    # Targets move after so many updates: with more of these, they move faster too.
+    slow = Arm(
+        'updates4_slow',
+        '4 times the updates, targets as slow as before',
+        factors={'updates_per_cycle': 4, 'target_update_interval': 4},
+    )
+    return (Arm('one', 'one critic', {'critics': 1}), *several, *quantiles, *more, slow)
 
 
 STUDIES: dict[str, Study] = {

@@ -18,6 +18,7 @@ from policy_node.training.benchmark.measures import (
     GOOD_SUCCESS,
     are_apart,
     area_in_time,
+    compared,
     sum_up,
 )
 from policy_node.training.benchmark.results import Band, Curve, aggregate, draw, to_csv
@@ -80,10 +81,13 @@ def sum_up_arms(study: Study, runs: Rows, curves: Rows) -> Rows:
         )
         # As long as the first arm took, which is the baseline where that was run.
         seconds = _median_seconds(groups[0][1])
-        for _, group in groups:
+        measured: dict[str, Rows] = {}
+        for (arm,), group in groups:
             areas = (_area_in_time(by_run[run_of(run)], run, seconds) for run in group)
             pairs = zip(group, areas, strict=True)
-            arms.append(sum_up([{**run, 'area_in_time': area} for run, area in pairs]))
+            measured[arm] = [{**run, 'area_in_time': area} for run, area in pairs]
+        baseline = measured.get(study.arms[0].name, [])
+        arms += [sum_up(group) | compared(group, baseline) for group in measured.values()]
     return arms
 
 
@@ -166,7 +170,7 @@ def _times(row: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, Any]]) -> str:
-    """In what the quartiles of an arm and of the baseline are apart."""
+    """In what an arm and the baseline are apart."""
     base = study.arms[0].name
     found = [other for other in arms if (other['task'], other['arm']) == (row['task'], base)]
     if row['arm'] == base or not found:

@@ -13,6 +13,7 @@ from policy_node.training.benchmark.jobs import Job, run_name
 from policy_node.training.benchmark.stored_runs import ABOUT, StoredRuns, run_of
 from policy_node.training.benchmark.study import Study
 from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.training_state import read_state
 
 
 def take_from_other_studies(jobs: Sequence[Job], studies: Path) -> None:
@@ -76,8 +77,9 @@ def _equal_run(job: Job, studies: Path) -> Path | None:
         there = Job(job.arm, job.config, state.parent, final_episodes=job.final_episodes)
         try:
             there.check_configuration()
+            stored = read_state(state).extra['config']
         except (ValueError, TypeError, OSError):
             continue
-        if there.is_finished:
+        if there.is_finished and stored.get('init_from', '') == job.config.init_from:
             return state.parent
     return None

@@ -115,7 +115,11 @@ class StoredRuns:
         for job in {(job.config.task, job.arm.name): job for job in jobs}.values():
             task = job.config.task
             for arm in self.tasks.get(task, {'arms': ()})['arms']:
-                differing = differing_fields(self._configured(task, arm, job), job.config)
+                stored = self._configured(task, arm, job)
+                differing = differing_fields(stored, job.config)
+                before, now = stored.get('init_from', ''), job.config.init_from
+                if before != now:
+                    differing['init_from'] = f'init_from {before!r}, now {now!r}'
                 if arm != job.arm.name:
                     differing = {name: text for name, text in differing.items() if name not in own}
                 if differing:

@@ -113,14 +113,18 @@ def is_over(observation: NDArray[np.floating], spec: TaskSpec) -> NDArray[np.boo
 
 
 def without_landings(episodes: Episodes, spec: TaskSpec) -> Episodes:
-    """The episodes with what was achieved by a gamble taken back to their start.
+    """The episodes with what was achieved by a gamble taken back to what was before it.
 
-    A landing is no motion of the robot's: which episodes have moved something is decided by what
-    comes before it.
+    A landing is no motion of the robot's: which episodes have moved something, and how much, is
+    decided by what comes before it.
     """
     over = is_over(episodes.observation, spec)
-    first = episodes.achieved_goal[:, :1]
-    return replace(episodes, achieved_goal=np.where(over[..., None], first, episodes.achieved_goal))
+    # Once over, an episode stays so; at its start it is not.
+    last = np.where(over, 0, np.arange(over.shape[1])).max(axis=1)
+    before = episodes.achieved_goal[np.arange(len(last)), last][:, None]
+    return replace(
+        episodes, achieved_goal=np.where(over[..., None], before, episodes.achieved_goal)
+    )
 
 
 def _parts(spec: TaskSpec) -> dict[str, slice]:

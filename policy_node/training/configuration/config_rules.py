@@ -11,7 +11,7 @@ from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
 from policy_node.training.configuration.config_fields import ConfigFields
 from policy_node.training.goals.goal_choice import GOAL_CHOICES
 from policy_node.training.goals.graded import parse_grades
-from policy_node.training.goals.hindsight import OUTCOME, parse_mixture
+from policy_node.training.goals.hindsight import FROM_THE_EPISODE, OUTCOME, parse_mixture
 from policy_node.training.replay.multi_step import CORRECTIONS
 
 # Recipes of runs that start from nothing.
@@ -64,7 +64,7 @@ RANGES = (
     ('reward_distance', 1e-3, 1000),
     ('reward_rotation', 1e-3, 1000),
     ('reward_apart', 0, 1),
-    ('retry_failed', 0, 1),
+    ('retry_failed', 0, 0.9),
     ('first_distance', 1, 1000),
     ('first_rotation', 1, 1000),
     ('narrow_above', 0, 1),
@@ -175,8 +175,10 @@ def _contradictions(config: ConfigFields, spec: TaskSpec) -> Iterator[str]:
     yield from _contradictions_of_rates(config)
     yield from _contradictions_of_subgoals(config)
     yield from _contradictions_of_values(config)
+    yield from _contradictions_of_targets(config)
     yield from _contradictions_of_goals(config)
     yield from _contradictions_of_conditions(config)
+    yield from _contradictions_of_importance(config)
     yield from _contradictions_of_algorithm(config)
     yield from _contradictions_of_task(config, spec)
 
@@ -202,8 +204,8 @@ def _contradictions_of_rates(config: ConfigFields) -> Iterator[str]:
         yield 'advantage excludes critics above 1 and norm batch'
     if config.advantage and (several or holds):
         yield 'advantage is of one tick: it excludes n_step and longest_hold above 1'
-    if config.advantage and (weighted or chosen):
-        yield 'advantage excludes importance and goal_choice'
+    if config.advantage and (weighted or chosen or config.target_noise > 0.0):
+        yield 'advantage excludes importance, goal_choice and target_noise'
 
 
 def _contradictions_of_subgoals(config: ConfigFields) -> Iterator[str]:
@@ -249,6 +251,12 @@ def _contradictions_of_values(config: ConfigFields) -> Iterator[str]:
         yield 'quantiles above 1 exclude aggregate min; allowed: mean, truncated'
     if config.quantiles > 1 and (config.norm == 'batch' or config.advantage):
         yield 'quantiles above 1 exclude norm batch and advantage'
+
+
+def _contradictions_of_targets(config: ConfigFields) -> Iterator[str]:
+    """The same of what values learn to be, and of what normalises them."""
+    if config.target_noise > 0.0 and (config.longest_hold > 1 or config.subgoal_every > 0):
+        yield 'target_noise excludes longest_hold above 1 and subgoal_every'
     if config.norm != 'none' and config.layer_norm:
         yield f'norm {config.norm} excludes layer_norm, which is for the critic too'
     if config.norm == 'batch' and config.target != 'none':
@@ -262,6 +270,8 @@ def _contradictions_of_goals(config: ConfigFields) -> Iterator[str]:
     conditioned, chosen = config.condition != 'none', config.goal_choice != 'uniform'
     if chosen and not replays_later:
         yield f'goal_choice {config.goal_choice} needs future or near goals'
+    if config.goal_choice == 'bellman' and (config.n_step > 1 or config.drop_is_lost):
+        yield 'goal_choice bellman is of one step: it excludes n_step above 1 and drop_is_lost'
     if config.goal_choice == 'uncertain' and config.critics == 1:
         yield 'goal_choice uncertain needs critics above 1'
     if config.narrows and (conditioned or config.reward_type == 'dense'):
@@ -292,15 +302,24 @@ def _contradictions_of_conditions(config: ConfigFields) -> Iterator[str]:
         yield 'condition threshold needs reward_type sparse'
 
 
-def _contradictions_of_algorithm(config: ConfigFields) -> Iterator[str]:
-    """The same of importance weights, of `ppo`, and of what others could not start from."""
-    weighted, on_policy = config.importance != 'none', config.algorithm == 'ppo'
-    if weighted and config.n_step > 1:
+def _contradictions_of_importance(config: ConfigFields) -> Iterator[str]:
+    """The same of importance weights."""
+    if config.importance == 'none':
+        return
+    if config.n_step > 1:
         yield f'importance {config.importance} excludes n_step above 1'
-    if weighted and config.strategy == 'none' and not config.goals:
+    if config.strategy == 'none' and not config.goals:
         yield f'importance {config.importance} needs goals chosen in hindsight'
-    if weighted and on_policy != (config.importance == 'decision'):
+    if (config.algorithm == 'ppo') != (config.importance == 'decision'):
         yield f'importance {config.importance} excludes algorithm {config.algorithm}'
+    if config.importance == 'density' and config.goals:
+        if set(parse_mixture(config.goals)) <= set(FROM_THE_EPISODE):
+            yield f'importance density needs other goals beside {config.goals!r}: actual, random'
+
+
+def _contradictions_of_algorithm(config: ConfigFields) -> Iterator[str]:
+    """The same of `ppo`, and of what others could not start from."""
+    on_policy = config.algorithm == 'ppo'
     if config.goals and OUTCOME in parse_mixture(config.goals) and not on_policy:
         yield 'goals outcome needs algorithm ppo'
     for name in ('first_value', 'first_action_gain'):

@@ -73,7 +73,8 @@ class OnPolicyExperience(Experience):
         return with_outcomes_achieved(super().mixture(env_steps))
 
     def _roll_out(self, env_steps: int) -> Rollouts:
-        episodes = self.replay.newest(self._newest)
+        # Fewer where MuJoCo lost some: those before are of another actor.
+        episodes = self.replay.newest(min(self._newest, self.replay.last_added))
         mixture = super().mixture(env_steps)
         mixture.pop('real', None)
         copies, outcomes = self.config.hindsight_k if mixture else 0, None

@@ -7,7 +7,9 @@ good (as PPO-HER, arXiv 2410.22524); `decision` weighs each transition of a repl
     w_t = prod_{k <= t} pi(a_k | s_k, g') / pi(a_k | s_k, g),
 
 the per-decision weight of hindsight policy gradients (Rauber et al. 2019, arXiv 1711.06006),
-normalised tick by tick over the replayed episodes, as they propose.
+normalised tick by tick over the replayed episodes, as they propose. What comes after a transition
+depends on later actions, which were for g as well: in its advantage each later error weighs the
+ratios of the actions between, cut as in V-trace (Espeholt et al. 2018, arXiv 1802.01561).
 """
 
 from __future__ import annotations
@@ -31,6 +33,9 @@ from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.transitions import Starts, Transitions
 
 _SMALLEST_DEVIATION = 1e-6
+# Of an error by the ratio of its action, and of what follows by those of the actions before it: the
+# second only makes traces shorter.
+_LARGEST_RATIO, _LARGEST_TRACE = 10.0, 1.0
 
 
 class Critique(Protocol):
@@ -130,7 +135,8 @@ class RolloutMaker:
             goals: Goals (episodes, goal_size) to replay them for.
         """
         own = self._under(episodes)
-        replayed = [self._under(replace(episodes, desired_goal=goal)) for goal in goals]
+        meant = own.log_probability if self.corrects else None
+        replayed = [self._under(replace(episodes, desired_goal=goal), meant) for goal in goals]
         if self.corrects and replayed:
             logs = [rollouts.log_probability - own.log_probability for rollouts in replayed]
             weights = np.split(decision_weights(np.concatenate(logs)), len(logs))
@@ -140,26 +146,40 @@ class RolloutMaker:
             ]
         return _joined([own, *replayed])
 
-    def _under(self, episodes: Episodes) -> Rollouts:
-        """Rollouts under the goals that the episodes have."""
+    def _under(self, episodes: Episodes, meant: Array32 | None = None) -> Rollouts:
+        """Rollouts under the goals that the episodes have.
+
+        Args:
+            episodes: The episodes.
+            meant: (episodes, T) log probabilities of the actions for the goals that they were for;
+                None takes them as if they had been for these.
+        """
         count, ticks = len(episodes), episodes.ticks
         goal = np.repeat(episodes.desired_goal[:, None], ticks + 1, axis=1)
         achieved = episodes.achieved_goal[:, 1:].astype(np.float64)
         reward = np.asarray(self.compute_reward(achieved, goal[:, 1:].astype(np.float64)))
         value = self.critique.values(episodes.observation, goal).astype(np.float64)
-        advantage = advantages(reward, value, self.gamma, self.trace)
         states = episodes.observation[:, :-1], goal[:, :-1]
+        log_probability = self.critique.log_probabilities(*states, episodes.action)
+        log_ratio = None if meant is None else log_probability - meant
+        advantage = advantages(reward, value, self.gamma, self.trace, log_ratio)
         return Rollouts(
             episodes,
             reward.astype(np.float32),
-            self.critique.log_probabilities(*states, episodes.action),
+            log_probability,
             advantage.astype(np.float32),
             (advantage + value[:, :-1]).astype(np.float32),
             np.ones((count, ticks), np.float32),
         )
 
 
-def advantages(reward: Array, value: Array, gamma: float, trace: float) -> Array:
+def advantages(
+    reward: Array,
+    value: Array,
+    gamma: float,
+    trace: float,
+    log_ratio: NDArray[np.floating] | None = None,
+) -> Array:
     """Generalised advantages (Schulman et al. 2016, arXiv 1506.02438), (episodes, T).
 
     Args:
@@ -167,13 +187,20 @@ def advantages(reward: Array, value: Array, gamma: float, trace: float) -> Array
         value: (episodes, T + 1); episodes are cut, never terminated, so the last counts.
         gamma: Discount of one step.
         trace: Lambda.
+        log_ratio: (episodes, T) log pi(a | s, g') - log pi(a | s, g) of actions that were for
+            another goal g; None where they were for this one.
     """
     error = reward + gamma * value[:, 1:] - value[:, :-1]
+    ratio = np.ones_like(error)
+    if log_ratio is not None:
+        ratio = np.exp(np.minimum(log_ratio, np.log(_LARGEST_RATIO), dtype=np.float64))
     found = np.zeros_like(error)
+    # What the ticks from here on add to the value of their first state.
     following = np.zeros(len(error))
     for tick in reversed(range(error.shape[1])):
-        following = error[:, tick] + gamma * trace * following
-        found[:, tick] = following
+        found[:, tick] = error[:, tick] + gamma * trace * following
+        cut = np.minimum(ratio[:, tick], _LARGEST_TRACE)
+        following = ratio[:, tick] * error[:, tick] + gamma * trace * cut * following
     return found
 
 

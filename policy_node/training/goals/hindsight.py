@@ -30,6 +30,8 @@ SOURCES = (
     *('real', 'future', 'final', 'episode', 'random', 'actual', 'next', 'near', 'displaced'),
     OUTCOME,
 )
+# Those that a transition may itself have led to.
+FROM_THE_EPISODE = ('future', 'final', 'episode', 'next', 'near')
 _NEAR_TICKS = 10
 # One more, where there is a high level: what it had the actor pursue.
 _SUBGOAL = 'subgoal'

@@ -284,7 +284,9 @@ class DDPG(ActorCritic):
     @torch.no_grad()
     def surprise(self, batch: Transitions) -> Array32:
         """Absolute error of each value, (batch,); of several critics the mean."""
-        error = self._separate_errors(self._known(batch)).abs()
+        known = self._known(batch)
+        with self._precision():
+            error = self._separate_errors(known).abs().float()
         found: Array32 = (error if error.ndim == 1 else error.mean(dim=0)).cpu().numpy()
         return found
 
@@ -292,7 +294,9 @@ class DDPG(ActorCritic):
     def disagreement(self, batch: Transitions) -> Array32:
         """Standard deviation of each value over the critics, (batch,)."""
         known = self._known(batch)
-        spread: Array32 = self.critic(known.features, known.action).std(dim=0).cpu().numpy()
+        with self._precision():
+            value = self.critic(known.features, known.action).float()
+        spread: Array32 = value.std(dim=0).cpu().numpy()
         return spread
 
     def importance(self, batch: Transitions) -> Array32:

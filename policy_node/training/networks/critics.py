@@ -101,7 +101,7 @@ def critic_tensors(tensors: dict[str, Tensor], critics: int) -> dict[str, Tensor
         tensors: As `Critic` or `Ensemble` has them.
         critics: How many there are to be; members beyond it are left out.
     """
-    if not any(name.startswith(_MEMBERS) for name in tensors):
+    if not is_ensemble(tensors):
         tensors = {f'{_MEMBERS}0.{name}': value for name, value in tensors.items()}
     if critics == 1:
         first = f'{_MEMBERS}0.'
@@ -109,9 +109,14 @@ def critic_tensors(tensors: dict[str, Tensor], critics: int) -> dict[str, Tensor
     return {name: value for name, value in tensors.items() if _member_of(name) < critics}
 
 
+def is_ensemble(tensors: dict[str, Tensor]) -> bool:
+    """Whether they are named as those of an `Ensemble`, of one critic perhaps."""
+    return any(name.startswith(_MEMBERS) for name in tensors)
+
+
 def count_critics(tensors: dict[str, Tensor]) -> int:
     """How many critics these are tensors of."""
-    if not any(name.startswith(_MEMBERS) for name in tensors):
+    if not is_ensemble(tensors):
         return 1 if tensors else 0
     return len({_member_of(name) for name in tensors})
 

@@ -62,6 +62,10 @@ class EpisodeReplay:
         weigh: Weights of episodes for `draw`; None is 1 where the achieved goal has moved.
         count_ticks: How many ticks of an episode, from its first, are worth drawing; None is
             all of them.
+
+    Attributes:
+        capacity: How many episodes it holds at most.
+        last_added: How many came with the last `add`.
     """
 
     def __init__(
@@ -89,6 +93,7 @@ class EpisodeReplay:
         # Sums over the rows up to each: of valid ticks, and of weights times these.
         self._ticks_up_to, self._weight_up_to = np.zeros(0), np.zeros(0)
         self.capacity = capacity
+        self.last_added = 0
         self._size = 0
         self._next = 0
 
@@ -134,6 +139,7 @@ class EpisodeReplay:
         self._weights[rows] = self._weigh(episodes)
         if self._count_ticks is not None:
             self._valid[rows] = self._count_ticks(episodes)
+        self.last_added = len(episodes)
         self._next = int((self._next + len(episodes)) % self.capacity)
         self._size = min(self._size + len(episodes), self.capacity)
         valid = self._valid[: self._size] / self.ticks

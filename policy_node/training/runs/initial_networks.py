@@ -12,7 +12,12 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.networks.conditions import first_weights, with_input
-from policy_node.training.networks.critics import Ensemble, count_critics, critic_tensors
+from policy_node.training.networks.critics import (
+    Ensemble,
+    count_critics,
+    critic_tensors,
+    is_ensemble,
+)
 from policy_node.training.networks.shape_from_config import network_shape
 from policy_node.training.networks.widening import can_widen, widened
 from policy_node.training.runs.training_state import part_of
@@ -120,7 +125,7 @@ class InitialNetworks:
 
     def with_critics(self, critics: int) -> InitialNetworks:
         """The same with their critics named as so many are; there may be fewer of them."""
-        if critics == 1 == self.critics:
+        if critics == 1 == self.critics and not is_ensemble(part_of(self.tensors, 'critic')):
             return self
         tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
         for part in _CRITICS:

@@ -148,6 +148,14 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ),
         ({'noise_spread': 1.5}, 'noise_spread 1.5; allowed: 0 ... 1'),
         ({'hidden_sizes': (0,)}, 'hidden_sizes'),
+        ({'retry_failed': 1.0}, 'retry_failed 1.0; allowed: 0 ... 0.9'),
+        ({'importance': 'density', 'goals': 'future=1'}, "needs other goals beside 'future=1'"),
+        ({'goal_choice': 'bellman', 'n_step': 3}, 'goal_choice bellman is of one step'),
+        ({'target_noise': 0.2, 'longest_hold': 3}, 'target_noise excludes longest_hold'),
+        (
+            {'target_noise': 0.2, 'advantage': True, 'discount': 'time'},
+            'advantage excludes importance, goal_choice and target_noise',
+        ),
     ],
 )
 def test_bad_values_are_refused(changes: dict[str, object], match: str) -> None:

@@ -196,6 +196,18 @@ def test_target_noise_is_cut_and_stays_within_the_actions() -> None:
     assert torch.equal(make_learner()._target_action(features), own)
 
 
+@pytest.mark.parametrize('name', ['surprise', 'disagreement'])
+def test_goals_are_judged_as_precisely_as_values_are_learnt(name: str) -> None:
+    """In bfloat16, where updates are: it takes half of the time."""
+    judged = {}
+    for precision in ('float32', 'bfloat16'):
+        learner = make_learner(precision=precision, critics=2)
+        judged[precision] = getattr(learner, name)(make_batch())
+        assert judged[precision].dtype == np.float32
+    assert not np.array_equal(judged['float32'], judged['bfloat16'])
+    np.testing.assert_allclose(judged['bfloat16'], judged['float32'], atol=0.02)
+
+
 def test_under_bfloat16_the_output_layer_stays_float32() -> None:
     network = MLP(4, 1, SHAPE)
     with torch.no_grad():

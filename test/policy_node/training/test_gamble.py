@@ -181,4 +181,14 @@ def test_a_landing_is_no_motion_of_the_robot() -> None:
     spec = simulation.spec
     assert episode_weights('moved', spec, 25.0)(episodes).tolist() == [1.0, 1.0]
     assert episode_weights('moved', spec, 25.0, gamble=True)(episodes).tolist() == [0.0, 1.0]
-    assert episode_weights('energy', spec, 25.0, gamble=True)(episodes)[0] == 0.0
+    energy = episode_weights('energy', spec, 25.0, gamble=True)
+    assert energy(episodes)[0] == 0.0
+    # Going back to where it was pushed from would be a motion of its own.
+    observation, achieved = np.zeros((1, 6, 25), np.float32), np.zeros((1, 6, 3), np.float32)
+    achieved[0, 2:, 0] = 0.05
+    goal, action = np.zeros((1, 3), np.float32), np.zeros((1, 5, 4), np.float32)
+    pushed = Episodes(observation, achieved, goal, action)
+    gambled = Episodes(observation.copy(), achieved.copy(), goal, action)
+    gambled.observation[0, 4:, simulation._parts['gripper_state']] = 1.0
+    gambled.achieved_goal[0, 4:] = 0.3
+    assert energy(gambled) == energy(pushed) > 0.0

@@ -227,7 +227,10 @@ def test_a_second_critic_starts_from_nothing_and_both_go_on_or_one(
     # A mean with one that has a single critic has that one.
     arguments[-1] = f'{block_run},{runs[0]}'
     assert main([*arguments, '--output', str(runs[1])]) == 0
-    assert read_initial_networks(arguments[-1]).critics == 1
+    mean = read_initial_networks(arguments[-1])
+    assert mean.critics == 1
+    alone = Trainer(tiny(task), tmp_path, Workers(), init_from=mean.fitted(tiny(task))).learner
+    assert same(alone.critic.state_dict(), part_of(mean.tensors, 'critic.members.0'))
 
 
 def test_a_critic_with_another_norm_starts_from_nothing(tmp_path: Path, block_run: Path) -> None:

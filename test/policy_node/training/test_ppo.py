@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -97,6 +98,74 @@ def test_weights_make_actions_for_one_goal_those_for_another() -> None:
     assert (weight[:, 1] * actions[:, 1]).mean() == pytest.approx(0.5, abs=0.02)
     assert (weight[:, 1] * actions[:, 0]).mean() == pytest.approx(0.5, abs=0.02), 'the past counts'
     assert (weight[:, 0] * actions[:, 1]).mean() == pytest.approx(0.0, abs=0.02), 'no later action'
+
+
+def test_advantages_of_actions_for_another_goal_are_right_on_average_at_any_trace() -> None:
+    """Three steps of two actions, all eight ways enumerated; every way is a state of its own."""
+    generator = np.random.default_rng(0)
+    ways = np.array(list(itertools.product((0, 1), repeat=3)))
+    # By what was done before: the probabilities of both actions for either goal, and the reward.
+    done = [ways[:, :tick] @ (1 << np.arange(tick)) + (1 << tick) for tick in range(4)]
+    wanted, meant = (generator.uniform(0.2, 0.8, 8) for _ in range(2))
+
+    def probabilities(of_one: np.ndarray) -> np.ndarray:
+        ones = np.stack([of_one[done[tick]] for tick in range(3)], axis=1)
+        return np.where(ways == 1, ones, 1.0 - ones)
+
+    by_goal, by_other = probabilities(wanted), probabilities(meant)
+    reward = np.stack([generator.normal(size=16)[done[tick + 1]] for tick in range(3)], axis=1)
+    value = np.zeros((8, 4))
+    exact = np.zeros((8, 3))
+    for tick in reversed(range(3)):
+        exact[:, tick] = reward[:, tick] + 0.9 * value[:, tick + 1]
+        for state in np.unique(done[tick]):
+            here = done[tick] == state
+            later = by_goal[here, tick:].prod(axis=1)
+            value[here, tick] = (later * exact[here, tick]).sum() / later.sum()
+    ratio = by_goal / by_other
+    for trace in (0.0, 0.5, 1.0):
+        found = advantages(reward, value, 0.9, trace, np.log(ratio))
+        weighed = by_other.prod(axis=1)[:, None] * np.cumprod(ratio, axis=1) * found
+        for tick in range(3):
+            for state in np.unique(done[tick + 1]):
+                here = done[tick + 1] == state
+                happens = by_goal[here, : tick + 1].prod(axis=1)[0]
+                expected = happens * (exact[here, tick] - value[here, tick])[0]
+                assert weighed[here, tick].sum() == pytest.approx(expected, abs=1e-12)
+
+
+def test_advantages_of_actions_for_the_same_goal_need_no_ratio() -> None:
+    generator = np.random.default_rng(0)
+    reward, value = generator.normal(size=(3, 6)), generator.normal(size=(3, 7))
+    plain = advantages(reward, value, 0.9, 0.7)
+    assert (advantages(reward, value, 0.9, 0.7, np.zeros((3, 6))) == plain).all()
+    improbable = advantages(reward, value, 0.9, 0.7, np.full((3, 6), -1e4))
+    np.testing.assert_allclose(improbable, reward + 0.9 * value[:, 1:] - value[:, :-1])
+    assert np.isfinite(advantages(reward, value, 0.9, 0.7, np.full((3, 6), 1e4))).all()
+
+
+@pytest.mark.parametrize('corrects', [False, True])
+def test_replayed_episodes_are_corrected_for_their_own_goals_alone(corrects: bool) -> None:
+    class Halves:
+        """Each action is half as likely for a goal of 1 as for one of 0; nothing is worth much."""
+
+        def values(self, observation: np.ndarray, goal: np.ndarray) -> np.ndarray:
+            return np.zeros(goal.shape[:-1], np.float32)
+
+        def log_probabilities(
+            self, observation: np.ndarray, goal: np.ndarray, action: np.ndarray
+        ) -> np.ndarray:
+            return np.log(np.where(goal[..., 0] > 0.5, 0.25, 0.5)).astype(np.float32)
+
+    states = np.zeros((1, 4, 1), np.float32)
+    episodes = Episodes(states, states, np.zeros((1, 1), np.float32), states[:, :3])
+    maker = RolloutMaker(
+        Halves(), lambda achieved, goal: -np.ones(achieved.shape[:-1]), 1.0, 1.0, corrects
+    )
+    made = maker.make(episodes, [np.ones((1, 1), np.float32)])
+    own, replayed = made.value_target
+    assert own.tolist() == [-3.0, -2.0, -1.0]
+    assert replayed.tolist() == ([-1.75, -1.5, -1.0] if corrects else own.tolist())
 
 
 def reached(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:

@@ -45,6 +45,14 @@ def test_select_keeps_rows_together() -> None:
     assert chosen.action[:, 0, 0].tolist() == [1, 3] == chosen.observation[:, 2, 1].tolist()
 
 
+def test_it_knows_how_many_came_last() -> None:
+    replay = EpisodeReplay(8, 3, 5, 2, 4)
+    assert replay.last_added == 0
+    for count in (5, 3):
+        replay.add(numbered(0, count))
+        assert replay.last_added == count
+
+
 def test_what_cannot_fit_is_refused() -> None:
     with pytest.raises(ValueError, match='capacity 0'):
         EpisodeReplay(0, 3, 5, 2, 4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,7 +17,14 @@ from policy_node.policies.files import write_files
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.final import FINAL_FILE
 from policy_node.training.benchmark.jobs import Job
-from policy_node.training.benchmark.measures import are_apart, area_in_time, area_under, sum_up
+from policy_node.training.benchmark.measures import (
+    are_apart,
+    area_in_time,
+    area_under,
+    compared,
+    rank_sum_chance,
+    sum_up,
+)
 from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.benchmark.research_report import BEGIN, END, format_table, sum_up_arms
 from policy_node.training.benchmark.results import Curve
@@ -134,12 +142,40 @@ def test_a_censored_run_is_slower_than_any_other() -> None:
     assert (row['steps_to_0.9_median'], row['reached']) == ('', 1)
 
 
-def test_arms_are_apart_where_quartiles_do_not_touch() -> None:
-    low = sum_up([run(area, '', 0.0) for area in (0.1, 0.2, 0.3)])
-    high = sum_up([run(area, '', 0.0) for area in (0.4, 0.5, 0.6)])
-    near = sum_up([run(area, '', 0.0) for area in (0.2, 0.3, 0.4)])
-    assert are_apart(low, high, 'area') and are_apart(high, low, 'area')
-    assert not are_apart(low, near, 'area') and not are_apart(low, high, 'final_success')
+def test_arms_are_apart_where_quartiles_do_not_touch_and_chance_would_not_do_it() -> None:
+    low, high, near, overlapping = (
+        [run(area, '', 0.0) for area in areas]
+        for areas in (
+            (0.1, 0.2, 0.3, 0.4, 0.5),
+            (0.6, 0.7, 0.8, 0.9, 1.0),
+            (0.3, 0.4, 0.5, 0.6, 0.7),
+            # Quartiles of .6 and more, and one run below all others: 6 of 252 orders on this side.
+            (0.05, 0.6, 0.7, 0.8, 0.9),
+        )
+    )
+
+    def apart(first: list[dict], second: list[dict], name: str = 'area') -> bool:
+        return are_apart(sum_up(first) | compared(first, second), sum_up(second), name)
+
+    assert apart(low, high) and apart(high, low) and not apart(low, near)
+    assert not apart(low, high, 'final_success')
+    row = sum_up(overlapping)
+    assert row['area_lower'] > sum_up(low)['area_upper'] and not apart(overlapping, low)
+    assert set(compared(low, low).values()) == {''}
+
+
+def test_the_chance_of_a_rank_sum_is_counted() -> None:
+    low, high = [1.0, 2.0, 3.0, 4.0, 5.0], [6.0, 7.0, 8.0, 9.0, 10.0]
+    assert rank_sum_chance(low, high) == rank_sum_chance(high, low) == pytest.approx(2 / 252)
+    # One exchange less: both orders nearer than complete separation, on both sides.
+    assert rank_sum_chance([1.0, 2.0, 3.0, 4.0, 6.0], [5.0, 7.0, 8.0, 9.0, 10.0]) == pytest.approx(
+        4 / 252
+    )
+    assert rank_sum_chance([1.0] * 5, [1.0] * 5) == 1.0
+    # Of three and three, with a tie across: 2 of 20 are as far.
+    assert rank_sum_chance([1.0, 2.0, 3.0], [3.0, 4.0, 5.0]) == pytest.approx(4 / 20)
+    many = rank_sum_chance([*range(20)], [value + 4.5 for value in range(20)])
+    assert many == pytest.approx(0.0239, abs=0.01)
 
 
 @pytest.mark.release
@@ -220,6 +256,17 @@ def test_a_run_that_another_study_has_is_taken_from_there(
     assert [path.name for path in Path('runs/research/returns/FetchPush/one').iterdir()] == [
         'seed0'
     ]
+    # Nor one that began with other networks.
+    state = TrainingState({}, Counters(env_steps=done.config.total_steps), {'config': config})
+    state.extra['config'] = dataclasses.asdict(done.config) | {'init_from': 'FetchPush'}
+    write_state(done.folder / STATE_FILE, state)
+    (elsewhere, _) = jobs_of('hierarchy', 'flat')
+    take_from_other_studies([elsewhere], Path('runs/research'))
+    assert elsewhere.is_finished
+    (same[0].folder / STATE_FILE).unlink()
+    shutil.rmtree(elsewhere.folder)
+    take_from_other_studies([elsewhere], Path('runs/research'))
+    assert not elsewhere.folder.exists()
     # What has begun goes on.
     before = (half.folder / STATE_FILE).read_bytes()
     (same[0].folder / FINAL_FILE).unlink()
