@@ -12,37 +12,17 @@ from msgs_spec.loading import guard_loading
 if TYPE_CHECKING:
     from policy_node.policies.actor import Actor
     from policy_node.policies.loading import load_actor, load_policy
-    from policy_node.training.train import train
 
-__all__ = ['Actor', 'load_actor', 'load_policy', 'train']
-
-# Where they are.
-_MODULES = {
-    'Actor': 'policies.actor',
-    'load_actor': 'policies.loading',
-    'load_policy': 'policies.loading',
-    'train': 'training.train',
-}
+__all__ = ['Actor', 'load_actor', 'load_policy']
 
 # Before anything that takes long to import.
 guard_loading()
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    from importlib import import_module
+    if name in __all__:
+        from importlib import import_module
 
-    if name == 'train':
-        _require_training()
-    return getattr(import_module(f'policy_node.{_MODULES[name]}'), name)
-
-
-def _require_training() -> None:
-    """Names the extra that is missing, where Python would name one of its modules."""
-    from msgs_spec.command_line import UsageError, require_extra
-
-    try:
-        require_extra('train')
-    except UsageError as error:
-        raise ModuleNotFoundError(str(error)) from None
+        module = 'actor' if name == 'Actor' else 'loading'
+        return getattr(import_module(f'policy_node.policies.{module}'), name)
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

@@ -126,8 +126,14 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             ValueError: If the action has a wrong shape or is not finite.
             gymnasium.error.ResetNeeded: If it was never reset.
         """
+        given = np.asarray(action)
+        if given.shape != self.action_space.shape:
+            raise ValueError(
+                f'an action of {self.spec_of_task.name} has shape {self.action_space.shape}, '
+                f'not {given.shape}'
+            )
         self._physics.send()
-        result = self.simulation.step(clip_actions(np.asarray(action)[None]))
+        result = self.simulation.step(clip_actions(given[None]))
         self._physics.receive()
         self._show()
         diverged = bool(result.diverged[0])

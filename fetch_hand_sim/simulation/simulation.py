@@ -141,6 +141,10 @@ class Simulation:
         self._is_started = np.zeros(num_envs, dtype=np.bool_)
         self._process = os.getpid()
 
+    def __repr__(self) -> str:
+        """Task and number of copies."""
+        return f'{type(self).__name__}({self.spec.name!r}, num_envs={self.num_envs})'
+
     @property
     def task(self) -> Task:
         """The physics of the task."""

@@ -94,7 +94,7 @@ class ConfigFields:
     """Most steps of a return before it bootstraps."""
     correction: str = 'none'
     """Of longer returns, whose actions are not the actor's: `none`, `lambda` (their mean is the
-    lambda-return) or `cut` (they end before an action far from the actor's)."""
+    truncated lambda-return) or `cut` (they end before an action far from the actor's)."""
     trace: float = 0.7
     """With `lambda`, the probability of going on after each step; of `ppo` the same lambda."""
     cut_distance: float = 0.3
@@ -229,7 +229,8 @@ class ConfigFields:
     torch_threads: int = 0
     """Threads of one tensor operation; 0 is 1 up to batches of 1024, then half of the cores."""
     precision: str = 'auto'
-    """`float32`, `bfloat16` (autocast), or `auto`: bfloat16 where the processor has it."""
+    """`float32`, `bfloat16` (autocast), or `auto`: bfloat16 where the processor has it. `ppo` knows
+    float32 alone."""
     device: str = 'auto'
     """`auto`, `cpu` or `cuda`."""
 

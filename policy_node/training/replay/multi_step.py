@@ -2,7 +2,8 @@
 
 A return of n steps carries rewards back n times as fast, but it is that of the actions taken, not
 of the actor's. `none` takes that bias. `lambda` draws the number of steps from a geometric
-distribution cut at n, so that the mean target is the lambda-return of MHER (arXiv 2102.12962).
+distribution cut at n, so that the mean target is the truncated lambda-return (Sutton and Barto
+2018, 12.3); the average of MHER(lambda) (arXiv 2102.12962) weighs the longest return less.
 `cut` ends a return before the first action that is far from the actor's for the same goal.
 """
 

@@ -136,12 +136,21 @@ def test_bad_resets_move_nothing(arguments, error, message):
     assert state_of(env) == before
 
 
-@pytest.mark.parametrize('action', [np.zeros(3), np.full(4, np.nan), np.zeros((1, 4)), 'up'])
-def test_bad_actions_move_nothing(action):
+@pytest.mark.parametrize(
+    ('action', 'message'),
+    [
+        (np.zeros(3), r'an action of FetchPush has shape \(4,\), not \(3,\)'),
+        (5, r'an action of FetchPush has shape \(4,\), not \(\)'),
+        (np.zeros((1, 4)), r'has shape \(4,\), not \(1, 4\)'),
+        (np.full(4, np.nan), 'actions must be finite'),
+        (['up'] * 4, 'actions are numbers'),
+    ],
+)
+def test_bad_actions_move_nothing(action, message):
     env = make('FetchPush').unwrapped
     env.reset(seed=0)
     before = state_of(env)
-    with pytest.raises(ValueError, match='actions'):
+    with pytest.raises(ValueError, match=message):
         env.step(action)
     assert state_of(env) == before
 

@@ -171,6 +171,10 @@ def test_bad_actions_move_nothing(bad):
     assert state_of(simulation) == before
 
 
+def test_it_says_what_it_is():
+    assert repr(Simulation('FetchPush', num_envs=2)) == "Simulation('FetchPush', num_envs=2)"
+
+
 BAD_RESETS = {
     'negative seed': ({'seed': -1}, ValueError, 'a seed must not be negative, but -1 is'),
     'one negative seed': ({'seed': [3, -2]}, ValueError, 'must not be negative, but -2 is'),

@@ -182,6 +182,42 @@ def test_temporal_smoothness_keeps_actions_of_neighbouring_states_alike() -> Non
     assert changes[1] < 0.3 * changes[0]
 
 
+def test_a_change_of_action_costs_its_weight_beside_the_size_of_actions() -> None:
+    learner = make_learner(action_l2=0.7, temporal_smoothness=0.4)
+    with torch.no_grad():
+        learner.target_actor.output.weight.neg_()
+    batch = make_batch()
+    now, then = (
+        np.tanh(forward(learner.actor.network, np.concatenate([seen, batch.goal], axis=1)))
+        for seen in (batch.observation, batch.next_observation)
+    )
+    losses = learner.update(batch)
+    penalty = 0.7 * np.square(now).mean() + 0.4 * np.square(then - now).mean()
+    assert losses.actor.item() == pytest.approx(penalty - losses.value.item(), rel=1e-4)
+
+
+def test_the_averaged_actor_keeps_its_share_and_takes_the_rest_of_the_actor() -> None:
+    config = recipe_config('FetchReach', 'paper', actor_average=0.9)
+    learner = DDPG(NetworkShape(3, 2, 4, (8,)), config, CPU, Workers())
+    old = copy.deepcopy(learner.actor.network.state_dict())
+    with torch.no_grad():
+        torch._foreach_add_(learner.actor_parameters, 1.0)
+    for share in (0.1, 0.19):
+        learner.average()
+        evaluated, acting = learner.evaluation_actor(), learner.acting_actor()
+        for name, value in old.items():
+            torch.testing.assert_close(evaluated.network.state_dict()[name], value + share)
+            torch.testing.assert_close(acting.network.state_dict()[name], value + 1.0)
+
+
+def test_learning_rates_fall_linearly_to_the_share_asked_for() -> None:
+    learner = make_learner(learning_rate=2e-3, final_learning_rate=0.1)
+    for progress, expected in ((0.0, 2e-3), (0.5, 1.1e-3), (1.0, 2e-4), (1.5, 2e-4)):
+        learner.set_progress(progress)
+        for optimizer in learner.optimizers().values():
+            assert optimizer.param_groups[0]['lr'] == pytest.approx(expected)
+
+
 def test_target_noise_is_cut_and_stays_within_the_actions() -> None:
     torch.manual_seed(0)
     learner = make_learner(target_noise=0.2)

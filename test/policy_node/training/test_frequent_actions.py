@@ -168,6 +168,52 @@ def test_an_action_holds_for_its_length_but_not_beyond_the_episode() -> None:
     np.testing.assert_array_equal(left, [[3, 1], [2, 4], [1, 3], [2, 2], [1, 1]])
 
 
+@pytest.mark.parametrize('noise', [0.0, 0.3])
+def test_what_is_recorded_of_held_actions_is_what_was_executed(noise: float) -> None:
+    """Two episodes in each of two simulations; without noise every decision is the actor's."""
+    torch.manual_seed(0)
+    actor = Actor(NetworkShape(10, 3, 5, (16,))).eval()
+    with torch.no_grad():
+        # Lengths that differ from state to state.
+        actor.network.output.weight.mul_(4.0)
+    config = TrainConfig('FetchReach', longest_hold=6, noise_std=noise, random_epsilon=noise)
+    simulation, again = (Simulation('FetchReach', num_envs=2, num_threads=1) for _ in range(2))
+    collector = Collector(simulation, [3, 4], config)
+    lengths: set[int] = set()
+    for seeds in ([3, 4], None):
+        episodes, _ = collector.collect(actor)
+        observation = again.reset(seed=seeds)
+        for tick in range(50):
+            seen = observation['observation'].astype(np.float32)
+            np.testing.assert_array_equal(episodes.observation[:, tick], seen)
+            observation = again.step(episodes.action[:, tick, :4]).observation
+        last = observation['observation'].astype(np.float32)
+        np.testing.assert_array_equal(episodes.observation[:, 50], last)
+        for row in range(2):
+            decided = decisions(episodes.action[row], 6)
+            lengths |= set(np.diff([*decided, 50]))
+            if noise == 0.0:
+                goal = np.repeat(episodes.desired_goal[row : row + 1], len(decided), axis=0)
+                asked = {'observation': episodes.observation[row, decided], 'desired_goal': goal}
+                own, _ = actor.predict(asked)
+                np.testing.assert_allclose(episodes.action[row, decided, :4], own[:, :4], atol=1e-5)
+                wanted = np.minimum(ticks_of(own[:, 4], 6), 50 - np.array(decided))
+                np.testing.assert_array_equal(np.diff([*decided, 50]), wanted)
+    assert len(lengths) > 3
+
+
+def decisions(action: np.ndarray, most: int) -> list[int]:
+    """Ticks at which something was decided, which then held, to the end of the episode at most."""
+    left, found, tick = ticks_of(action[:, -1], most), [], 0
+    while tick < len(action):
+        held = slice(tick, tick + left[tick])
+        assert left[held].tolist() == list(range(left[tick], 0, -1)), 'counted down to its end'
+        assert (action[held, :-1] == action[tick, :-1]).all()
+        found.append(tick)
+        tick += left[tick]
+    return found
+
+
 def test_held_actions_are_learnt_from_with_as_many_steps() -> None:
     """A walk to the right by one a tick; the goal is at 6: rewards and ends are known."""
     ticks = 8

@@ -20,6 +20,7 @@ from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.rollouts import (
     RolloutMaker,
     Rollouts,
+    RolloutTransitions,
     advantages,
     decision_weights,
     goals_in_hindsight,
@@ -381,6 +382,52 @@ def log_ratio_after_updates() -> tuple[np.ndarray, np.ndarray]:
         learner.update(rollouts.draw(row, 0.5, generator))
     logs = learner.log_probabilities(episodes.observation[:, 0], goal, action[:, 0])
     return logs - rollouts.log_probability[:, 0], rollouts.advantage[:, 0] > 0
+
+
+def test_the_first_losses_are_those_of_the_definition() -> None:
+    """Two actions each, within the range and at its limits; weights, and ratios either way."""
+    torch.manual_seed(0)
+    config = configured(action_l2=0.7, learning_rate=0.0)
+    learner = PPO(NetworkShape(1, 1, 2, (4,)), config, torch.device('cpu'), Workers())
+    ratio = np.array([0.5, 0.5, 0.9, 1.1, 2.0, 2.0])
+    advantage = np.array([1.0, -1.0, 3.0, -2.0, 4.0, -5.0])
+    # What is good gains no more beyond 1.2, what is bad loses no less below 0.8.
+    gain = np.array([0.5, -0.8, 2.7, -2.2, 4.8, -10.0])
+    weight = np.array([0.1, 2.0, 1.0, 0.5, 1.5, 0.3])
+    target = np.linspace(-3.0, 0.0, 6)
+    action = np.array([[0.1, -0.4], [1.0, 0.3], [0.2, -1.0], [-1.0, 1.0], [0.8, 0.0], [-0.6, 0.5]])
+    inputs = np.random.default_rng(0).normal(size=(6, 2))
+
+    def said(network: torch.nn.Module) -> np.ndarray:
+        first, bias, last, offset = (value.detach().numpy() for value in network.parameters())
+        return np.maximum(inputs @ first.T + bias, 0.0) @ last.T + offset
+
+    mean, value = np.tanh(said(learner.actor.network)), said(learner.critic)[:, 0]
+    inside = np.exp(-np.square((action - mean) / 0.3) / 2) / (0.3 * math.sqrt(2 * math.pi))
+    # Of noise beyond a limit, all that lies there counts.
+    beyond = np.vectorize(math.erfc)((1.0 - np.sign(action) * mean) / (0.3 * math.sqrt(2))) / 2
+    density = np.where(np.abs(action) == 1.0, beyond, inside).prod(axis=1)
+    arrays = {
+        'observation': inputs[:, :1],
+        'next_observation': inputs[:, :1],
+        'goal': inputs[:, 1:],
+        'action': action,
+        # The value target has both already.
+        'reward': np.zeros(6),
+        'discount': np.zeros(6),
+        'log_probability': np.log(density / ratio),
+        'advantage': advantage,
+        'value_target': target,
+        'weight': weight,
+    }
+    losses = learner.update(
+        RolloutTransitions(**{name: array.astype(np.float32) for name, array in arrays.items()})
+    )
+    critic_loss = (weight * np.square(value - target)).mean()
+    assert losses.critic.item() == pytest.approx(critic_loss, rel=1e-4)
+    actor_loss = -(weight * gain).mean() + 0.7 * np.square(mean).mean()
+    assert losses.actor.item() == pytest.approx(actor_loss, rel=1e-4)
+    assert losses.value.item() == pytest.approx(value.mean(), rel=1e-4)
 
 
 def test_ppo_refuses_transitions_that_nobody_rolled_out() -> None:

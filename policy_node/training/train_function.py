@@ -114,7 +114,7 @@ def _ending(
     config: TrainConfig, folder: Path, resume: bool, on_cycle: OnCycle | None, quiet: bool
 ) -> Ending:
     """Runs it; what commands say in one line are errors as Python has them."""
-    command = f'policy_node.train({config.task!r}, {str(folder)!r})'
+    command = f'policy_node.training.train({config.task!r}, {str(folder)!r})'
     try:
         return train_run(
             config, folder, resume=resume, command=command, on_cycle=on_cycle, quiet=quiet

@@ -1,4 +1,4 @@
-"""`policy_node.train`: training as a function."""
+"""`policy_node.training.train`: training as a function."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from policy_node import load_policy, train
-from policy_node.training.train import Run
+from policy_node import load_policy
+from policy_node.training import Run, train
 from support import script_environment
 
 torch.set_num_threads(1)
@@ -129,7 +129,7 @@ def test_a_folder_that_holds_a_run_is_left_alone(tmp_path):
 def test_ctrl_c_saves_the_run_and_ends_the_program_around_it(tmp_path):
     code = f"""
 import os, signal
-from policy_node import train
+from policy_node.training import train
 
 for seed in range(2):
     train('FetchReach', {str(tmp_path)!r} + f'/{{seed}}', total_steps=100_000, seed=seed,
@@ -157,7 +157,7 @@ def test_a_missing_extra_is_named(tmp_path):
     )
     environment = script_environment() | {'PYTHONPATH': str(tmp_path)}
     result = subprocess.run(
-        [sys.executable, '-c', 'from policy_node import train'],
+        [sys.executable, '-c', 'from policy_node.training import train'],
         env=environment,
         capture_output=True,
         text=True,
