@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from policy_node.policies.actor import MLP
+from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.networks.critics import AGGREGATES, Ensemble, make_critic
 from policy_node.training.replay.transitions import Transitions
 from support.learners import SHAPE, make_learner
@@ -92,3 +95,145 @@ def test_disagreement_is_where_nothing_was_learnt() -> None:
     unknown = replace(known, goal=elsewhere)
     assert learner.disagreement(known).mean() < 0.05 < learner.disagreement(unknown).mean()
     assert learner.surprise(known).mean() < 0.05 and learner.surprise(known).shape == (64,)
+
+
+# Of observation, goal and action: what the critics are, and what their slow copies are.
+CRITICS = np.array([[0.5, -0.3, 0.2, -0.4], [-0.4, 0.1, 0.6, -1.1], [0.2, 0.8, -0.7, -0.9]])
+SLOW = np.array([[0.8, 0.5, -0.6, -1.2], [0.9, -0.5, 0.4, -1.0], [-0.8, 0.6, 0.1, -0.4]])
+SLOW_ACTOR = np.array([0.7, -0.4, 0.1])
+
+
+def linear_learner(critics: int, **changes: object) -> DDPG:
+    """The first of these critics, each a weighted sum; the actor differs from its slow copy."""
+    learner = make_learner(NetworkShape(1, 1, 1, (1,)), critics=critics, **changes)
+    make_linear(learner.target_actor, SLOW_ACTOR)
+    for ensemble, weights in ((learner.critic, CRITICS), (learner.target_critic, SLOW)):
+        members = [ensemble] if critics == 1 else ensemble.members
+        for member, own in zip(members, weights, strict=False):
+            make_linear(member.network, own)
+    return learner
+
+
+@torch.no_grad()
+def make_linear(network: MLP, weights: np.ndarray) -> None:
+    """The one hidden unit is far above 0, so that the network says the sum and the last weight."""
+    network.hidden[0].weight.copy_(torch.tensor(weights[None, :-1]))
+    network.hidden[0].bias.fill_(20.0)
+    network.output.weight.fill_(1.0)
+    network.output.bias.fill_(weights[-1] - 20.0)
+
+
+def scattered(count: int = 200) -> Transitions:
+    generator = np.random.default_rng(0)
+    columns = generator.uniform(-2, 2, (3, count, 1)).astype(np.float32)
+    action = generator.uniform(-1, 1, (count, 1)).astype(np.float32)
+    reward = -generator.integers(0, 2, count).astype(np.float32)
+    # Returns differ in length, so discounts do.
+    discount = generator.choice([0.5, 0.25], count).astype(np.float32)
+    return Transitions(*columns, action, reward, discount)
+
+
+def said(weights: np.ndarray, *inputs: np.ndarray) -> np.ndarray:
+    return np.concatenate(inputs, axis=1) @ weights[:-1] + weights[-1]
+
+
+def values_by_hand(critics: int, batch: Transitions) -> tuple[np.ndarray, np.ndarray]:
+    """Values, and slow ones of the next states, each (critics, batch)."""
+    now = batch.observation, batch.goal, batch.action
+    action = np.tanh(said(SLOW_ACTOR, batch.next_observation, batch.goal))[:, None]
+    then = batch.next_observation, batch.goal, action
+    return tuple(
+        np.stack([said(own, *seen) for own in weights[:critics]])
+        for weights, seen in ((CRITICS, now), (SLOW, then))
+    )
+
+
+def test_surprise_is_how_far_a_value_is_from_its_clipped_target() -> None:
+    batch = scattered()
+    value, following = values_by_hand(1, batch)
+    target = np.clip(batch.reward + batch.discount * following[0], -2.0, 0.0)
+    assert (target == -2.0).any() and (target == 0.0).any(), 'both limits matter'
+    found = linear_learner(1).surprise(batch)
+    np.testing.assert_allclose(found, np.abs(value[0] - target), atol=1e-5)
+
+
+def test_surprise_of_several_critics_is_their_mean() -> None:
+    batch = scattered()
+    value, following = values_by_hand(3, batch)
+    target = np.clip(batch.reward + batch.discount * following.min(axis=0), -2.0, 0.0)
+    found = linear_learner(3, aggregate='min').surprise(batch)
+    np.testing.assert_allclose(found, np.abs(value - target).mean(axis=0), atol=1e-5)
+
+
+def test_disagreement_is_the_deviation_of_values_over_critics() -> None:
+    batch = scattered()
+    value, _ = values_by_hand(3, batch)
+    found = linear_learner(3).disagreement(batch)
+    np.testing.assert_allclose(found, value.std(axis=0, ddof=1), atol=1e-5)
+
+
+@pytest.mark.parametrize('aggregate', ['mean', 'min', 'truncated'])
+def test_all_critics_learn_from_one_target_of_what_their_copies_say(aggregate: str) -> None:
+    batch, learner = scattered(), linear_learner(3, aggregate=aggregate)
+    value, following = values_by_hand(3, batch)
+    assert set(following.argmin(axis=0)) == set(following.argmax(axis=0)) == {0, 1, 2}
+    low, middle, high = np.sort(following, axis=0)
+    together = {'mean': (low + middle + high) / 3, 'min': low, 'truncated': (low + middle) / 2}
+    target = np.clip(batch.reward + batch.discount * together[aggregate], -2.0, 0.0)
+    known = learner._known(batch)
+    with torch.no_grad():
+        found = learner.targets(known.reward, known.discount, known.next_features)
+    np.testing.assert_allclose(found, target, atol=1e-5)
+    loss = learner.update(batch).critic
+    assert loss.item() == pytest.approx(np.square(value - target).mean(), rel=1e-4)
+
+
+def test_a_batch_norm_sees_states_and_next_states_together() -> None:
+    """CrossQ: statistics of one pass over both, and none of any other pass."""
+    shape = NetworkShape(1, 1, 1, (6,))
+    learner = make_learner(shape, norm='batch', target='none', action_l2=0.0, learning_rate=0.0)
+    linear, norm, _ = learner.critic.network.hidden
+    output = learner.critic.network.output
+    with torch.no_grad():
+        norm.weight.uniform_(0.5, 1.5)
+        norm.bias.uniform_(-0.5, 0.5)
+        output.weight.mul_(0.4)
+        output.bias.fill_(-0.7)
+    # Next states lie elsewhere: neither alone has the statistics of both.
+    batch = scattered()
+    batch.next_observation[:] = 0.3 * batch.next_observation + 1.5
+    features, next_features = (
+        np.concatenate([seen, batch.goal], axis=1)
+        for seen in (batch.observation, batch.next_observation)
+    )
+    with torch.no_grad():
+        own, following = (
+            learner.actor(torch.from_numpy(seen)).numpy() for seen in (features, next_features)
+        )
+
+    def hidden(features: np.ndarray, action: np.ndarray) -> np.ndarray:
+        weight, bias = (tensor.detach().numpy().astype(float) for tensor in linear.parameters())
+        return np.concatenate([features, action], axis=1) @ weight.T + bias
+
+    def values(hidden: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        weight, bias, out, offset = (
+            tensor.detach().numpy().astype(float)
+            for tensor in (*norm.parameters(), *output.parameters())
+        )
+        normalized = (hidden - mean) / np.sqrt(variance + 1e-5) * weight + bias
+        return np.maximum(normalized, 0.0) @ out[0] + offset[0]
+
+    now, then = hidden(features, batch.action), hidden(next_features, following)
+    both = np.concatenate([now, then])
+    statistics = both.mean(axis=0), both.var(axis=0)
+    target = batch.reward + batch.discount * values(then, *statistics)
+    error = values(now, *statistics) - np.clip(target, -2.0, 0.0)
+    assert ((-2.0 < target) & (target < 0.0)).mean() > 0.5
+    losses = learner.update(batch)
+    assert losses.critic.item() == pytest.approx(np.square(error).mean(), rel=1e-4)
+    # A hundredth of the running statistics is replaced, once: the actor does not count.
+    mean, variance = 0.01 * both.mean(axis=0), 0.99 + 0.01 * both.var(axis=0, ddof=1)
+    np.testing.assert_allclose(norm.running_mean, mean, atol=1e-6)
+    np.testing.assert_allclose(norm.running_var, variance, rtol=1e-5)
+    expected = values(hidden(features, own), mean, variance).mean()
+    assert losses.value.item() == pytest.approx(expected, rel=1e-4)

@@ -141,27 +141,47 @@ def test_a_batch_follows_the_configuration() -> None:
     assert weights.tolist() == [1.0, 1.0, 1.0], 'metres along y count as moved'
 
 
+def sideways(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """-1 until the goal is met along y, then 0."""
+    return -1.0 * (np.abs(achieved - goal)[..., 1] > 0.5)
+
+
+@pytest.mark.parametrize('source', ['real', 'future'])
 @pytest.mark.parametrize('n_step', [1, 3])
-def test_a_drop_that_is_lost_is_worth_minus_one_for_ever(n_step: int) -> None:
-    """Episode 0 drops its pen at tick 20, episode 1 never; rewards are -1 but at tick 5."""
+def test_a_drop_that_is_lost_is_worth_minus_one_for_ever(n_step: int, source: str) -> None:
+    """Episode 0 drops its pen at tick 20, episode 1 never; rewards are -1 but at tick 5.
+
+    With goals in hindsight, but at the tick that the goal is of: that of the loss perhaps.
+    """
     changes = {'ticks_after_drop': 1, 'drop_is_lost': True, 'gamma': 0.9, 'n_step': n_step}
     config = recipe_config('HandManipulatePenRotate', 'best', **changes)
     heights = np.full((2, PEN.episode_ticks + 1), 0.2)
     heights[0, 20:] = 0.0
-    episodes = pen_episodes(poses(heights))
+    achieved = poses(heights)
+    achieved[..., 1] = np.arange(PEN.episode_ticks + 1)
+    episodes = pen_episodes(achieved)
+    episodes.desired_goal[:, 1] = 5.0
     steps = StepCounter(n_step) if n_step > 1 else None
-    reward = lambda achieved, desired: -np.ones(len(achieved))  # noqa: E731
-    sampler = TransitionSampler(reward, 0.9, steps, lost_value=config.lowest_value)
+    sampler = TransitionSampler(sideways, 0.9, steps, lost_value=config.lowest_value)
     valid = ticks_until_dropped(PEN, config.ticks_after_drop)(episodes)
     row = np.repeat([0, 1], 4000)
     generator = np.random.default_rng(0)
-    batch = sampler.sample(episodes, row, {'real': 1.0}, generator, valid)
+    batch = sampler.sample(episodes, row, {source: 1.0}, generator, valid)
     ends = batch.discount == 0
     assert ends[:4000].any() and not ends[4000:].any()
-    left = 21 - batch.observation[:, 0]
+    tick, goal = batch.observation[:, 0].astype(int), batch.goal[:, 1]
+    left = np.where(row == 0, 21, PEN.episode_ticks) - tick
     assert (ends == ((row == 0) & (left <= n_step))).all()
-    np.testing.assert_allclose(batch.reward[ends], -10.0, rtol=1e-5)
-    assert batch.reward[~ends].min() > -3.0
+    expected = []
+    for index, count in enumerate(np.minimum(left, n_step)):
+        reached = [float(tick[index] + step + 1 == goal[index]) for step in range(count)]
+        total = sum(0.9**step * (hit - 1.0) for step, hit in enumerate(reached))
+        expected.append(total + 0.9**count * ends[index] * -10.0)
+    np.testing.assert_allclose(batch.reward, expected, rtol=1e-5)
+    # For ever, from wherever it is seen, less what a goal that is met on the way is worth.
+    worth = -10.0 + 0.9 ** (goal - tick - 1.0) * (source == 'future')
+    np.testing.assert_allclose(batch.reward[ends], worth[ends], rtol=1e-5)
+    assert len(set(batch.reward[~ends])) > n_step, 'goals are met where nothing is lost as well'
 
 
 @pytest.mark.parametrize('changes', [{}, {'ticks_after_drop': 2, 'reward_type': 'dense'}])

@@ -206,6 +206,7 @@ def decisions(action: np.ndarray, most: int) -> list[int]:
     """Ticks at which something was decided, which then held, to the end of the episode at most."""
     left, found, tick = ticks_of(action[:, -1], most), [], 0
     while tick < len(action):
+        assert 1 <= left[tick] <= most
         held = slice(tick, tick + left[tick])
         assert left[held].tolist() == list(range(left[tick], 0, -1)), 'counted down to its end'
         assert (action[held, :-1] == action[tick, :-1]).all()

@@ -1,0 +1,139 @@
+"""Rewards of several steps for goals that differ from row to row, against a loop over the steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.tasks import task_spec
+from policy_node.training.collection.frame_skip import HeldSteps, length_of
+from policy_node.training.experience.hindsight_actions import SubgoalSampler
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.networks.conditions import Threshold
+from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.replay.multi_step import StepCounter
+from policy_node.training.replay.transitions import Transitions
+
+COUNT, TICKS, LONGEST = 5, 9, 4
+ROW = np.tile(np.arange(COUNT), 80)
+MIXTURE = {'future': 0.5, 'actual': 0.3, 'real': 0.2}
+# Ticks of each episode that count, where not all do.
+VALID = np.array([9, 3, 1, 6, 9])
+HELD = np.random.default_rng(1).integers(1, LONGEST + 1, (COUNT, TICKS))
+
+
+@pytest.fixture
+def episodes() -> Episodes:
+    """Random walks of some centimetres a tick; what is observed are the episode and the tick."""
+    generator = np.random.default_rng(0)
+    row, tick = np.meshgrid(np.arange(COUNT), np.arange(TICKS + 1), indexing='ij')
+    place = 0.03 * generator.normal(size=(COUNT, TICKS + 1, 3)).cumsum(axis=1)
+    goal = 0.05 * generator.normal(size=(COUNT, 3))
+    # As a subgoal it would be three numbers and whether it is tested: here never.
+    action = np.zeros((COUNT, TICKS, 5))
+    action[..., 4] = length_of(HELD, LONGEST)
+    arrays = np.stack([row, tick], axis=-1), place, goal, action
+    return Episodes(*(values.astype(np.float32) for values in arrays))
+
+
+def nearness(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """A reward that no two places and no two goals share."""
+    return -np.linalg.norm(achieved - goal, axis=-1)
+
+
+def steps_of(batch: Transitions) -> np.ndarray:
+    return (batch.next_observation - batch.observation)[:, 1].astype(int)
+
+
+def assert_rewards_are_those_of_a_loop(
+    episodes: Episodes,
+    batch: Transitions,
+    reward_of: Callable[[int, np.ndarray, np.ndarray], float],
+) -> None:
+    """What each step achieves is rewarded for the goal of the row, and discounted by 0.9 a step."""
+    expected = []
+    for index, steps in enumerate(steps_of(batch)):
+        row, tick = batch.observation[index].astype(int)
+        goal = batch.goal[index].astype(float)
+        following = episodes.achieved_goal[row, tick + 1 : tick + steps + 1].astype(float)
+        rewards = [reward_of(index, achieved, goal) for achieved in following]
+        expected.append(sum(0.9**step * reward for step, reward in enumerate(rewards)))
+    np.testing.assert_allclose(batch.reward, expected, rtol=1e-5)
+    np.testing.assert_allclose(batch.discount, 0.9 ** steps_of(batch), rtol=1e-6)
+    np.testing.assert_array_equal(batch.observation[:, 0], batch.next_observation[:, 0])
+    assert len(np.unique(batch.goal, axis=0)) > 20, 'goals differ from row to row'
+
+
+class Judge:
+    """Would do what was done in every other episode, and the opposite in the others."""
+
+    def act(self, observation: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        return np.repeat(observation[:, :1] % 2, 5, axis=1)
+
+
+@pytest.mark.parametrize('valid', [None, VALID], ids=['all', 'valid'])
+@pytest.mark.parametrize(
+    'counter',
+    [
+        StepCounter(2),
+        StepCounter(5),
+        StepCounter(100),
+        StepCounter(5, 'lambda', trace=0.6),
+        StepCounter(5, 'cut', cut_distance=0.8),
+        HeldSteps(LONGEST),
+    ],
+    ids=['2', '5', '100', 'lambda', 'cut', 'held'],
+)
+def test_every_step_of_a_return_is_rewarded_for_the_goal_of_its_row(
+    episodes: Episodes, counter: StepCounter | HeldSteps, valid: np.ndarray | None
+) -> None:
+    sampler = TransitionSampler(nearness, 0.9, counter)
+    generator = np.random.default_rng(2)
+    batch = sampler.sample(episodes, ROW, MIXTURE, generator, valid, Judge())
+    assert_rewards_are_those_of_a_loop(episodes, batch, lambda _, *goals: nearness(*goals))
+    tick, steps = batch.observation[:, 1].astype(int), steps_of(batch)
+    left = (TICKS if valid is None else valid[ROW]) - tick
+    assert (steps >= 1).all() and (steps <= left).all() and len(set(steps)) > 1
+    if isinstance(counter, HeldSteps):
+        np.testing.assert_array_equal(steps, np.minimum(HELD[ROW, tick], left))
+    elif counter.correction == 'none':
+        np.testing.assert_array_equal(steps, np.minimum(counter.most, left))
+
+
+def test_a_reward_for_a_share_of_time_is_that_share_at_every_step(episodes: Episodes) -> None:
+    sampler = TransitionSampler(nearness, 0.9, StepCounter(3), reward_scale=0.1)
+    batch = sampler.sample(episodes, ROW, MIXTURE, np.random.default_rng(2))
+    assert_rewards_are_those_of_a_loop(episodes, batch, lambda _, *goals: 0.1 * nearness(*goals))
+
+
+@pytest.mark.parametrize('every', [2, 4, TICKS])
+def test_every_tick_of_a_subgoal_is_rewarded_for_the_goal_of_its_row(
+    episodes: Episodes, every: int
+) -> None:
+    sampler = SubgoalSampler(TransitionSampler(nearness, 0.9), every, missed_value=-50.0)
+    episodes.action[..., 4] = 0.0
+    batch = sampler.sample(episodes, ROW, MIXTURE, np.random.default_rng(2))
+    assert set(steps_of(batch)) == {every}
+    assert_rewards_are_those_of_a_loop(episodes, batch, lambda _, *goals: nearness(*goals))
+
+
+@pytest.mark.parametrize('n_step', [1, 3, 100])
+def test_the_threshold_of_a_row_holds_at_every_step_of_its_return(
+    episodes: Episodes, n_step: int
+) -> None:
+    spec = task_spec('FetchReach')
+    condition = Threshold(GoalMetric(spec), widest=4.0)
+    sampler = TransitionSampler(nearness, 0.9, StepCounter(n_step), condition)
+    batch = sampler.sample(episodes, ROW, MIXTURE, np.random.default_rng(2))
+    near = spec.distance_threshold * np.exp(batch.condition[:, 0].astype(float))
+    assert 0.02 < near.min() < 0.03 and 0.15 < near.max() < 0.2
+
+    def met(index: int, achieved: np.ndarray, goal: np.ndarray) -> float:
+        return float(np.linalg.norm(achieved - goal) < near[index]) - 1.0
+
+    assert_rewards_are_those_of_a_loop(episodes, batch, met)
+    np.testing.assert_array_equal(batch.next_condition, batch.condition)
+    assert n_step == 1 or len(set(batch.reward)) > 4, 'met at some steps and missed at others'
