@@ -258,12 +258,20 @@ def _stopping_is_said(name: str) -> Iterator[list[int]]:
 
 @contextmanager
 def on_stop_signals(
-    numbers: Iterable[signal.Signals], stop: Callable[[int, FrameType | None], None]
+    numbers: Iterable[signal.Signals],
+    stop: Callable[[int, FrameType | None], None],
+    raises_again: bool = False,
 ) -> Iterator[list[int]]:
     """Calls `stop` when one of these signals comes for the first time; again, it ends the process.
 
     But not a second SIGHUP: a closed terminal sends one, and the shell in it another; so after the
     first they are ignored. One that is ignored from the start, as `nohup` has it, stays so.
+
+    Args:
+        numbers: The signals.
+        stop: Is called with the number and the frame.
+        raises_again: Whether a second SIGINT raises KeyboardInterrupt instead, because the process
+            is somebody else's program, a notebook perhaps.
 
     Yields:
         A list that will hold the numbers of those that came.
@@ -272,7 +280,10 @@ def on_stop_signals(
 
     def handle(number: int, frame: FrameType | None) -> None:
         received.append(number)
-        signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
+        again: Any = signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL
+        if raises_again and number == signal.SIGINT:
+            again = signal.default_int_handler
+        signal.signal(number, again)
         discard_unread_output()
         stop(number, frame)
 

@@ -78,7 +78,7 @@ class Reporter:
         return [(DIAGNOSTICS, encode_reports(report)), (REAL_TIME_FACTOR, factor)]
 
     def say_what_is_waited_for(self) -> None:
-        """Logs it, a few times a minute."""
+        """Logs it, every `WAITING_PERIOD` seconds at most."""
         line = waiting_line(self._robot, self._surroundings())
         self._node.get_logger().warning(line, **seldom(WAITING_PERIOD))
 

@@ -71,13 +71,8 @@ def finite_goals(goals: ArrayLike, count: int, spec: TaskSpec) -> Array:
     Raises:
         ValueError: If they have another shape, or something is no finite number.
     """
-    array = np.array(goals, dtype=np.float64)
-    shape = (count, spec.goal.size)
-    if array.shape != shape:
-        raise ValueError(f'goals of {spec.name} have shape {shape}, not {array.shape}')
-    if not np.isfinite(array).all():
-        raise ValueError(f'goals must be finite, not {array.tolist()}')
-    return array
+    array = finite_numbers('goals', goals, (count, spec.goal.size), owner=spec.name)
+    return np.array(array, dtype=np.float64)
 
 
 def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_values import typed_fields
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.runs.resumed_config import resumed_config
-from policy_node.training.runs.run import Ending, OnCycle, train_run
+from policy_node.training.runs.run import Caller, Ending, OnCycle, train_run
 from policy_node.training.runs.run_folder import BEST_FILE, LATEST_FILE, STATE_FILE
 from policy_node.training.runs.run_log import read_progress
 
@@ -35,7 +35,7 @@ class Run:
     """
 
     folder: Path
-    config: TrainConfig
+    config: TrainConfig = field(repr=False)
     reason: str
     env_steps: int
     seconds: float
@@ -68,8 +68,8 @@ def train(
     """Trains an actor with DDPG and hindsight experience replay, in this process.
 
     Ctrl-C (or "interrupt" of a notebook) ends it after the cycle with all saved, and raises
-    KeyboardInterrupt; `resume=True` goes on from there. In a thread other than the main one
-    signals do nothing.
+    KeyboardInterrupt; `resume=True` goes on from there. A second one raises at once. In a thread
+    other than the main one signals do nothing.
 
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
@@ -99,7 +99,7 @@ def train(
                 f'{folder} holds a run: resume=True goes on with it, or choose another'
             )
     with _left_as_it_was():
-        ending = _ending(config, folder, resume, on_cycle, quiet)
+        ending = _ending(config, folder, resume, Caller(on_cycle, quiet))
     if ending.signal == signal.SIGINT:
         raise KeyboardInterrupt(ending.reason)
     if ending.signal:
@@ -110,15 +110,11 @@ def train(
     )
 
 
-def _ending(
-    config: TrainConfig, folder: Path, resume: bool, on_cycle: OnCycle | None, quiet: bool
-) -> Ending:
+def _ending(config: TrainConfig, folder: Path, resume: bool, caller: Caller) -> Ending:
     """Runs it; what commands say in one line are errors as Python has them."""
     command = f'policy_node.training.train({config.task!r}, {str(folder)!r})'
     try:
-        return train_run(
-            config, folder, resume=resume, command=command, on_cycle=on_cycle, quiet=quiet
-        )
+        return train_run(config, folder, resume=resume, command=command, caller=caller)
     except UsageError as error:
         raise ValueError(str(error)) from error
     except CommandError as error:

@@ -37,6 +37,19 @@ from policy_node.training.runs.training_state import Counters
 OnCycle = Callable[[Row], object]
 
 
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """A program that trains; a second Ctrl-C raises KeyboardInterrupt there and does not end it.
+
+    Attributes:
+        on_cycle: Is told of each cycle; the run ends when it returns False.
+        quiet: Whether progress is not shown.
+    """
+
+    on_cycle: OnCycle | None = None
+    quiet: bool = False
+
+
 class RunTakenError(CommandError):
     """Another process works on the run."""
 
@@ -63,8 +76,7 @@ def train_run(
     resume: bool = False,
     command: str = '',
     experience: Episodes | None = None,
-    on_cycle: OnCycle | None = None,
-    quiet: bool = False,
+    caller: Caller | None = None,
 ) -> Ending:
     """Trains as configured, in this process, until a limit or a signal ends it.
 
@@ -74,8 +86,7 @@ def train_run(
         resume: Continue the run in the folder; else it must hold none.
         command: Command line, for the record.
         experience: Episodes to learn from as well.
-        on_cycle: Is told of each cycle; the run ends when it returns False.
-        quiet: Whether progress is not shown.
+        caller: The program that this is called from; None is a command of ours.
 
     Raises:
         UsageError: If something that the run needs is missing or does not fit; nothing is written
@@ -102,7 +113,7 @@ def train_run(
         if why := _too_large(trainer):
             complain(NAME, why)
         try:
-            ending = _train(trainer, output, command, on_cycle, quiet)
+            ending = _train(trainer, output, command, caller)
         except (TrainingError, OSError) as error:
             raise CommandError(f'{error}; {_kept(output)}') from None
         finally:
@@ -140,10 +151,9 @@ def _too_large(trainer: Trainer) -> str:
     return why_too_large(needed, available_memory())
 
 
-def _train(
-    trainer: Trainer, output: Path, command: str, on_cycle: OnCycle | None, quiet: bool
-) -> Ending:
+def _train(trainer: Trainer, output: Path, command: str, caller: Caller | None) -> Ending:
     config, counters, log = trainer.config, trainer.counters, None
+    on_cycle = caller.on_cycle if caller else None
 
     def tell(row: Row) -> None:
         if on_cycle is not None and on_cycle(row) is False:
@@ -153,9 +163,10 @@ def _train(
         with (output / COMMAND_FILE).open('a') as file:
             file.write(command + '\n')
         limits = config.total_steps, config.time_limit
+        quiet = caller is not None and caller.quiet
         log = RunLog(output, *limits, counters.env_steps, quiet=quiet, on_row=tell)
     try:
-        with _stop_on_signals(trainer) as received:
+        with _stop_on_signals(trainer, is_guest=caller is not None) as received:
             reason = trainer.train(log)
     finally:
         if log is not None:
@@ -206,8 +217,12 @@ def _initial_networks(config: TrainConfig) -> InitialNetworks:
 
 
 @contextlib.contextmanager
-def _stop_on_signals(trainer: Trainer) -> Iterator[list[int]]:
+def _stop_on_signals(trainer: Trainer, is_guest: bool = False) -> Iterator[list[int]]:
     """Ctrl-C, SIGTERM and SIGHUP end the run after the cycle; a second one ends it at once.
+
+    Args:
+        trainer: Of the run.
+        is_guest: Whether a second Ctrl-C must leave the process alive.
 
     Yields:
         A list that will hold the number of the signal.
@@ -219,5 +234,5 @@ def _stop_on_signals(trainer: Trainer) -> Iterator[list[int]]:
         complain(NAME, 'stopping after this cycle; once more stops at once')
 
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    with on_stop_signals(numbers, stop) as received:
+    with on_stop_signals(numbers, stop, raises_again=is_guest) as received:
         yield received

@@ -149,6 +149,28 @@ for seed in range(2):
     assert resumed.env_steps == 800
 
 
+def test_a_second_ctrl_c_raises_at_once_and_leaves_the_program_alive(tmp_path):
+    code = f"""
+import os, signal
+from policy_node.training import train
+
+def twice(row):
+    os.kill(os.getpid(), signal.SIGINT)
+    os.kill(os.getpid(), signal.SIGINT)
+
+try:
+    train('FetchReach', {str(tmp_path / 'run')!r}, total_steps=100_000, on_cycle=twice, **{SMALL!r})
+except KeyboardInterrupt as error:
+    print('alive', error.args)
+print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)
+"""
+    command = [sys.executable, '-c', code]
+    result = subprocess.run(
+        command, env=script_environment(), capture_output=True, text=True, timeout=120
+    )
+    assert result.stdout.splitlines() == ['alive ()', 'True'], result.stderr
+
+
 def test_a_missing_extra_is_named(tmp_path):
     (tmp_path / 'sitecustomize.py').write_text(
         'import importlib.util as u\n'
