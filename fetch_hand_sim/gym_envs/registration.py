@@ -55,8 +55,10 @@ def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
     needs `max_episode_steps` too.
 
     Args:
-        name: The task, the id, or what `spec` of an environment says.
-        **arguments: As `gymnasium.make` and `FetchHandEnv` have them.
+        name: The task (`FetchPush`; `msgs_spec.tasks.TASKS` has all), the id, or what `spec` of an
+            environment says.
+        **arguments: As `gymnasium.make` and `FetchHandEnv` have them, such as `reward_type`,
+            `render_mode` and `control_hz`.
 
     Raises:
         ValueError: If an argument is not allowed.
