@@ -16,7 +16,7 @@ from fetch_hand_sim.films.film import MOVING, check_kind, check_size, write_film
 from fetch_hand_sim.films.pictures import Studio
 from fetch_hand_sim.films.recording import load_recordings
 from msgs_spec.arrays import Picture
-from msgs_spec.command_line import UsageError
+from msgs_spec.command_line import CommandError, UsageError
 
 
 class Film:
@@ -83,6 +83,7 @@ class Film:
 
         Raises:
             ValueError: If the ending, the folder or the size is not allowed, or .mp4 lacks ffmpeg.
+            OSError: If it cannot be written.
         """
         file = Path(path)
         try:
@@ -93,6 +94,8 @@ class Film:
             write_film(file, self, self.fps)
         except UsageError as error:
             raise ValueError(str(error).removeprefix('--out ')) from None
+        except CommandError as error:
+            raise OSError(str(error)) from error
         return file
 
     def __repr__(self) -> str:

@@ -25,6 +25,7 @@ from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from msgs_spec.command_line import CommandError, UsageError
 from support.episode_recorder import Recorder
+from support.full_disk import files_at_most
 
 
 @pytest.fixture(scope='module')
@@ -423,6 +424,13 @@ def test_a_film_is_saved_only_where_and_as_what_it_can_be(name, tmp_path):
     with pytest.raises(ValueError, match='film') as error:
         Film(PICTURES).save(tmp_path / name)
     assert '--out' not in str(error.value)
+
+
+def test_a_film_that_a_full_disk_does_not_take_is_an_os_error(tmp_path):
+    noise = np.random.default_rng(0).integers(256, size=(3, 64, 64, 3), dtype=np.uint8)
+    with files_at_most(1_000), pytest.raises(OSError, match='film'):
+        Film(noise).save(tmp_path / 'film.webp')
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_film_of_an_episode_is_that_of_the_command(folder, opengl, tmp_path):
