@@ -40,6 +40,8 @@ FOREIGN = set('. > apt cd colcon git ls mkdir pip python3 rviz2 ssh touch uvx'.s
 RUN_ELSEWHERE = {'write_your_own_controller.md'}
 # Its task is there only when its package is: test_own_task.py reads its command lines.
 WITH_ANOTHER_PACKAGE = {'own_task.md'}
+# They train for half a minute.
+TRAINING = {'notebook.md'}
 
 
 class UnderstoodError(BaseException):
@@ -62,7 +64,14 @@ def _pages_with(find) -> list[Path]:
     return [page for page in pages() if list(find(page.read_text()))]
 
 
-@pytest.mark.parametrize('page', _pages_with(python_blocks), ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    'page',
+    [
+        pytest.param(page, marks=[pytest.mark.release] if page.name in TRAINING else [])
+        for page in _pages_with(python_blocks)
+    ],
+    ids=lambda page: page.name,
+)
 def test_python_runs_as_it_stands(page, episodes):
     """All blocks of a page, one after the other, where the demo has logged episodes."""
     if page.parent.name == 'tutorials':
