@@ -39,7 +39,7 @@ class StopSignals:
     SIGHUP, which a closed terminal sends, only where it is not ignored, as `nohup` has it.
 
     rclpy's own handlers would invalidate the context in the middle of a tick, and the last messages
-    with it. Only the main thread can make one.
+    with it. A thread other than the main one hears of no signal.
 
     Attributes:
         received: Name of the signal that came, None if none did.

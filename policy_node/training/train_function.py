@@ -17,7 +17,12 @@ from policy_node.training.configuration.config_values import typed_fields
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.runs.resumed_config import resumed_config
 from policy_node.training.runs.run import Caller, Ending, OnCycle, train_run
-from policy_node.training.runs.run_folder import BEST_FILE, LATEST_FILE, STATE_FILE
+from policy_node.training.runs.run_folder import (
+    BEST_FILE,
+    LATEST_FILE,
+    STATE_FILE,
+    default_folder,
+)
 from policy_node.training.runs.run_log import read_progress
 
 
@@ -93,7 +98,7 @@ def train(
         config = resumed_config(folder, task, recipe, typed_fields(fields))
     else:
         config = recipe_config(task, recipe or 'best', **typed_fields(fields))
-        folder = Path(output or f'runs/{task}_{config.recipe}_seed{config.seed}')
+        folder = Path(output or default_folder(config))
         if (folder / STATE_FILE).is_file():
             raise ValueError(
                 f'{folder} holds a run: resume=True goes on with it, or choose another'

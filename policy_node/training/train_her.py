@@ -71,8 +71,6 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
     if options.resume is not None:
         if options.output is not None:
             raise ValueError(f'--output excludes --resume: the run goes on in {options.resume}')
-        if overrides.get('init_from'):
-            raise ValueError('--init-from excludes --resume: a run goes on with its own networks')
         from policy_node.training.runs.resumed_config import resumed_config
 
         return resumed_config(options.resume, task, recipe, overrides)
@@ -105,11 +103,12 @@ def _run(options: argparse.Namespace, command: str) -> int:
     require_extra('train')
     from policy_node.training.machine.distributed import is_first_worker
     from policy_node.training.runs.run import train_run
+    from policy_node.training.runs.run_folder import default_folder
 
     try:
         config = config_from_arguments(options)
         output = options.resume or options.output
-        output = output or Path('runs') / f'{config.task}_{config.recipe}_seed{config.seed}'
+        output = output or default_folder(config)
         experience = _read_experience(config, options.from_episodes)
     except (ValueError, TypeError) as error:
         raise UsageError(str(error)) from None

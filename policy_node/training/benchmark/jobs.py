@@ -85,6 +85,13 @@ def differing_fields(stored: Mapping[str, Any], config: TrainConfig) -> dict[str
     }
 
 
+def differing_runs(stored: Mapping[str, Any], config: TrainConfig) -> dict[str, str]:
+    """As `differing_fields`, of runs of two places: where they started from counts as well."""
+    before, now = stored.get('init_from', ''), config.init_from
+    start = {} if before == now else {'init_from': f'init_from {before!r}, now {now!r}'}
+    return {**differing_fields(stored, config), **start}
+
+
 def run_name(task: str, arm: str, seed: int) -> str:
     """Task, arm and seed of a run, as in the path of its folder."""
     return f'{task}/{arm}/seed{seed}'

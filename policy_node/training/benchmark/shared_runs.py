@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies.files import write_files
-from policy_node.training.benchmark.jobs import Job, run_name
+from policy_node.training.benchmark.jobs import Job, differing_runs, run_name
 from policy_node.training.benchmark.stored_runs import ABOUT, StoredRuns, run_of
 from policy_node.training.benchmark.study import Study
 from policy_node.training.runs.run_folder import STATE_FILE
@@ -76,10 +76,9 @@ def _equal_run(job: Job, studies: Path) -> Path | None:
     for state in sorted(studies.glob(pattern)):
         there = Job(job.arm, job.config, state.parent, final_episodes=job.final_episodes)
         try:
-            there.check_configuration()
-            stored = read_state(state).extra['config']
+            differing = differing_runs(read_state(state).extra['config'], job.config)
         except (ValueError, TypeError, OSError):
             continue
-        if there.is_finished and stored.get('init_from', '') == job.config.init_from:
+        if not differing and there.is_finished:
             return state.parent
     return None

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from policy_node.policies.files import to_json
-from policy_node.training.benchmark.jobs import Job, differing_fields, run_name
+from policy_node.training.benchmark.jobs import Job, differing_runs, run_name
 from policy_node.training.benchmark.measures import curve_of, measure_run
 from policy_node.training.benchmark.results import curve_rows, to_csv
 from policy_node.training.benchmark.study import Study
@@ -116,10 +116,7 @@ class StoredRuns:
             task = job.config.task
             for arm in self.tasks.get(task, {'arms': ()})['arms']:
                 stored = self._configured(task, arm, job)
-                differing = differing_fields(stored, job.config)
-                before, now = stored.get('init_from', ''), job.config.init_from
-                if before != now:
-                    differing['init_from'] = f'init_from {before!r}, now {now!r}'
+                differing = differing_runs(stored, job.config)
                 if arm != job.arm.name:
                     differing = {name: text for name, text in differing.items() if name not in own}
                 if differing:
@@ -135,9 +132,7 @@ class StoredRuns:
             wanted = (job.config.task, job.config.seed, job.final_episodes)
             if (task, seed, row['final_episodes']) != wanted:
                 continue
-            stored = self._configured(task, arm, job)
-            same_start = stored.get('init_from', '') == job.config.init_from
-            if same_start and not differing_fields(stored, job.config):
+            if not differing_runs(self._configured(task, arm, job), job.config):
                 return row
         return None
 

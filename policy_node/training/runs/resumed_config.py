@@ -11,10 +11,11 @@ from policy_node.training.configuration.config_values import config_from_dict
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.runs.training_state import read_state
 
-# What networks are made of, and what their values and the replay are of: they stay with a run.
+# What networks are made of or came from, and what their values and the replay are of: all that
+# stays with a run.
 _NETWORK_FIELDS = (
     'hidden_sizes layer_norm goal_features algorithm critics quantiles norm advantage condition '
-    'longest_hold subgoal_every'
+    'longest_hold subgoal_every init_from'
 ).split()
 _EXPERIENCE_FIELDS = 'control_hz reward_type discount gamble'.split()
 
@@ -45,5 +46,5 @@ def resumed_config(
     for name, kind in fixed.items():
         old, new = getattr(before, name), getattr(config, name)
         if old != new:
-            raise ValueError(f'{folder} has {kind} of {name} {old}, which stay; not {new}')
+            raise ValueError(f'{folder} has {kind} of {name} {old!r}, which stay; not {new!r}')
     return config

@@ -25,6 +25,11 @@ LOCK_FILE = '.lock'
 COMMAND_FILE = 'command.txt'
 
 
+def default_folder(config: TrainConfig) -> Path:
+    """Where a run goes that was given no folder."""
+    return Path('runs') / f'{config.task}_{config.recipe}_seed{config.seed}'
+
+
 def companion_file(actor: Path) -> Path:
     """Where the critic of an actor lies, so that training can go on from it."""
     return actor.with_suffix('.training.safetensors')

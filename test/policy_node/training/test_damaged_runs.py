@@ -230,9 +230,12 @@ def test_a_curve_with_no_place_does_not_fail_the_run(
     [
         (['--hidden-sizes', '8,8'], 'has networks of hidden_sizes (16, 16), which stay; not (8, 8'),
         (['--critics', '2'], 'has networks of critics 1, which stay; not 2'),
-        (['--goal-features', 'relative'], 'has networks of goal_features plain, which stay'),
+        (['--goal-features', 'relative'], "has networks of goal_features 'plain', which stay"),
         (['--control-hz', '50'], 'has experience of control_hz 25.0, which stay; not 50.0'),
-        (['--reward-type', 'dense'], 'has experience of reward_type sparse, which stay; not dense'),
+        (
+            ['--reward-type', 'dense'],
+            "has experience of reward_type 'sparse', which stay; not 'dense'",
+        ),
     ],
 )
 def test_networks_and_what_they_learn_from_stay_as_they_are(

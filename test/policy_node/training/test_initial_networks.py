@@ -396,7 +396,6 @@ def test_no_other_task_has_that_recipe() -> None:
     [
         (['--init-from', 'Nobody'], "no actor 'Nobody'; shipped: "),
         (['--init-from', '.'], 'training_state.safetensors is no file'),
-        (['--init-from', 'FetchReach', '--resume', '.'], '--init-from excludes --resume'),
     ],
 )
 def test_a_start_that_is_not_there_is_one_line(

@@ -123,6 +123,8 @@ def test_a_folder_that_holds_a_run_is_left_alone(tmp_path):
         train('FetchReach', tmp_path, total_steps=400, **SMALL)
     with pytest.raises(ValueError, match='is a run of FetchReach, not of FetchPush'):
         train('FetchPush', tmp_path, resume=True, quiet=True)
+    with pytest.raises(ValueError, match="init_from '', which stay; not 'FetchReach'"):
+        train('FetchReach', tmp_path, resume=True, init_from='FetchReach', quiet=True)
     assert (tmp_path / 'training_state.safetensors').read_bytes() == before
 
 

@@ -516,9 +516,9 @@ def test_bad_usage_is_one_line_and_exit_status_2(
         (['--set', 'task=FetchSlide'], 'is a run of FetchReach, not of FetchSlide'),
         (['--recipe', 'paper'], 'is a run of best, not of paper'),
         (['--output', 'elsewhere'], '--output excludes --resume: the run goes on in '),
-        (['--set', 'init_from=FetchReach'], '--init-from excludes --resume'),
+        (['--set', 'init_from=FetchReach'], "networks of init_from '', which stay; not 'FetchR"),
         (['--quantiles', '5'], 'has networks of quantiles 1, which stay; not 5'),
-        (['--condition', 'horizon'], 'has networks of condition none, which stay; not horizon'),
+        (['--condition', 'horizon'], "networks of condition 'none', which stay; not 'horizon'"),
         (['--subgoal-every', '5'], 'has networks of subgoal_every 0, which stay; not 5'),
     ],
 )
