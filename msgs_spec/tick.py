@@ -24,7 +24,7 @@ Phase = Literal['waiting', 'reset', 'running', 'finished']
 PHASES: dict[Phase, str] = {
     'waiting': 'before the first episode',
     'reset': 'at tick 0 of an episode',
-    'running': 'at the ticks between',
+    'running': 'at the ticks between, in `latest_tick` alone',
     'finished': 'at the last tick of an episode that was not given up',
 }
 
@@ -168,8 +168,8 @@ class TickEncoder:
 
         Args:
             tick: The tick.
-            latched: Whether to send `episode_status` too: at the reset, when the episode is
-                finished, and when it changes between.
+            latched: Whether to send `episode_status` too: at the reset, and when the episode is
+                finished.
 
         Raises:
             ValueError: If a vector is missing or has a wrong size.

@@ -23,7 +23,8 @@ START, END = '<!-- interface table -->', '<!-- /interface table -->'
 
 _PUBLISHING = (
     'All messages of a tick carry one stamp. `reward` and `applied_command` start with the first\n'
-    'step of an episode; `episode_status` is sent when it changes, `desired_goal` every tick.'
+    'step of an episode; `episode_status` is sent at the first and the last tick of an episode,\n'
+    'and while the robot waits for its first; `desired_goal` every tick.'
 )
 _VIEWING = (
     'None of them is logged. The scalars of a tick carry its stamp, for plots: '
@@ -155,7 +156,7 @@ def _orders() -> str:
         ('`commands`, `applied_command`, Fetch', _command(FETCH.command)),
         ('`commands`, `applied_command`, hand', _command(SHADOW_HAND.command)),
         ('Fingertips', _names(FINGERTIPS)),
-        ('`episode_status` keys', _names(keys)),
+        ('`episode_status` keys', f'{_names(keys)}, the last where it is not `{JOINT_PREFIX}`'),
         ('Its `phase`', ', '.join(f'`{phase}` {when}' for phase, when in PHASES.items())),
     )
     return '\n'.join(f'- {title}: {text}' for title, text in lines)

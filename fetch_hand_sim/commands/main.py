@@ -6,6 +6,7 @@ The commands are the executables that `ros2 run fetch_hand_sim` also finds, unde
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -97,15 +98,15 @@ def _split(words: Sequence[str]) -> tuple[Command | None, list[str], list[str]]:
 def ros_arguments(words: Sequence[str]) -> list[str]:
     """Returns the arguments of a node; `task:=FetchPush` is enough for `--ros-args -p ...`.
 
-    The same before `--ros-args`, after which ROS has its own words. `__ns:=/left`, which is no
+    ROS has its own words after these, with `--ros-args` or without. `__ns:=/left`, which is no
     parameter but a name of ROS, becomes a remapping.
     """
-    end = words.index('--ros-args') if '--ros-args' in words else len(words)
-    short, rest = words[:end], words[end:]
+    short = list(itertools.takewhile(lambda word: not word.startswith('-'), words))
+    rest = list(words[len(short) :])
     if not short or not all(':=' in word for word in short):
         return list(words)
     given = [part for word in short for part in ('-r' if word.startswith('__') else '-p', word)]
-    return ['--ros-args', *given, *rest[1:]]
+    return ['--ros-args', *given, *(rest[1:] if rest[:1] == ['--ros-args'] else rest)]
 
 
 def make_parser() -> argparse.ArgumentParser:

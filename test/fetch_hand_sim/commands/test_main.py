@@ -85,6 +85,11 @@ def test_an_unknown_command_is_one_line(arguments, line, capsys):
             ['seed:=1', '--ros-args', '-r', 'commands:=c', '--', 'left over'],
             ['--ros-args', '-p', 'seed:=1', '-r', 'commands:=c', '--', 'left over'],
         ),
+        (
+            ['a:=1', '-r', 'commands:=c', '--params-file', 'my.yaml'],
+            ['--ros-args', '-p', 'a:=1', '-r', 'commands:=c', '--params-file', 'my.yaml'],
+        ),
+        (['a:=1', 'left over', '-r', 'b:=c'], ['a:=1', 'left over', '-r', 'b:=c']),
         (['__ns:=/left', 'a:=1'], ['--ros-args', '-r', '__ns:=/left', '-p', 'a:=1']),
         (['--task', 'a:=1'], ['--task', 'a:=1']),
         (['--help'], ['--help']),
