@@ -50,7 +50,10 @@ GET_FEATURES = _interface(
 GET_STATE = _interface('~/get_simulation_state', 'GetSimulationState', 'Playing or paused.')
 SET_STATE = _interface('~/set_simulation_state', 'SetSimulationState', 'As `~/pause`.')
 RESET_SIMULATION = _interface(
-    '~/reset_simulation', 'ResetSimulation', 'As `~/reset`; time is never set back.'
+    '~/reset_simulation',
+    'ResetSimulation',
+    'As `~/reset` (scope state), or begins the series again, with the `seed` as it is set then; '
+    'time is never set back.',
 )
 STEP_SIMULATION = _interface(
     '~/step_simulation',

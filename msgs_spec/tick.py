@@ -14,9 +14,9 @@ from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_status
 from msgs_spec.observations import Readings
-from msgs_spec.robots import JOINT_PREFIX
+from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.schemas import serialize
-from msgs_spec.tasks import TaskSpec
+from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, TaskSpec
 from msgs_spec.topics import TopicSpec, topics
 
 Phase = Literal['waiting', 'reset', 'running', 'finished']
@@ -102,9 +102,20 @@ class EpisodeStatus:
             )
         except (KeyError, ValueError) as error:
             raise ValueError(f'episode_status with unreadable value: {error}') from None
-        if not 0.0 < status.control_hz < math.inf:
-            raise ValueError(f'episode_status with control_hz {status.control_hz}')
+        status._require_known()
         return status
+
+    def _require_known(self) -> None:
+        """Refuses what nobody could go by."""
+        if not 0.0 < self.control_hz < math.inf:
+            raise ValueError(f'episode_status with control_hz {self.control_hz}')
+        for name, allowed in (('reward_type', REWARD_TYPES), ('success_rule', SUCCESS_RULES)):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f'episode_status with {name} {getattr(self, name)[:40]!r}')
+        if len(self.joint_prefix) > LONGEST_JOINT_PREFIX:
+            raise ValueError(
+                f'episode_status with joint_prefix of {len(self.joint_prefix)} characters'
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

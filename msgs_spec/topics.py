@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import lru_cache, partial
 from typing import Literal
 
 from msgs_spec.robots import FINGERTIPS
@@ -236,7 +236,8 @@ LATEST_TICK = TopicSpec(
 MONITORING = (DIAGNOSTICS, REAL_TIME_FACTOR, LATEST_TICK)
 
 
-@cache
+# Of any number of names of joints, which whoever publishes may choose.
+@lru_cache(maxsize=256)
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Returns all topics of a task.
 

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fetch_hand_sim.commands.picture_size import picture_size
-from fetch_hand_sim.datasets import lerobot_columns, minari
+from fetch_hand_sim.datasets import minari
 from fetch_hand_sim.datasets.parquet import export_parquet
-from fetch_hand_sim.datasets.writing import ByTask
+from fetch_hand_sim.datasets.writing import ByTask, why_apart
 from fetch_hand_sim.episode_log import (
     EpisodeArrays,
     EpisodeReadError,
@@ -116,10 +116,7 @@ def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: s
         return ''
     if len(episode) == 0:
         return f'no step was taken, and {_TITLES[to]} needs one'
-    if not others:
-        return ''
-    why_apart = {'minari': minari.why_apart, 'lerobot': lerobot_columns.why_apart}[to]
-    return why_apart(episode, others[0])
+    return why_apart(episode, others[0]) if others else ''
 
 
 def _export(options: argparse.Namespace, by_task: dict[str, list[EpisodeArrays]]) -> dict[str, str]:

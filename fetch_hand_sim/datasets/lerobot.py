@@ -23,6 +23,7 @@ from fetch_hand_sim.datasets.writing import (
     ByTask,
     ExportError,
     alone_in,
+    move_all,
     require_module,
     require_new,
 )
@@ -51,7 +52,7 @@ def export_lerobot(
 
     Args:
         by_task: Episodes, at least one of each task, each with a step, and none that is apart from
-            the first of its task, see `lerobot_columns.why_apart`.
+            the first of its task, see `writing.why_apart`.
         directory: Where to write.
         camera: Whose films are part of it; None for none.
 
@@ -74,8 +75,7 @@ def export_lerobot(
                 for task, episodes in by_task.items():
                     rate = episodes[0].record.control_hz
                     _Dataset(Path(hidden) / task, episodes[0].spec, rate, camera).write(episodes)
-                for task, target in targets.items():
-                    (Path(hidden) / task).rename(target)
+                move_all({Path(hidden) / task: target for task, target in targets.items()})
     except OSError as error:
         raise ExportError(f'{directory}: {error.strerror or error}') from error
     return targets

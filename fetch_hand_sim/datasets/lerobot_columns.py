@@ -22,14 +22,6 @@ _OBJECT = 'object'
 _COUNTS = ('frame_index', 'episode_index', 'index', 'task_index')
 
 
-def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
-    """Returns why an episode cannot be in the dataset of another of its task, '' if it can."""
-    rate, other = episode.record.control_hz, first.record.control_hz
-    if rate == other:
-        return ''
-    return f'{rate:g} Hz, and {other:g} Hz in {first.path}; a LeRobot dataset has one rate'
-
-
 def features(spec: TaskSpec) -> dict[str, dict[str, Any]]:
     """The columns of a task's dataset as `meta/info.json` has them: type, shape, names."""
     robot, rest = _parts(spec)

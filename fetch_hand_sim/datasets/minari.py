@@ -23,6 +23,7 @@ from fetch_hand_sim.datasets.writing import (
     ByTask,
     ExportError,
     alone_in,
+    move_all,
     require_module,
     require_new,
 )
@@ -36,22 +37,6 @@ _DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
 _VERSION = re.compile(r'-v\d+$')
 # Minari's: where datasets live, and what is in the directories above one.
 _MINARI_PATH, _NAMESPACE = 'MINARI_DATASETS_PATH', 'namespace_metadata.json'
-# Of a record, what `_environment` is made of.
-_OF_THE_ENVIRONMENT = ('control_hz', 'timing', 'reward_type', 'success_rule')
-
-
-def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
-    """Returns why an episode cannot be in the Minari dataset of another of its task, '' if it can.
-
-    A dataset has one environment, whose rewards and rate are those of all its episodes.
-    """
-    one, other = episode.record, first.record
-    for name in _OF_THE_ENVIRONMENT:
-        if getattr(one, name) != getattr(other, name):
-            here, there = getattr(one, name), getattr(other, name)
-            why = f'{name} {here}, and {there} in {first.path}'
-            return f'{why}; a Minari dataset has one environment'
-    return ''
 
 
 def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]:
@@ -59,7 +44,7 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
 
     Args:
         by_task: Episodes, at least one of each task, and none that is apart from the first of its
-            task, see `why_apart`.
+            task, see `writing.why_apart`.
         directory: Where Minari datasets live (`MINARI_DATASETS_PATH`).
         name: Of the dataset, such as `logged-v0` or `me/logged-v0`; the task comes before it, and a
             version after it if it has none.
@@ -130,7 +115,7 @@ def _create_dataset(
 def _appearing(directory: Path, dataset_ids: Sequence[str]) -> Iterator[None]:
     """Minari writes into a hidden folder meanwhile; what is whole at the end moves to its place."""
     # Minari joins a relative path to itself.
-    directory = directory.resolve()
+    directory, before = directory.resolve(), os.environ.get(_MINARI_PATH)
     with TemporaryDirectory(prefix='.', suffix='.partial', dir=directory) as hidden:
         os.environ[_MINARI_PATH] = hidden
         try:
@@ -139,14 +124,16 @@ def _appearing(directory: Path, dataset_ids: Sequence[str]) -> Iterator[None]:
                 warnings.filterwarnings('ignore', module='minari')
                 yield
         finally:
-            os.environ[_MINARI_PATH] = str(directory)
+            if before is None:
+                del os.environ[_MINARI_PATH]
+            else:
+                os.environ[_MINARI_PATH] = before
         for source in Path(hidden).rglob(_NAMESPACE):
             target = directory / source.relative_to(hidden)
             target.parent.mkdir(parents=True, exist_ok=True)
             if not target.exists():
                 source.replace(target)
-        for dataset_id in dataset_ids:
-            (Path(hidden) / dataset_id).rename(directory / dataset_id)
+        move_all({Path(hidden) / each: directory / each for each in dataset_ids})
 
 
 def _environment(episode: EpisodeArrays) -> Any:

@@ -6,7 +6,6 @@ Needs the extra `[data]`. Values are those of `load_episodes`, float64, unchange
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from fetch_hand_sim.datasets.writing import (
     ByTask,
     ExportError,
     alone_in,
+    move_all,
     require_module,
     require_new,
 )
@@ -76,8 +76,7 @@ def _write_tables(parquet: Any, tables: Mapping[Path, Any]) -> None:
         for path, table in tables.items():
             with hidden[path].open('wb') as stream:
                 parquet.write_table(table, stream, compression='zstd')
-        for path in tables:
-            os.replace(hidden[path], path)
+        move_all({hidden[path]: path for path in tables})
     finally:
         for partial in hidden.values():
             partial.unlink(missing_ok=True)

@@ -12,12 +12,30 @@ from typing import Any
 
 from fetch_hand_sim.episode_log import EpisodeArrays
 from msgs_spec.command_line import CommandError
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
 ByTask = Mapping[str, Sequence[EpisodeArrays]]
+
+_SETTINGS = ('control_hz', 'timing', 'reward_type', 'success_rule')
 
 
 class ExportError(CommandError):
     """A dataset cannot be written; the message is one line."""
+
+
+def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
+    """Returns why an episode cannot be in a dataset with another of its task, '' if it can.
+
+    Minari's has one environment, LeRobot's one rate, and a column of rewards means one thing.
+    """
+    for name in _SETTINGS:
+        if name == 'timing' and episode.record.control_hz == DEFAULT_CONTROL_HZ:
+            # Both mean the same there, and logs of 1.0 do not say it.
+            continue
+        here, there = getattr(episode.record, name), getattr(first.record, name)
+        if here != there:
+            return f'{name} {here}, and {there} in {first.path}; a dataset has one'
+    return ''
 
 
 def require_module(module: str) -> Any:
@@ -54,3 +72,24 @@ def require_new(paths: Iterable[Path]) -> None:
     for path in paths:
         if path.exists():
             raise ExportError(f'{path} exists; nothing is overwritten')
+
+
+def move_all(targets: Mapping[Path, Path]) -> None:
+    """Gives files or folders their names; where one cannot have it, none has.
+
+    Args:
+        targets: By where each is now, on the same disk, where it is to be.
+
+    Raises:
+        OSError: If one cannot be moved.
+    """
+    moved: list[Path] = []
+    try:
+        for source, target in targets.items():
+            source.rename(target)
+            moved.append(source)
+    except BaseException:
+        for source in moved:
+            with suppress(OSError):
+                targets[source].rename(source)
+        raise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -108,12 +108,12 @@ def load_episode(path: Path) -> EpisodeArrays:
         raise EpisodeReadError(f'{file.path}: no readable episode: {error}') from error
 
 
-@cache
+@lru_cache(maxsize=256)
 def _codec(task: TaskSpec, name: str) -> TopicCodec:
     return TopicCodec(topic(task, name))
 
 
-@cache
+@lru_cache(maxsize=256)
 def _assembler(task: TaskSpec, control_hz: float) -> ObservationAssembler:
     return ObservationAssembler(task, control_hz)
 

@@ -26,6 +26,8 @@ MAX_RECORDS = 300_000
 # A metadata record, and what a writer takes for it, which YAML may write ten times as long.
 MAX_RECORD_BYTES = 2**20
 MAX_METADATA_BYTES = 2**16
+# Metadata records of a file; a robot writes two, and rosbag2 another.
+MAX_METADATA_RECORDS = 16
 # All attachments of a file, and the file; a compiled model has 3 MB.
 MAX_ATTACHMENT_BYTES = 64 * 2**20
 MAX_FILE_BYTES = 128 * 2**20

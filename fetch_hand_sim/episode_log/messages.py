@@ -17,7 +17,13 @@ from mcap.records import Channel, Chunk, Metadata
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
-from fetch_hand_sim.episode_log.limits import MAX_MESSAGES, MAX_RECORDS, MAX_UNPACKED_BYTES
+from fetch_hand_sim.episode_log.limits import (
+    MAX_MESSAGES,
+    MAX_METADATA_RECORDS,
+    MAX_RECORD_BYTES,
+    MAX_RECORDS,
+    MAX_UNPACKED_BYTES,
+)
 from fetch_hand_sim.episode_log.reader import mcap_file, one_line_errors
 from fetch_hand_sim.episode_log.untrusted import RECORD, require_size, unpack
 
@@ -111,7 +117,11 @@ class _Scan:
         self._sizes: dict[int, list[int]] = defaultdict(list)
 
     def take(self, buffer: mmap.mmap) -> None:
+        metadata = 0
         for opcode, content in _data_section(buffer):
+            metadata += opcode == Opcode.METADATA
+            if metadata > MAX_METADATA_RECORDS:
+                raise ValueError(f'more than {MAX_METADATA_RECORDS} metadata records')
             if opcode == Opcode.CHUNK:
                 self._take_chunk(Chunk.read(ReadDataStream(BytesIO(content))))
             elif opcode == Opcode.METADATA:
@@ -139,6 +149,8 @@ class _Scan:
             if following > end:
                 raise ValueError('a record is longer than its chunk')
             if opcode == Opcode.MESSAGE:
+                if size < _HEADER:
+                    raise ValueError('a message is shorter than its header')
                 offsets[channel].append(base + position)
                 sizes[channel].append(size)
                 self._messages += 1
@@ -165,6 +177,8 @@ def _data_section(buffer: mmap.mmap) -> Iterator[tuple[int, bytes]]:
             raise ValueError('a record is longer than the file')
         if opcode == Opcode.DATA_END:
             return
+        if opcode == Opcode.METADATA and size > MAX_RECORD_BYTES:
+            raise ValueError(f'record of {size} bytes; allowed: up to {MAX_RECORD_BYTES}')
         if opcode in (Opcode.CHUNK, Opcode.METADATA):
             yield opcode, buffer[start:position]
     raise ValueError('no end of data')

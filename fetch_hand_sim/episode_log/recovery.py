@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -152,7 +153,10 @@ def recover_episode(leftover: Path) -> Path | None:
 def _recover(leftover: Path, name: str) -> Path | None:
     file, final = durable.bag_file(leftover, name), leftover.parent / name
     if not file.exists():
-        _clear_away(leftover)
+        # A robot may begin its file right now: what it has just made stays, and so does the folder.
+        durable.rewritten_file(file).unlink(missing_ok=True)
+        durable.metadata_file(leftover).unlink(missing_ok=True)
+        _remove_empty(leftover)
         return None
     with durable.open_regular(file) as torn:
         # Whoever recovers it holds the file and its replacement; after that it is another one.
@@ -171,6 +175,15 @@ def _recover(leftover: Path, name: str) -> Path | None:
 
 def _in_use(leftover: Path) -> EpisodeInUseError:
     return EpisodeInUseError(f'{leftover} is being written, or another process has recovered it')
+
+
+def _remove_empty(leftover: Path) -> None:
+    try:
+        leftover.rmdir()
+    except OSError as error:
+        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+            raise _in_use(leftover) from None
+        raise
 
 
 def _clear_away(leftover: Path) -> None:

@@ -28,6 +28,7 @@ from fetch_hand_sim.episode_log.limits import (
     MAX_FILE_BYTES,
     MAX_MESSAGE_BYTES,
     MAX_MESSAGES,
+    MAX_METADATA_RECORDS,
     MAX_RECORD_BYTES,
     MAX_RECORDS,
     MAX_TOPICS,
@@ -165,6 +166,7 @@ class Records(StreamReader):
         )
         self._wanted = wanted
         self._records_left = MAX_RECORDS
+        self._metadata_left = MAX_METADATA_RECORDS
 
     def _read_record(self, opcode: int, length: int) -> McapRecord | None:
         self._records_left -= 1
@@ -173,6 +175,10 @@ class Records(StreamReader):
         if opcode not in self._wanted:
             self._stream.read(length)
             return None
+        if opcode == Opcode.METADATA:
+            self._metadata_left -= 1
+            if self._metadata_left < 0:
+                raise ValueError(f'more than {MAX_METADATA_RECORDS} metadata records')
         if opcode not in _LONG and length > MAX_RECORD_BYTES:
             raise ValueError(f'record of {length} bytes; allowed: up to {MAX_RECORD_BYTES}')
         return super()._read_record(opcode, length)

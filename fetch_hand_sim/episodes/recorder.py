@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from queue import Queue
 from threading import Semaphore, Thread
 
 from fetch_hand_sim.episode_log import (
@@ -87,6 +87,7 @@ class EpisodeRecorder:
     ) -> None:
         self.has_failed = False
         self.waited_s = 0.0
+        self._untold = Semaphore(1)
         self._metadata = metadata
         self._on_error = on_error
         self._on_slow = on_slow
@@ -128,7 +129,7 @@ class EpisodeRecorder:
         self._end(reason)
         self._backlog.close()
         self._thread.join(_LAST_CHANCE if self.has_failed else None)
-        self._files.close()
+        self._files.close(_LAST_CHANCE if self.has_failed else None)
 
     def _end(self, reason: str | None) -> None:
         """Completes the running episode, if there is one; with a reason, marked as cut short."""
@@ -159,10 +160,11 @@ class EpisodeRecorder:
             )
 
     def _fail(self, line: str) -> None:
+        # First of all: what is put into the backlog after it was cleared is not waited for.
+        self.has_failed = True
         self._status = None
         self._backlog.clear()
-        if not self.has_failed:
-            self.has_failed = True
+        if self._untold.acquire(blocking=False):
             self._on_error(line)
 
     def _write(self) -> None:
@@ -172,7 +174,7 @@ class EpisodeRecorder:
                 write = self._backlog.take(_FLUSH_AFTER) or self._files.flush
                 if not self.has_failed:
                     self._try(write)
-                if not self._files.has_unflushed:
+                if self.has_failed or not self._files.has_unflushed:
                     self._backlog.note_saved()
         except BaseException:
             self._fail('episode log stopped: an error in the program')
@@ -203,7 +205,10 @@ class _EpisodeFiles:
         self._on_error = on_error
         self._on_logged = on_logged
         self._writer: EpisodeWriter | None = None
-        self._storing = ThreadPoolExecutor(max_workers=1, thread_name_prefix='episode_store')
+        # A thread that a disk holds up for ever must not hold up the end of the process.
+        self._unstored: Queue[Callable[[], None] | None] = Queue()
+        self._storing = Thread(target=self._store_all, name='episode_store', daemon=True)
+        self._storing.start()
         self._room = Semaphore(_MAX_UNSTORED)
 
     @property
@@ -236,11 +241,21 @@ class _EpisodeFiles:
         if self._writer is not None:
             writer, self._writer = self._writer, None
             writer.end(episode_result(status), reason)
-            self._storing.submit(self._store, writer, status, reason is None)
+            self._unstored.put(partial(self._store, writer, status, reason is None))
 
-    def close(self) -> None:
-        """Waits until all files are on the disk."""
-        self._storing.shutdown(wait=True)
+    def close(self, seconds: float | None) -> None:
+        """Waits until all files are on the disk; so long at most, None for as long as it takes."""
+        self._unstored.put(None)
+        self._storing.join(seconds)
+
+    def _store_all(self) -> None:
+        """Stores files until there are no more; runs in a thread of its own."""
+        try:
+            while (store := self._unstored.get()) is not None:
+                store()
+        except BaseException:
+            self._on_error('episode log stopped: an error in the program')
+            raise
 
     def _store(self, writer: EpisodeWriter, status: EpisodeStatus, is_complete: bool) -> None:
         try:

@@ -102,6 +102,7 @@ class EpisodeRunner:
         """Gives the next episode to start a seed, and those after it the seeds that follow."""
         following = self.episode if self.is_between_episodes else self.episode + 1
         self._new_first_seed = seed - following
+        self._series_seed = seed - self._first_episode
 
     def set_goal(self, goal: Array) -> None:
         """Replaces the goal (goal size,) of the running episode from the next tick on.
@@ -125,7 +126,10 @@ class EpisodeRunner:
             self._finish()
 
     def start_over(self) -> None:
-        """Gives the series up: the next tick starts its first episode again, and time goes on."""
+        """Gives the series up: the next tick starts its first episode again, and time goes on.
+
+        With its first seed, or the one that was given last.
+        """
         self.is_between_episodes = True
         self.episode = self._first_episode
         self._first_seed, self._new_first_seed = self._series_seed, None

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode
 from fetch_hand_sim.episode_log.messages import MessageFile, read_messages
@@ -64,8 +66,8 @@ def recording_of(arrays: EpisodeArrays) -> Recording:
     ticks = len(arrays) + 1
     task = arrays.record.task
     messages = read_messages(arrays.path)
-    joints = _vectors(messages, task, 'joint_states', ticks)[:, : len(task.robot.joints)]
-    poses = _object_poses(messages, arrays, ticks)
+    joints = _vectors(messages, arrays, 'joint_states')[:, : len(task.robot.joints)]
+    poses = _vectors(messages, arrays, 'object_pose') if arrays.spec.has_object else None
     achieved, desired = arrays.observations['achieved_goal'], arrays.goals
     frames = [
         Frame(
@@ -81,20 +83,19 @@ def recording_of(arrays: EpisodeArrays) -> Recording:
     return Recording(arrays, frames, times, arrays.path.stem.removesuffix('_0'))
 
 
-def _object_poses(messages: MessageFile, arrays: EpisodeArrays, ticks: int) -> Array | None:
-    if not arrays.spec.has_object:
-        return None
-    return _vectors(messages, arrays.record.task, 'object_pose', ticks)
-
-
-def _vectors(messages: MessageFile, task: TaskSpec, name: str, ticks: int) -> Array:
-    """The vectors (ticks, size) of a topic that every tick has; `task` names the joints."""
+def _vectors(messages: MessageFile, arrays: EpisodeArrays, name: str) -> Array:
+    """The vectors (N + 1, size) of a topic that every tick has, with the stamp of the tick."""
     resolved = next((each for each in messages.offsets if each.rpartition('/')[2] == name), name)
+    # Of an episode that was cut off, the last tick may be there in part.
+    stamps = arrays.stamps
     try:
-        rows = messages.rows(resolved).data[:ticks]
-        return TopicCodec(topic(task, name)).decode_many(rows)[1]
+        rows = messages.rows(resolved).data[: len(stamps)]
+        given, vectors = TopicCodec(topic(arrays.record.task, name)).decode_many(rows)
     except (ValueError, KeyError) as error:
         raise EpisodeReadError(f'{messages.path}: no readable {name}: {error}') from error
+    if not np.array_equal(given, stamps):
+        raise EpisodeReadError(f'{messages.path}: {name} is missing at some ticks')
+    return vectors
 
 
 def load_recordings(

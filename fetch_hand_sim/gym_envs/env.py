@@ -9,7 +9,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Image, Pictures, check_render_mode
+from fetch_hand_sim.gym_envs.pictures import (
+    RENDER_MODES,
+    Image,
+    Pictures,
+    check_render_mode,
+    render_fps,
+)
 from fetch_hand_sim.gym_envs.shared_physics import SharedPhysics
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
@@ -74,7 +80,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             keeps_data=True,
         )
         self.spec_of_task = self.simulation.spec
-        self.metadata = {**self.metadata, 'render_fps': round(control_hz)}
+        self.metadata = {**self.metadata, 'render_fps': render_fps(control_hz)}
         self.observation_space = observation_space(self.spec_of_task)
         self.action_space = action_space(self.spec_of_task)
         self.render_mode = render_mode

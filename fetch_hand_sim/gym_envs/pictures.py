@@ -29,6 +29,11 @@ Image = NDArray[np.uint8] | NDArray[np.float32]
 RENDER_MODES = ['human', 'rgb_array', 'depth_array']
 
 
+def render_fps(control_hz: float) -> int | float:
+    """Pictures per second of a film that shows every step; whole numbers as `int`."""
+    return int(control_hz) if control_hz == int(control_hz) else control_hz
+
+
 class Pictures:
     """Draws copies of a simulation; opens OpenGL or a window at the first picture.
 

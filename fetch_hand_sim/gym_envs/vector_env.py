@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episodes.robot_episode import has_ended
-from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures, check_render_mode
+from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures, check_render_mode, render_fps
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
@@ -101,7 +101,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self.metadata = {
             **self.metadata,
             'autoreset_mode': self.autoreset_mode,
-            'render_fps': round(control_hz),
+            'render_fps': render_fps(control_hz),
         }
         self.single_observation_space = observation_space(self.spec_of_task)
         self.single_action_space = action_space(self.spec_of_task)
@@ -222,11 +222,17 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """The random generator of every environment, (N,), live."""
+        for index, seed in enumerate(self._seeds):
+            if seed is None:
+                # Who holds it before the first episode finds that drawn from it, too.
+                fresh, self._seeds[index] = seeding.np_random()
+                held = self.simulation.generator(index)
+                held.bit_generator.state = fresh.bit_generator.state
         return tuple(self.simulation.generator(i) for i in range(self.num_envs))
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
-        """The seed of every environment's random generator, (N,); -1 before its first episode."""
+        """The seed of every environment's random generator, (N,); -1 before there is one."""
         return tuple(-1 if seed is None else seed for seed in self._seeds)
 
     def render(self) -> tuple[Any, ...] | None:

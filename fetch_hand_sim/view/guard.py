@@ -119,8 +119,9 @@ class Guard:
         return self._matches(given)
 
     def _matches(self, given: Sequence[str] | None) -> bool:
-        token = self.token or ''
-        return any(hmac.compare_digest(each.encode(), token.encode()) for each in given or ())
+        # Bytes that are no text come as lone surrogates.
+        words = [each.encode('utf-8', 'surrogatepass') for each in given or ()]
+        return any(hmac.compare_digest(each, (self.token or '').encode()) for each in words)
 
 
 def _host_name(host: str) -> str:

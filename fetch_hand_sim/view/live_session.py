@@ -150,7 +150,7 @@ def _check_alive(nodes: list[subprocess.Popen[str]], log: IO[str], stop: StopSig
     """Raises what a node said before it ended by itself."""
     ended = [node for node in nodes if node.poll() is not None]
     if ended and not stop:
-        lines = Path(log.name).read_text().strip().splitlines()[-_LAST_LINES:]
+        lines = Path(log.name).read_text(errors='replace').strip().splitlines()[-_LAST_LINES:]
         raise NodeFailure(f'a node ended with exit code {ended[0].poll()}: {" / ".join(lines)}')
 
 

@@ -150,6 +150,9 @@ def test_status_survives_exactly():
         ({'control_hz': '-1'}, 'episode_status with control_hz -1.0'),
         ({'control_hz': 'nan'}, 'episode_status with control_hz nan'),
         ({'is_success': 'yes'}, "episode_status with unreadable value: 'yes'"),
+        ({'success_rule': 'strict'}, "episode_status with success_rule 'strict'"),
+        ({'reward_type': 'x' * 50}, f"episode_status with reward_type '{'x' * 40}'"),
+        ({'joint_prefix': 'x' * 65}, 'episode_status with joint_prefix of 65 characters'),
     ],
 )
 def test_unreadable_status_is_refused(change, message):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.commands import export_episodes
+from fetch_hand_sim.datasets.writing import move_all
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
 from policy_node.training import generate_episodes
 from support.episode_recorder import Recorder
@@ -265,3 +267,26 @@ def test_usage_errors(tmp_path, capsys):
     with pytest.raises(SystemExit) as caught:
         export_episodes.main([str(tmp_path), '--to', 'paper', '--output', 'x'])
     assert caught.value.code == 2
+
+
+def test_of_several_moves_all_are_made_or_none(tmp_path):
+    for name in ('a', 'b'):
+        (tmp_path / name).mkdir()
+    targets = {tmp_path / 'a': tmp_path / 'c', tmp_path / 'b': tmp_path / 'nowhere' / 'd'}
+    with pytest.raises(FileNotFoundError):
+        move_all(targets)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ['a', 'b']
+    targets[tmp_path / 'b'] = tmp_path / 'd'
+    move_all(targets)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ['c', 'd']
+
+
+@pytest.mark.parametrize('before', [None, '/data/mine'])
+def test_minari_looks_afterwards_where_it_looked_before(before, episodes, tmp_path, monkeypatch):
+    pytest.importorskip('minari')
+    monkeypatch.delenv('MINARI_DATASETS_PATH', raising=False)
+    if before is not None:
+        monkeypatch.setenv('MINARI_DATASETS_PATH', before)
+    arguments = [str(episodes), '--to', 'minari', '--output', str(tmp_path)]
+    assert export_episodes.main(arguments) == 0
+    assert os.environ.get('MINARI_DATASETS_PATH') == before

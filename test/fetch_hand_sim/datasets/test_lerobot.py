@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,9 @@ import pytest
 from fetch_hand_sim.commands import export_episodes
 from fetch_hand_sim.datasets import lerobot
 from fetch_hand_sim.datasets.lerobot_film import color_statistics
+from fetch_hand_sim.datasets.writing import why_apart
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
+from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.films.pictures import Studio
 from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.simulation.opengl import prepare_opengl
@@ -199,7 +202,23 @@ def test_episodes_of_another_rate_are_left_out(tmp_path, capsys):
     assert _export(tmp_path / 'logged', tmp_path / 'out') == 1
     printed = capsys.readouterr()
     assert '1 episodes of FetchReach' in printed.out
-    assert '50 Hz, and 25 Hz in' in printed.err and 'has one rate' in printed.err
+    assert 'control_hz 50.0, and 25.0 in' in printed.err and 'a dataset has one' in printed.err
+
+
+@pytest.mark.parametrize(
+    ('rate', 'changes', 'said'),
+    [
+        (25.0, {'reward_type': 'dense'}, 'reward_type dense, and sparse in'),
+        (25.0, {'success_rule': 'paper'}, 'success_rule paper, and gymnasium in'),
+        (25.0, {'timing': 'ticks'}, ''),
+        (50.0, {'timing': 'ticks'}, 'timing ticks, and seconds in'),
+    ],
+)
+def test_what_a_dataset_has_one_of(rate, changes, said, tmp_path):
+    first = load_episode(Recorder('FetchReach', rate).record(EpisodeDirectory(tmp_path)))
+    other = replace(first, record=replace(first.record, **changes))
+    assert why_apart(first, first) == ''
+    assert why_apart(other, first).startswith(said) and bool(why_apart(other, first)) == bool(said)
 
 
 def test_all_tasks_are_written_or_none(episodes, tmp_path, capsys):

@@ -34,6 +34,7 @@ from fetch_hand_sim.episode_log import (
     read_episode,
     read_summary,
     recover_episode,
+    recovery,
 )
 from msgs_spec.schemas import deserialize
 from support import SUPPORT, script_environment
@@ -494,3 +495,26 @@ def test_writing_costs_little_of_a_tick(tmp_path, recorder, ticks):
     per_tick = (time.process_time() - started) / len(ticks)
     writer.finish({})
     assert per_tick < 0.005
+
+
+def test_a_robot_that_begins_its_file_while_the_rest_is_cleared_away_keeps_it(
+    tmp_path, monkeypatch
+):
+    leftover = durable.active_path(tmp_path, 'FetchReach_000000_seed0')
+    leftover.mkdir()
+    file = durable.bag_file(leftover, 'FetchReach_000000_seed0')
+    remove = recovery._remove_empty
+
+    def begins(path):
+        file.write_bytes(b'begun')
+        remove(path)
+
+    # A moment after recovery has seen that there is no file.
+    monkeypatch.setattr(recovery, '_remove_empty', begins)
+    with pytest.raises(EpisodeInUseError):
+        recover_episode(leftover)
+    assert file.read_bytes() == b'begun'
+    file.unlink()
+    monkeypatch.setattr(recovery, '_remove_empty', remove)
+    assert recover_episode(leftover) is None
+    assert not leftover.exists()

@@ -229,3 +229,69 @@ def chunks(path: Path) -> list[Chunk]:
             r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)
         )
     return found
+
+
+def test_a_recorder_that_has_failed_idles(
+    tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What comes into the backlog after it was cleared is not saved, and not waited for."""
+
+    def fail(writer: EpisodeWriter) -> Path:
+        raise EpisodeLogError('episode log stopped: disk full')
+
+    monkeypatch.setattr(EpisodeWriter, 'store', fail)
+    errors: list[str] = []
+    recorder = EpisodeRecorder(
+        tmp_path,
+        metadata=lambda status: METADATA,
+        on_error=errors.append,
+        on_logged=lambda episode: None,
+    )
+    for tick in (*ticks, ticks[0]):
+        recorder.record(*tick)
+    until(lambda: bool(errors))
+    recorder._backlog.put(lambda: None)
+    began = time.process_time()
+    time.sleep(0.5)
+    assert time.process_time() - began < 0.25
+    recorder.close('end')
+    assert errors == ['episode log stopped: disk full']
+
+
+def test_a_disk_that_has_failed_holds_the_end_up_no_longer_than_said(
+    tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, gone_on, stored = (threading.Event() for _ in range(3))
+    store = EpisodeWriter.store
+
+    def late(writer: EpisodeWriter) -> Path | None:
+        begun.set()
+        gone_on.wait(20.0)
+        path = store(writer)
+        stored.set()
+        return path
+
+    monkeypatch.setattr(EpisodeWriter, 'store', late)
+    monkeypatch.setattr(recorder_module, '_LAST_CHANCE', 0.1)
+    recorder = EpisodeRecorder(
+        tmp_path,
+        metadata=lambda status: METADATA,
+        on_error=lambda line: None,
+        on_logged=lambda episode: None,
+    )
+    for tick in ticks:
+        recorder.record(*tick)
+    assert begun.wait(10.0)
+    recorder._fail('episode log stopped: as another file says')
+    began = time.monotonic()
+    recorder.close('end')
+    assert time.monotonic() - began < 2.0
+    gone_on.set()
+    assert stored.wait(10.0)
+
+
+def until(is_true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10.0
+    while not is_true():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)

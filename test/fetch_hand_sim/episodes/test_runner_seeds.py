@@ -60,3 +60,14 @@ def test_a_number_of_episodes_counts_from_the_first_of_them(simulation):
         assert not runner.is_done
         run_episode(runner)
     assert runner.is_done
+
+
+@pytest.mark.parametrize('episodes', [0, 2])
+def test_a_series_that_begins_again_has_the_seed_that_was_set_last(simulation, episodes):
+    runner = EpisodeRunner(simulation, first_seed=3, first_episode=4)
+    runner.set_next_seed(100)
+    for _ in range(episodes):
+        run_episode(runner)
+    runner.start_over()
+    assert (runner.episode, runner.seed) == (4, 100)
+    assert [run_episode(runner)[0].status.seed for _ in range(2)] == [100, 101]

@@ -17,13 +17,14 @@ from PIL import Image
 
 import fetch_hand_sim
 from fetch_hand_sim.commands.render_episode import main as render_episode
-from fetch_hand_sim.episode_log import EpisodeDirectory
+from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError, load_episodes
 from fetch_hand_sim.films.film import check_kind, check_size, write_film, write_picture
 from fetch_hand_sim.films.pictures import Studio, grid, sheets, tile, with_frame
 from fetch_hand_sim.films.playing import Film, film_episode
 from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from msgs_spec.command_line import CommandError, UsageError
+from support.crafted_files import Crafter
 from support.episode_recorder import Recorder
 from support.full_disk import files_at_most
 
@@ -118,6 +119,32 @@ def test_mp4_holds_every_picture(tmp_path):
     frames = imageio.imread(path)
     assert frames.shape == (5, 100, 140, 3)
     assert np.abs(frames.mean(axis=(1, 2, 3)) - 40.0 * np.arange(5)).max() < 6.0
+
+
+def test_the_last_picture_of_an_mp4_is_where_its_time_says(tmp_path):
+    """To the tenth of a millisecond, at a rate that no few digits say."""
+    ffmpeg = pytest.importorskip('imageio_ffmpeg').get_ffmpeg_exe()
+    path, rate, count = tmp_path / 'film.mp4', 500 / 11, 6000
+    picture = np.zeros((16, 16, 3), dtype=np.uint8)
+    write_film(path, (picture for _ in range(count)), fps=rate)
+    command = [ffmpeg, '-i', path, '-vf', 'showinfo', '-f', 'null', '-']
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+    times = [float(each) for each in re.findall(r'pts_time:([\d.]+)', said)]
+    assert len(times) == count
+    np.testing.assert_allclose(times, np.arange(count) / rate, atol=1e-4)
+
+
+@pytest.mark.parametrize('side', [10, 60, 224])
+def test_what_ffmpeg_says_is_not_lost_with_the_pipe(side, tmp_path, monkeypatch):
+    pytest.importorskip('imageio_ffmpeg')
+    ffmpeg = tmp_path / 'ffmpeg'
+    ffmpeg.write_text('#!/bin/sh\necho "No space left on device" >&2\nexit 1\n')
+    ffmpeg.chmod(0o755)
+    monkeypatch.setenv('IMAGEIO_FFMPEG_EXE', str(ffmpeg))
+    picture = np.zeros((side, side, 3), dtype=np.uint8)
+    with pytest.raises(CommandError, match='ffmpeg: No space left on device'):
+        write_film(tmp_path / 'film.mp4', (picture for _ in range(200)), fps=25.0)
+    assert [each.name for each in tmp_path.iterdir()] == ['ffmpeg']
 
 
 @pytest.mark.parametrize('name', ['film.gif', 'picture.PNG'])
@@ -459,3 +486,16 @@ def test_film_episode_plays_to_the_end_with_a_policy_or_a_function(opengl):
     assert not all((a == b).all() for a, b in zip(film, film_episode(env, Resting()), strict=True))
     with pytest.raises(ValueError, match=re.escape("render_mode None; allowed: 'rgb_array'")):
         film_episode(fetch_hand_sim.make('FetchReach'), Resting())
+
+
+@pytest.mark.parametrize('lost', [0, 50, -1])
+def test_a_pose_of_the_object_that_is_missing_is_one_line(lost, tmp_path):
+    """Poses are no part of what is observed, so that nothing else looks at their number."""
+    path = Recorder('HandManipulateEggRotate').record(EpisodeDirectory(tmp_path))
+    content = Crafter(path, 0, 0).whole()
+    poses = [each for each in content.messages if each.topic == '/object_pose']
+    content.messages.remove(poses[lost])
+    (path / f'{path.name}_0.mcap').write_bytes(content.to_bytes())
+    assert len(load_episodes(path)) == 1
+    with pytest.raises(EpisodeReadError, match='object_pose is missing at some ticks'):
+        load_recordings(path, 1)

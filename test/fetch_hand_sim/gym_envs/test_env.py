@@ -93,7 +93,8 @@ def test_arguments_reach_the_simulation():
     metric = env.unwrapped.simulation.metric
     assert (metric.reward_type, metric.success_rule) == ('dense', 'paper')
     assert env.unwrapped.simulation.tick_duration == pytest.approx(0.02)
-    assert env.metadata['render_fps'] == 50
+    assert repr(env.metadata['render_fps']) == '50'
+    assert make('HandReach', control_hz=12.5).metadata['render_fps'] == 12.5
     assert gymnasium.spec(environment_id('HandReach')).kwargs == {'task': 'HandReach'}
 
 

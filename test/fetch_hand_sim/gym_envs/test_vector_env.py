@@ -232,6 +232,22 @@ def test_a_seed_that_nobody_gave_is_told_too():
     assert_same(make_vec('FetchReach', 2).reset(seed=env.np_random_seed)[0], first)
 
 
+def test_generators_that_somebody_holds_before_the_first_episode_are_drawn_from():
+    env = make_vec('FetchReach', 2)
+    held = env.np_random
+    for number, generator in enumerate(held):
+        generator.bit_generator.state = np.random.default_rng(number).bit_generator.state
+    first, _ = env.reset()
+    assert all(mine is other for mine, other in zip(env.np_random, held, strict=True))
+    for number, generator in enumerate(env.np_random):
+        generator.bit_generator.state = np.random.default_rng(number).bit_generator.state
+    assert_same(env.reset()[0], first)
+    untouched = make_vec('FetchReach', 2)
+    assert len(untouched.np_random) == 2
+    first, _ = untouched.reset()
+    assert_same(make_vec('FetchReach', 2).reset(seed=untouched.np_random_seed)[0], first)
+
+
 def test_a_diverged_environment_is_truncated_and_starts_again():
     env = make_vec('FetchPush', 3)
     env.reset(seed=0)

@@ -69,6 +69,7 @@ def test_no_files_from_visitors():
     [
         ('/', ''),
         ('/?token=wrong', ''),
+        ('/?token=\udcff', ''),
         ('/', 'fetch_hand_sim_view_0=wrong'),
         ('/', 'fetch_hand_sim_view_1=a-token'),
         ('/', 'other=a-token'),
