@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ from policy_node.policies.policy import LoadedPolicy, Observation, observation_p
 
 # As torch.nn.LayerNorm.
 _NORM_EPSILON = 1e-5
+# Two that set the number of threads and set it back between each other would leave it at one.
+_ONE_AT_A_TIME = Lock()
 
 
 class NumpyActor:
@@ -68,7 +71,7 @@ class NumpyActor:
         state = observation_part(observation, 'observation', shape.observation_size)
         goal = observation_part(observation, 'desired_goal', shape.goal_size)
         features = self._features(state.astype(np.float64), goal.astype(np.float64))
-        with _blas().limit(limits=1):
+        with _ONE_AT_A_TIME, _blas().limit(limits=1):
             return np.tanh(self._forward(features)).astype(np.float32), None
 
     def _forward(self, layer: Array) -> Array:

@@ -19,7 +19,7 @@ from policy_node.policies.files import one_line, read_file, write_file
 # A training state with its optimisers has a few megabytes.
 LARGEST_TENSOR_FILE = 2**30
 # Text costs many times its bytes once it is parsed; that of an actor has a few kilobytes.
-_LARGEST_HEADER = 2**20
+LARGEST_HEADER = 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +77,8 @@ def parse_header(data: bytes, path: str | Path) -> TensorHeader:
         end = 8 + int.from_bytes(data[:8], 'little')
         if len(data) < max(end, 8):
             raise ValueError('it ends within its header')
-        if end > _LARGEST_HEADER:
-            raise ValueError(f'header of {end} bytes; allowed: up to {_LARGEST_HEADER}')
+        if end > LARGEST_HEADER:
+            raise ValueError(f'header of {end} bytes; allowed: up to {LARGEST_HEADER}')
         entries = json.loads(data[8:end])
         metadata = entries.pop('__metadata__', {})
         return TensorHeader(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import torch
@@ -103,7 +103,7 @@ def train(
             raise ValueError(
                 f'{folder} holds a run: resume=True goes on with it, or choose another'
             )
-    with _left_as_it_was():
+    with _PROGRAM:
         ending = _ending(config, folder, resume, Caller(on_cycle, quiet))
     if ending.signal == signal.SIGINT:
         raise KeyboardInterrupt(ending.reason)
@@ -126,12 +126,29 @@ def _ending(config: TrainConfig, folder: Path, resume: bool, caller: Caller) -> 
         raise RuntimeError(str(error)) from error
 
 
-@contextlib.contextmanager
-def _left_as_it_was() -> Iterator[None]:
-    """Gives the program its number of threads and its random numbers back."""
-    threads = torch.get_num_threads()
-    with torch.random.fork_rng():
-        try:
-            yield
-        finally:
-            torch.set_num_threads(threads)
+class _Program:
+    """What a run changes in the program around it, given back when no run is left.
+
+    Several may run at the same time, in threads.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._runs = 0
+        self._kept = contextlib.ExitStack()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._runs == 0:
+                self._kept.callback(torch.set_num_threads, torch.get_num_threads())
+                self._kept.enter_context(torch.random.fork_rng())
+            self._runs += 1
+
+    def __exit__(self, *exception: object) -> None:
+        with self._lock:
+            self._runs -= 1
+            if self._runs == 0:
+                self._kept.close()
+
+
+_PROGRAM = _Program()

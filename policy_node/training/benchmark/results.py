@@ -240,7 +240,9 @@ def _name_curves(figure: Any, panels: Sequence[Any], columns: int) -> None:
 
 def _top_of_axis(bands: Mapping[str, Mapping[str, Band]]) -> float:
     """Success at the top of every panel: 1, or less where no arm comes near half of it."""
-    highest = max(float(band.upper.max()) for arms in bands.values() for band in arms.values())
+    # Curves that have no step in common have an empty band.
+    tops = [band.upper for arms in bands.values() for band in arms.values() if band.upper.size]
+    highest = max((float(upper.max()) for upper in tops), default=0.0)
     return 1.0 if highest > 0.4 else max(1.25 * highest, 0.05)
 
 

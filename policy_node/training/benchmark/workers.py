@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from enum import Enum
 from multiprocessing.connection import wait
@@ -25,7 +26,7 @@ from msgs_spec.command_line import (
 from msgs_spec.parent_process import end_with_parent
 from policy_node.training.benchmark.final import measure_final
 from policy_node.training.benchmark.jobs import Job
-from policy_node.training.runs.run import RunTakenError, train_run
+from policy_node.training.runs.run import RunTakenError, lock_run, train_run
 
 LOG_FILE = 'log.txt'
 # Seconds between two lines about each running job.
@@ -119,12 +120,21 @@ def attempt(job: Job, command: str) -> Outcome:
                 return Outcome.STOPPED
             if not job.is_trained:
                 raise CommandError(f'it ended before its steps were done: {ending.reason}')
-        _measure(job)
+        with lock_run(job.folder):
+            if not job.is_finished:
+                _measure(job)
     except RunTakenError:
         _tell(f'{job.name} is being run by another process')
         return Outcome.TAKEN
     except CommandError as error:
+        # By another process, between a look and a lock.
+        if job.is_finished:
+            return Outcome.FINISHED
         complain('benchmark', f'{job.name}: {error}')
+        return Outcome.FAILED
+    except Exception:
+        # Whatever it is, the other jobs go on.
+        traceback.print_exc()
         return Outcome.FAILED
     return Outcome.FINISHED
 

@@ -24,7 +24,8 @@ class ActionNoise:
         shape: (simulations, action size).
         std: Standard deviation of the Gaussian noise.
         epsilon: Probability of a random action.
-        spread: The first simulation has 1 - spread times both, the last 1 + spread.
+        spread: The first simulation has 1 - spread times both, the last 1 + spread; one alone has
+            both as they are.
         ticks: For how many ticks whatever was drawn holds.
 
     Attributes:
@@ -43,7 +44,8 @@ class ActionNoise:
         self._generator = generator
         self._shape = shape
         self._std, self._epsilon = std, epsilon
-        self._shares = 1.0 + spread * np.linspace(-1.0, 1.0, shape[0])
+        one = np.zeros(1)
+        self._shares = 1.0 + spread * (np.linspace(-1.0, 1.0, shape[0]) if shape[0] > 1 else one)
         self._ticks = ticks
         self.share = 1.0
         self._uniform, self._noise = np.zeros(shape, np.float32), np.zeros(shape, np.float32)

@@ -240,6 +240,11 @@ def _contradictions_of_values(config: ConfigFields) -> Iterator[str]:
         yield f'learning_starts needs replay_transitions of {config.learning_starts} or more'
     if config.correction != 'none' and config.n_step == 1:
         yield f'correction {config.correction} needs n_step above 1'
+    corrected = config.correction
+    if config.trace != DEFAULTS['trace'] and 'lambda' != corrected and config.algorithm != 'ppo':
+        yield 'trace needs correction lambda, or algorithm ppo'
+    if config.cut_distance != DEFAULTS['cut_distance'] and corrected != 'cut':
+        yield 'cut_distance needs correction cut'
     if config.episode_weights != DEFAULTS['episode_weights'] and config.moved_share == 0.0:
         yield f'episode_weights {config.episode_weights} needs moved_share above 0'
     truncates = config.aggregate == 'truncated' and config.quantiles > 1

@@ -24,6 +24,7 @@ from policy_node.training.replay.transitions import Transitions
 
 # How far an update may move the probability of an action (the paper's value).
 CLIP = 0.2
+LARGEST_LOG_RATIO = 20.0
 _ROOT = math.sqrt(2.0 * math.pi)
 
 
@@ -68,7 +69,9 @@ class PPO(ActorCritic):
     def _actor_loss(self, batch: RolloutTransitions, features: Tensor, weight: Tensor) -> Tensor:
         mean = self.actor(features)
         logs = log_probability(mean, self.config.noise_std, self.tensor(batch.action))
-        ratio = (logs - self.tensor(batch.log_probability)).exp()
+        # Beyond the bound an action is so much more or less likely that float32 has no gradient.
+        difference = logs - self.tensor(batch.log_probability)
+        ratio = difference.clamp(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO).exp()
         advantage = self.tensor(batch.advantage)
         bounded = ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
         gain = torch.minimum(ratio * advantage, bounded * advantage)

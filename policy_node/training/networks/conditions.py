@@ -127,7 +127,9 @@ def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
         shape: Of the network to make.
         value: That input.
     """
-    folded = MLP(shape.feature_size, shape.action_size, shape)
+    # Its random weights are thrown away: what is drawn next is as if there were none.
+    with torch.random.fork_rng(devices=[]):
+        folded = MLP(shape.feature_size, shape.action_size, shape)
     folded.load_state_dict(without_input(network.state_dict(), shape.feature_size, value))
     return folded
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
+from torch import nn
 
 from policy_node.training.learners.actor_critic import Losses
 from policy_node.training.replay.episode_replay import Episodes
@@ -45,3 +46,18 @@ def require_finite_losses(losses: Sequence[Losses], counters: Counters) -> None:
                 f'{name} loss is {float(values[finite.index(False)])} in update {update}, '
                 f'after {counters.env_steps} environment steps'
             )
+
+
+def require_finite_networks(modules: Mapping[str, nn.Module], counters: Counters) -> None:
+    """Stops on networks that a step has ruined, also one down the gradient of a finite loss.
+
+    Raises:
+        TrainingError: If there is one.
+    """
+    for name, module in modules.items():
+        for key, value in module.state_dict().items():
+            if not torch.isfinite(value).all():
+                raise TrainingError(
+                    f'{name}.{key} is not finite after update {counters.updates}, '
+                    f'after {counters.env_steps} environment steps'
+                )

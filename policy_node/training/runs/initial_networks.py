@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from torch import Tensor
@@ -25,6 +25,9 @@ from policy_node.training.runs.training_state import part_of
 # Updates of the critics alone where one starts from nothing beside an actor that is already good:
 # the gradient of a critic that knows nothing would ruin it.
 CRITIC_FIRST = 5_000
+# A critic of runs that differ in these says what has no meaning: dense rewards are distances, and
+# values are per tick.
+VALUED_BY = ('reward_type', 'control_hz')
 # Parts of a training state that are critics.
 _CRITICS = ('critic', 'target_critic')
 _PREFIXES = tuple(f'{part}.' for part in _CRITICS)
@@ -40,6 +43,7 @@ class InitialNetworks:
         goal_features: Their kind of inputs.
         norm: What normalises hidden layers of the critic alone.
         origin: Where they come from, for the record: name, task, environment steps and command.
+        valued_by: Fields of the run that its critic's values are of, see `VALUED_BY`.
     """
 
     tensors: dict[str, Tensor]
@@ -47,6 +51,7 @@ class InitialNetworks:
     goal_features: str
     norm: str
     origin: dict[str, Any]
+    valued_by: dict[str, Any] = field(default_factory=dict)
 
     @property
     def has_critic(self) -> bool:
@@ -79,8 +84,8 @@ class InitialNetworks:
     def fitted(self, config: TrainConfig) -> InitialNetworks:
         """These networks for another run, in which other inputs may begin to count.
 
-        A critic whose hidden layers are normalised otherwise is left behind. Hidden layers may
-        become wider.
+        A critic whose hidden layers are normalised otherwise, or whose values are of other rewards,
+        is left behind. Hidden layers may become wider.
 
         Where the position of an object did not count, the goal's position was always about the
         object's own: networks have learnt nothing from it, and what they do elsewhere is chance (an
@@ -103,7 +108,8 @@ class InitialNetworks:
         if config.condition != 'none':
             tensors = with_input(fitted.tensors, shape.feature_size)
             fitted = replace(fitted, tensors=tensors)
-        if config.norm != self.norm:
+        values = {name: getattr(config, name) for name in self.valued_by}
+        if config.norm != self.norm or values != self.valued_by:
             fitted = fitted.without_critic()
         else:
             fitted = fitted.with_critics(config.critics)

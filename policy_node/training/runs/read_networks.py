@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from policy_node.training.configuration.config_rules import unusual_networks
 from policy_node.training.configuration.config_values import config_from_dict
 from policy_node.training.networks.conditions import ACTING_INPUT, without_input
 from policy_node.training.networks.shape_from_config import network_shape
-from policy_node.training.runs.initial_networks import InitialNetworks
+from policy_node.training.runs.initial_networks import VALUED_BY, InitialNetworks
 from policy_node.training.runs.mean_networks import mean_of
 from policy_node.training.runs.origins import steps_behind
 from policy_node.training.runs.run_folder import STATE_FILE, companion_file
@@ -63,7 +64,8 @@ def _of_run(folder: Path) -> InitialNetworks:
         'init_from': state.extra.get('init_from', {}),
     }
     shape = network_shape(config)
-    return InitialNetworks(tensors, shape, config.goal_features, config.norm, origin)
+    kind = config.goal_features, config.norm
+    return InitialNetworks(tensors, shape, *kind, origin, _valued_by(config))
 
 
 def _require_usual(config: TrainConfig, name: str) -> None:
@@ -84,14 +86,14 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
     beside = (companion_file(path), path.parent / STATE_FILE)
     source = next((file for file in beside if file.is_file()), None)
     digest = checkpoint.checkpoint_hash(path)
-    norm = 'none'
+    norm, valued_by = 'none', {}
     if source is not None:
         state = read_state(source)
         if state.extra.get('actor_sha256', digest) != digest:
             raise ValueError(f'{source} is the critic of another actor than {path}')
         config = config_from_dict(state.extra['config'])
         _require_usual(config, str(source))
-        norm = config.norm
+        norm, valued_by = config.norm, _valued_by(config)
         critic = _unconditioned(part_of(state.tensors, 'critic'), config)
         tensors |= {f'critic.{key}': value for key, value in critic.items()}
     origin = {
@@ -103,7 +105,11 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         'sha256': digest,
         'init_from': info.init_from,
     }
-    return InitialNetworks(tensors, info.shape, info.goal_features, norm, origin)
+    return InitialNetworks(tensors, info.shape, info.goal_features, norm, origin, valued_by)
+
+
+def _valued_by(config: TrainConfig) -> dict[str, Any]:
+    return {name: getattr(config, name) for name in VALUED_BY}
 
 
 def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str, Tensor]:

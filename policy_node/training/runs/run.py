@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+import numpy as np
+
 from msgs_spec.command_line import (
     CommandError,
     UsageError,
@@ -48,6 +50,14 @@ class Caller:
 
     on_cycle: OnCycle | None = None
     quiet: bool = False
+
+
+class _OfCallerError(Exception):
+    """What `on_cycle` raised, so that no error of a run is taken for it, nor it for one."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(error)
+        self.error = error
 
 
 class RunTakenError(CommandError):
@@ -112,12 +122,7 @@ def train_run(
             raise _without_memory(error) from None
         if why := _too_large(trainer):
             complain(NAME, why)
-        try:
-            ending = _train(trainer, output, command, caller)
-        except (TrainingError, OSError) as error:
-            raise CommandError(f'{error}; {_kept(output)}') from None
-        finally:
-            leave_workers(workers)
+        ending = _train_or_explain(trainer, output, command, caller, resume=resume)
         if workers.is_first:
             title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
             try:
@@ -125,6 +130,22 @@ def train_run(
             except OSError as error:
                 complain(NAME, f'no curve, the run itself is saved: {error}')
         return ending
+
+
+def _train_or_explain(
+    trainer: Trainer, output: Path, command: str, caller: Caller | None, *, resume: bool
+) -> Ending:
+    """Trains; what fails is one line, and what the caller raised stays as it is."""
+    try:
+        return _train(trainer, output, command, caller, resume=resume)
+    except (TrainingError, OSError) as error:
+        raise CommandError(f'{error}; {_kept(output)}') from None
+    except _OfCallerError as error:
+        theirs = error.error
+    finally:
+        leave_workers(trainer.workers)
+    # Here, so that nothing of ours is around it.
+    raise theirs
 
 
 def _kept(output: Path) -> str:
@@ -151,16 +172,25 @@ def _too_large(trainer: Trainer) -> str:
     return why_too_large(needed, available_memory())
 
 
-def _train(trainer: Trainer, output: Path, command: str, caller: Caller | None) -> Ending:
+def _train(
+    trainer: Trainer, output: Path, command: str, caller: Caller | None, *, resume: bool
+) -> Ending:
     config, counters, log = trainer.config, trainer.counters, None
     on_cycle = caller.on_cycle if caller else None
 
     def tell(row: Row) -> None:
-        if on_cycle is not None and on_cycle(row) is False:
+        if on_cycle is None:
+            return
+        try:
+            result = on_cycle(row)
+        except Exception as error:
+            raise _OfCallerError(error) from error
+        if isinstance(result, bool | np.bool_) and not result:
             trainer.stop('stopped by on_cycle')
 
     if trainer.workers.is_first:
-        with (output / COMMAND_FILE).open('a') as file:
+        # One line for each part; of a run that was killed before anything was saved there is none.
+        with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
             file.write(command + '\n')
         limits = config.total_steps, config.time_limit
         quiet = caller is not None and caller.quiet
@@ -212,7 +242,7 @@ def _initial_networks(config: TrainConfig) -> InitialNetworks:
     except ValueError as error:
         raise UsageError(str(error)) from None
     if not networks.has_critic:
-        complain(NAME, f'{config.init_from} has no critic beside it: a new one learns first')
+        complain(NAME, f'{config.init_from} has no critic for this run: a new one learns first')
     return networks
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,11 @@ from policy_node.training.machine.distributed import Workers
 from policy_node.training.machine.threads import split_threads
 from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.replay_file import load_replay
-from policy_node.training.runs.finite_checks import require_finite_episodes, require_finite_losses
+from policy_node.training.runs.finite_checks import (
+    require_finite_episodes,
+    require_finite_losses,
+    require_finite_networks,
+)
 from policy_node.training.runs.initial_networks import CRITIC_FIRST, InitialNetworks
 from policy_node.training.runs.narrowing import Narrowing
 from policy_node.training.runs.progress_row import progress_row
@@ -35,7 +40,12 @@ from policy_node.training.runs.run_clock import RunClock
 from policy_node.training.runs.run_folder import RunFolder
 from policy_node.training.runs.run_log import RunLog
 from policy_node.training.runs.saving import NAME, Saver
-from policy_node.training.runs.training_state import Counters, load_networks, load_state
+from policy_node.training.runs.training_state import (
+    Counters,
+    load_networks,
+    load_state,
+    require_readable,
+)
 
 # Steps that a resumed run without these episodes collects before it goes on.
 MOST_REFILLED = 100_000
@@ -119,6 +129,7 @@ class Trainer:
         self.learner, self.experience = make_learner(
             config, spec, self.device, self.workers, sampler, generator
         )
+        require_readable(self.learner)
         self._narrowing = Narrowing(config, self.simulation.metric, self.experience, self.workers)
 
     def _part_noise(self) -> None:
@@ -194,15 +205,13 @@ class Trainer:
         """Runs until a limit is reached or `stop` is called; returns why it ended.
 
         Raises:
-            TrainingError: If a loss or an observation is not finite; the checkpoints written before
-                are left as they are.
+            TrainingError: If a loss, a weight or an observation is not finite; the checkpoints
+                written before are left as they are.
         """
         if self.counters.env_steps >= self.config.total_steps:
             return f'{self.config.total_steps:,} environment steps were done before'
         clock = RunClock(self.counters)
-        # The number of tensor threads belongs to a thread: without its own, the collector's small
-        # products would start one per core, which then spin against the simulation and the learner.
-        with ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,)) as executor:
+        with _collecting_thread() as executor:
             submit = executor.submit if self.config.overlap else _run_now
             collected = self._collect_first(submit)
             if collected is None:
@@ -222,7 +231,6 @@ class Trainer:
                     job = submit(self._collect, *self._prepare_collection())
                 collected = self._collect_or_explain(job)
                 clock.write(self.counters)
-                require_finite_losses(losses, self.counters)
                 knows = self.counters.updates > 0 or bool(self.config.init_from)
                 if collected.evaluation is None and knows and self._limit():
                     # Noise and learning rate have fallen, and nothing else would measure it.
@@ -316,6 +324,9 @@ class Trainer:
         ]
         self.learner.average()
         self.counters.updates = self.learner.updates
+        # Before anything acts by them or is saved.
+        require_finite_losses(losses, self.counters)
+        require_finite_networks(self.learner.modules(), self.counters)
         return losses
 
     def _keep_best(self, collected: Collected) -> None:
@@ -360,6 +371,22 @@ class Trainer:
         if collected.guided is not None:
             row['eval_guided'] = success_rate(collected.guided, rule)
         return row
+
+
+@contextmanager
+def _collecting_thread() -> Iterator[ThreadPoolExecutor]:
+    """A thread to collect in; who interrupts the block does not wait for its job."""
+    # The number of tensor threads belongs to a thread: without its own, the collector's small
+    # products would start one per core, which then spin against the simulation and the learner.
+    executor = ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,))
+    is_interrupted = False
+    try:
+        yield executor
+    except KeyboardInterrupt:
+        is_interrupted = True
+        raise
+    finally:
+        executor.shutdown(wait=not is_interrupted, cancel_futures=True)
 
 
 def _run_now(function: Callable[..., Collected], *arguments: Any) -> Future[Collected]:

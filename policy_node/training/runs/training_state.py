@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from policy_node.policies.files import read_file
+from policy_node.policies.files import LARGEST_POLICY, read_file
 from policy_node.policies.tensor_file import (
+    LARGEST_HEADER,
     LARGEST_TENSOR_FILE,
     parse_header,
     read_tensors,
@@ -27,6 +28,8 @@ from policy_node.training.runs.state_checks import (
 
 FORMAT = 'fetch_hand_training'
 FORMAT_VERSION = 1
+# Of a header: a name, a type, a shape and where the numbers lie.
+_BYTES_OF_AN_ENTRY = 160
 
 
 @dataclass(slots=True)
@@ -99,6 +102,30 @@ def save_state(
         for name, value in running.state().items():
             tensors[f'{part}.{name}'] = value
     write_state(path, TrainingState(tensors, counters, extra))
+
+
+def require_readable(learner: ActorCritic) -> None:
+    """Refuses networks whose files could not be read back, before hours are spent on them.
+
+    Raises:
+        ValueError: One line names what is too large.
+    """
+    actor = sum(value.nbytes for value in learner.actor.state_dict().values())
+    modules, optimizers = learner.modules().values(), learner.optimizers().values()
+    values = [value for module in modules for value in module.state_dict().values()]
+    moved = [each for optimizer in optimizers for each in optimizer.param_groups[0]['params']]
+    # Adam keeps two numbers beside each, and a count.
+    state = sum(value.nbytes for value in values) + 2 * sum(each.nbytes for each in moved)
+    header = _BYTES_OF_AN_ENTRY * (len(values) + 3 * len(moved))
+    for what, needed, allowed in (
+        ('an actor', actor, LARGEST_POLICY),
+        ('a training state', state, LARGEST_TENSOR_FILE),
+        ('the header of a training state', header, LARGEST_HEADER),
+    ):
+        if needed > allowed:
+            raise ValueError(
+                f'hidden_sizes and critics make {what} of {needed:,} bytes; allowed: {allowed:,}'
+            )
 
 
 def write_state(path: Path, state: TrainingState) -> None:

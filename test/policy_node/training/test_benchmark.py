@@ -25,7 +25,7 @@ from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark import published
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.jobs import ARMS
-from policy_node.training.benchmark.results import Curve, aggregate, read_curve, summarize
+from policy_node.training.benchmark.results import Curve, aggregate, draw, read_curve, summarize
 from policy_node.training.benchmark.studies import paper_jobs, reduced_budget
 from policy_node.training.benchmark.study import REPEATABLE
 from policy_node.training.configuration.config import TrainConfig
@@ -144,6 +144,14 @@ def test_curves_evaluated_at_other_steps_meet_on_common_ones() -> None:
     band = aggregate([curve(0.0, 0.2, 0.4), late])
     assert band.env_steps.tolist() == [150, 200, 250]
     np.testing.assert_allclose(band.median, [(0.1 + 0) / 2, (0.2 + 0.5) / 2, (0.3 + 1) / 2])
+
+
+def test_curves_without_a_common_step_are_drawn_as_nothing() -> None:
+    late = Curve(np.array([350.0, 450.0]), np.array([0.0, 1.0]), 50)
+    band = aggregate([curve(0.0, 0.2), late])
+    assert band.env_steps.size == 0
+    picture = draw({'FetchReach': {'her_sparse': band}}, {'her_sparse': 'DDPG+HER, sparse'})
+    assert picture.startswith(b'\x89PNG')
 
 
 def test_a_summary_is_about_the_last_evaluations() -> None:

@@ -89,6 +89,13 @@ def test_exploration_may_differ_between_simulations() -> None:
     assert np.mean(spread, axis=0) == pytest.approx(expected, rel=0.1)
 
 
+def test_one_simulation_alone_explores_as_configured() -> None:
+    simulation = Simulation('FetchReach', num_envs=1, num_threads=1)
+    config = TrainConfig('FetchReach', noise_std=0.1, random_epsilon=0.0, noise_spread=1.0)
+    action = Collector(simulation, [0], config).collect(RestingPolicy(4))[0].action
+    assert action.std() == pytest.approx(0.1, rel=0.2)
+
+
 def test_random_actions_ignore_the_policy() -> None:
     episodes, _ = make_collector(0.0, 0.0).collect(RestingPolicy(4), random=True)
     assert episodes.action.std() == pytest.approx(1 / np.sqrt(3), abs=0.03)

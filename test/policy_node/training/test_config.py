@@ -147,6 +147,8 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
             'condition horizon excludes drop_is_lost',
         ),
         ({'noise_spread': 1.5}, 'noise_spread 1.5; allowed: 0 ... 1'),
+        ({'trace': 0.5}, 'trace needs correction lambda, or algorithm ppo'),
+        ({'cut_distance': 0.5, 'n_step': 3}, 'cut_distance needs correction cut'),
         ({'hidden_sizes': (0,)}, 'hidden_sizes'),
         ({'retry_failed': 1.0}, 'retry_failed 1.0; allowed: 0 ... 0.9'),
         ({'importance': 'density', 'goals': 'future=1'}, "needs other goals beside 'future=1'"),

@@ -346,7 +346,7 @@ def test_an_actor_alone_acts_from_the_first_cycle_while_its_critic_learns(
     arguments += ['--set', 'updates_per_cycle=5', '--set', 'batch_size=64']
     arguments += ['--set', 'evaluation_episodes=20', '--output', str(tmp_path / 'run')]
     assert main(arguments) == 0
-    assert 'has no critic beside it: a new one learns first' in capsys.readouterr().err
+    assert 'has no critic for this run: a new one learns first' in capsys.readouterr().err
     evaluated = [
         row for row in read_progress(tmp_path / 'run/progress.csv') if 'eval_success' in row
     ]
@@ -409,3 +409,20 @@ def test_a_start_that_is_not_there_is_one_line(
     assert main(['--task', 'FetchReach', *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize('changes', [{'reward_type': 'dense'}, {'control_hz': 250.0}])
+def test_a_critic_of_other_rewards_is_left_behind(
+    changes: dict[str, object], tmp_path: Path, block_run: Path
+) -> None:
+    task = 'HandManipulateBlockRotateXYZ'
+    networks = read_initial_networks(str(block_run))
+    assert networks.fitted(tiny(task)).has_critic
+    config = tiny(task, **changes)
+    fitted = networks.fitted(config)
+    assert not fitted.has_critic
+    started = Trainer(config, tmp_path, Workers(), init_from=fitted)
+    assert started.learner.critic_first == CRITIC_FIRST
+    actor = started.learner.actor.state_dict()
+    for name, value in actor.items():
+        assert torch.equal(value, networks.tensors[f'actor.{name}']), name

@@ -430,6 +430,35 @@ def test_the_first_losses_are_those_of_the_definition() -> None:
     assert losses.value.item() == pytest.approx(value.mean(), rel=1e-4)
 
 
+@pytest.mark.parametrize('advantage', [-1.0, 1.0])
+@pytest.mark.parametrize('log_ratio', [-200.0, 95.0, 200.0])
+def test_probabilities_that_float32_cannot_compare_ruin_no_network(
+    log_ratio: float, advantage: float
+) -> None:
+    """As of goals in hindsight beside little noise: exp(89) is beyond float32."""
+    torch.manual_seed(0)
+    learner = PPO(NetworkShape(1, 1, 2, (4,)), configured(), torch.device('cpu'), Workers())
+    pairs = {name: np.full((6, 1), 0.3, np.float32) for name in ('observation', 'goal')}
+    action, numbers = np.full((6, 2), 0.2, np.float32), np.zeros(6, np.float32)
+    logs = learner.log_probabilities(pairs['observation'], pairs['goal'], action)
+    batch = RolloutTransitions(
+        **pairs,
+        next_observation=pairs['observation'],
+        action=action,
+        reward=numbers,
+        discount=numbers,
+        log_probability=logs - np.float32(log_ratio),
+        advantage=numbers + np.float32(advantage),
+        value_target=numbers,
+        weight=numbers + 1,
+    )
+    for _ in range(3):
+        losses = learner.update(batch)
+        assert torch.isfinite(losses.actor)
+    for value in learner.actor.state_dict().values():
+        assert torch.isfinite(value).all()
+
+
 def test_ppo_refuses_transitions_that_nobody_rolled_out() -> None:
     learner, _ = learn(1, strategy='none')
     one = np.zeros((1, 1), np.float32)

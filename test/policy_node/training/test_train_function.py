@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import torch
 
 from policy_node import load_policy
 from policy_node.training import Run, train
+from policy_node.training.runs.trainer import _collecting_thread
 from support import script_environment
 
 torch.set_num_threads(1)
@@ -84,6 +86,58 @@ def test_what_a_callback_raises_ends_the_run_and_frees_the_folder(tmp_path):
     with pytest.raises(ZeroDivisionError):
         train('FetchReach', tmp_path / 'run', total_steps=4_000, on_cycle=fail, **SMALL)
     assert train('FetchReach', tmp_path / 'run', total_steps=400, **SMALL).env_steps == 400
+
+
+def test_no_of_numpy_ends_the_run_as_well(tmp_path):
+    settings = {'total_steps': 4_000, **SMALL}
+    run = train('FetchReach', tmp_path / 'run', on_cycle=lambda row: np.bool_(False), **settings)
+    assert run.env_steps == 400
+
+
+def test_an_error_of_the_system_in_a_callback_is_the_callers(tmp_path):
+    """And none of the run's, whose disk has not failed."""
+
+    def plot(row):
+        Path('/nowhere/plot.png').write_bytes(b'')
+
+    with pytest.raises(FileNotFoundError, match=r'/nowhere/plot\.png') as caught:
+        train('FetchReach', tmp_path / 'run', total_steps=400, on_cycle=plot, **SMALL)
+    assert 'plot' in [entry.name for entry in caught.traceback]
+
+
+def test_runs_at_the_same_time_leave_the_programs_random_numbers(tmp_path):
+    torch.manual_seed(3)
+    expected = torch.rand(1)
+    torch.manual_seed(3)
+    first_may_end, second_began = threading.Event(), threading.Event()
+
+    def first(row):
+        second_began.wait(60.0)
+
+    def second(row):
+        second_began.set()
+        first_may_end.wait(60.0)
+
+    def run(name, on_cycle):
+        train('FetchReach', tmp_path / name, total_steps=400, on_cycle=on_cycle, **SMALL)
+
+    threads = [threading.Thread(target=run, args=each) for each in (('a', first), ('b', second))]
+    for thread in threads:
+        thread.start()
+    threads[0].join()
+    first_may_end.set()
+    threads[1].join()
+    assert torch.rand(1) == expected
+
+
+def test_who_interrupts_twice_does_not_wait_for_a_collection():
+    going = threading.Event()
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), _collecting_thread() as executor:
+        executor.submit(going.wait, 20.0)
+        raise KeyboardInterrupt
+    assert time.monotonic() - began < 5.0
+    going.set()
 
 
 def test_it_trains_in_a_thread_too(tmp_path):

@@ -26,6 +26,7 @@ from policy_node.training.goals.graded import GradedReward, parse_grades
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.replay.logged_episodes import read_experience
 from policy_node.training.runs.finite_checks import TrainingError
+from policy_node.training.runs.run import train_run
 from policy_node.training.runs.run_log import RunLog, read_progress
 from policy_node.training.runs.trainer import Collected, Trainer
 from policy_node.training.runs.training_state import read_state
@@ -415,6 +416,49 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(tmp_pa
     kept = weights(tmp_path / 'training_state.safetensors')
     assert all(torch.isfinite(value.float()).all() for value in kept.values())
     assert read_state(tmp_path / 'training_state.safetensors').extra['config']['num_envs'] == 8
+
+
+@pytest.mark.parametrize('overlap', [False, True])
+def test_weights_that_a_step_has_ruined_stop_the_run_before_they_act_or_are_saved(
+    tmp_path: Path, overlap: bool
+) -> None:
+    """Also where every loss was finite, as those before the step are."""
+    config = small_config(total_steps=10_000, checkpoint_seconds=0, overlap=overlap)
+    trainer = Trainer(config, tmp_path, Workers())
+    update, count = trainer.learner.update, 0
+
+    def ruinous(batch: object) -> object:
+        nonlocal count
+        count += 1
+        losses = update(batch)  # type: ignore[arg-type]
+        if count == 3 * config.updates_per_cycle:
+            with torch.no_grad():
+                trainer.learner.actor.network.output.weight.fill_(float('inf'))
+        return losses
+
+    trainer.learner.update = ruinous  # type: ignore[method-assign,assignment]
+    with pytest.raises(TrainingError, match=r'network\.output\.weight is not finite after update'):
+        trainer.train()
+    kept = weights(tmp_path / 'training_state.safetensors')
+    assert all(torch.isfinite(value.float()).all() for value in kept.values())
+
+
+def test_networks_whose_files_could_not_be_read_are_refused_at_once(tmp_path: Path) -> None:
+    for changes, said in (
+        ({'hidden_sizes': (4096, 4096)}, 'make an actor of 67,'),
+        ({'critics': 100, 'hidden_sizes': (16,) * 8}, 'the header of a training state of 1,'),
+    ):
+        with pytest.raises(ValueError, match=said):
+            Trainer(small_config(**changes), tmp_path, Workers())
+
+
+def test_a_run_that_began_anew_has_one_part(tmp_path: Path) -> None:
+    """One that was killed before it had saved anything does not count."""
+    (tmp_path / 'command.txt').write_text('train_her of before\n')
+    train_run(small_config(), tmp_path, command='train_her of now')
+    assert (tmp_path / 'command.txt').read_text() == 'train_her of now\n'
+    train_run(small_config(total_steps=1600), tmp_path, resume=True, command='more')
+    assert (tmp_path / 'command.txt').read_text() == 'train_her of now\nmore\n'
 
 
 def test_an_observation_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
