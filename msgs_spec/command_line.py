@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from types import FrameType
@@ -115,6 +115,13 @@ def complain(name: str, text: object) -> None:
         text: What is wrong; line breaks become spaces, control characters are escaped.
     """
     print(f'{name}: {printable(" ".join(str(text).split()))}', file=sys.stderr, flush=True)
+
+
+def complain_from_handler(name: str, text: object) -> None:
+    """As `complain`, of a signal handler, which may have come in the middle of another line."""
+    # Python refuses to write to a stream from within a write to it.
+    with suppress(RuntimeError):
+        complain(name, text)
 
 
 def say(text: object) -> None:
@@ -249,7 +256,7 @@ def _stopping_is_said(name: str) -> Iterator[list[int]]:
     """
 
     def say_and_raise(number: int, frame: FrameType | None) -> None:
-        complain(name, 'stopping')
+        complain_from_handler(name, 'stopping')
         signal.default_int_handler(number, frame)
 
     with on_stop_signals(_nobodys_signals(), say_and_raise) as received:

@@ -21,6 +21,7 @@ from msgs_spec.command_line import (
     EXIT_SUCCESS,
     CommandError,
     complain,
+    complain_from_handler,
     discard_unread_output,
 )
 from msgs_spec.parent_process import end_with_parent
@@ -198,7 +199,7 @@ class Processes:
     def _stop(self, number: int, frame: FrameType | None) -> None:
         del number, frame
         if not self._stopping:
-            complain('benchmark', 'stopping; jobs finish their cycle and keep their state')
+            complain_from_handler('benchmark', 'stopping; jobs finish their cycle and keep their state')
             self._stopping = True
             for _, process in self._running.values():
                 process.terminate()

@@ -16,6 +16,7 @@ from msgs_spec.command_line import (
     CommandError,
     UsageError,
     complain,
+    complain_from_handler,
     on_stop_signals,
     require_extra,
 )
@@ -261,7 +262,7 @@ def _stop_on_signals(trainer: Trainer, is_guest: bool = False) -> Iterator[list[
     def stop(number: int, frame: FrameType | None) -> None:
         del frame
         trainer.stop(f'stopped by {signal.Signals(number).name}')
-        complain(NAME, 'stopping after this cycle; once more stops at once')
+        complain_from_handler(NAME, 'stopping after this cycle; once more stops at once')
 
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     with on_stop_signals(numbers, stop, raises_again=is_guest) as received:
