@@ -199,7 +199,8 @@ class Processes:
     def _stop(self, number: int, frame: FrameType | None) -> None:
         del number, frame
         if not self._stopping:
-            complain_from_handler('benchmark', 'stopping; jobs finish their cycle and keep their state')
+            text = 'stopping; jobs finish their cycle and keep their state'
+            complain_from_handler('benchmark', text)
             self._stopping = True
             for _, process in self._running.values():
                 process.terminate()
