@@ -181,6 +181,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         return self.simulation.compute_success(achieved_goal, desired_goal).astype(np.float32)[()]
 
     def _sample_goal(self) -> Array:
+        self._physics.send()
         return self.simulation.task.sample_goal(0, self.np_random)
 
 

@@ -173,7 +173,11 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             raise gymnasium.error.ResetNeeded(
                 f'episodes {np.flatnonzero(started).tolist()} have ended; reset them first'
             )
-        result = self.simulation.step(clip_actions(np.asarray(actions)))
+        wanted = clip_actions(np.asarray(actions))
+        if started.any() and wanted.shape == self.action_space.shape:
+            # They only begin an episode, whatever their action is.
+            wanted = np.where(started[:, None], wanted.dtype.type(0), wanted)
+        result = self.simulation.step(wanted)
         observation, reward = result.observation, self._rewards(result)
         success, diverged = result.success, result.diverged & ~started
         if started.any():

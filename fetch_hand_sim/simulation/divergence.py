@@ -8,11 +8,11 @@ import numpy as np
 from mujoco import mjtWarning
 from numpy.typing import NDArray
 
-_THROWN_AWAY = (
+_THROWN_AWAY = [
     mjtWarning.mjWARN_BADQPOS.value,
     mjtWarning.mjWARN_BADQVEL.value,
     mjtWarning.mjWARN_BADQACC.value,
-)
+]
 
 
 class DivergenceWatch:
@@ -24,19 +24,19 @@ class DivergenceWatch:
 
     def __init__(self, batch: Any) -> None:
         self._batch = batch
-        self._warnings = self._count()
+        self.forget()
 
     def forget(self) -> None:
         """Counts no more what has been given up so far."""
-        self._warnings = self._count()
+        # The last axis is (last info, number).
+        self._batch.warning[:, _THROWN_AWAY] = 0
 
     def found(self) -> NDArray[np.bool_]:
         """Which simulations were given up since this or `forget` was called, (N,)."""
-        before, self._warnings = self._warnings, self._count()
-        return np.asarray(self._warnings > before)
-
-    def _count(self) -> NDArray[np.int64]:
-        """How often MuJoCo has given each simulation up, (N,)."""
-        # The last axis of `Batch.warning` is (last info, number).
-        first, second, third = (self._batch.warning[:, kind, 1] for kind in _THROWN_AWAY)
-        return np.asarray(first + second + third)
+        warning = self._batch.warning
+        first, second, third = (warning[:, kind, 1] for kind in _THROWN_AWAY)
+        lost = np.asarray(first + second + third > 0)
+        if lost.any():
+            # MuJoCo throws its counters away with the state: each loss is number one again.
+            self.forget()
+        return lost

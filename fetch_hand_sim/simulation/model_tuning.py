@@ -13,6 +13,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from fetch_hand_sim.simulation.contact_pairs import mix
+
 # Pairs of Fetch bodies that pass the bounding tests at most steps and stay more than 1 cm apart for
 # all positions of the joints between them, even 0.3 rad beyond the limits, which are soft and were
 # seen to give way by 0.13 rad (`test_model_tuning.py` samples these positions).
@@ -43,14 +45,18 @@ def list_geom_pairs(spec: mujoco.MjSpec) -> None:
     """Replaces the search for pairs of geoms that may collide by the list of these pairs.
 
     With few such pairs the list is cheaper than sorting all bodies along an axis at every substep.
-    Contact parameters are mixed as MuJoCo mixes them (`mj_contactParam`; margins and gaps add up).
+    Contact parameters are mixed as MuJoCo mixes them.
     """
     model = spec.compile()
     geoms = {geom.id: geom for geom in spec.geoms}
     for index, geom in geoms.items():
         geom.name = geom.name or f'geom{index}'
-    for first, second in collision_candidates(model):
-        _add_pair(spec, model, geoms[first], geoms[second])
+    candidates = np.array(collision_candidates(model), dtype=np.intp).reshape(-1, 2)
+    mixed = mix(model, candidates[:, 0], candidates[:, 1])
+    for number, (first, second) in enumerate(candidates.tolist()):
+        pair = spec.add_pair(geomname1=geoms[first].name, geomname2=geoms[second].name)
+        for name, values in mixed.items():
+            setattr(pair, name, values[number])
     for geom in geoms.values():
         geom.contype = geom.conaffinity = 0
 
@@ -90,24 +96,3 @@ def _bodies_may_collide(model: mujoco.MjModel, first: int, second: int) -> bool:
     if rigid[0] == rigid[1]:
         return False
     return not (all(rigid) and (rigid[0] == parents[1] or rigid[1] == parents[0]))
-
-
-def _add_pair(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, first: mujoco.MjsGeom, second: mujoco.MjsGeom
-) -> None:
-    ids = [first.id, second.id]
-    if np.ptp(model.geom_priority[ids]) or (model.geom_solref[ids, 0] <= 0).any():
-        raise ValueError(
-            f'geoms {first.name!r} and {second.name!r} differ in priority or have a direct solref; '
-            'only equal priorities and time constants can be mixed'
-        )
-    pair = spec.add_pair(geomname1=first.name, geomname2=second.name)
-    slide, spin, roll = model.geom_friction[ids].max(axis=0)
-    share = model.geom_solmix[ids[0]] / model.geom_solmix[ids].sum()
-    weights = np.array([share, 1.0 - share])
-    pair.friction = [slide, slide, spin, roll, roll]
-    pair.condim = int(model.geom_condim[ids].max())
-    pair.margin = model.geom_margin[ids].sum()
-    pair.gap = model.geom_gap[ids].sum()
-    pair.solref = weights[0] * model.geom_solref[ids[0]] + weights[1] * model.geom_solref[ids[1]]
-    pair.solimp = weights[0] * model.geom_solimp[ids[0]] + weights[1] * model.geom_solimp[ids[1]]

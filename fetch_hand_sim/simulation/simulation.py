@@ -178,7 +178,7 @@ class Simulation:
     def apply_model_changes(self) -> None:
         """Steps with `model` as it is now; the simulation keeps a copy of its own."""
         self._model_may_change = True
-        self._task.batch.set_models(self.model)
+        self._task.follow_model()
 
     def generator(self, index: int) -> np.random.Generator:
         """The random generator of simulation `index`, live: starts and goals are drawn from it."""
@@ -346,6 +346,7 @@ class Simulation:
         return {
             'arguments': {'task': self.spec.name, **self._arguments},
             'model': self.model if self._model_may_change else None,
+            'pairs': self._task.pairs if self._model_may_change else None,
             'metric': self.metric,
             'physics': self._task.physics_state(),
             'goals': self.goals.copy(),
@@ -359,9 +360,8 @@ class Simulation:
         """Compiles the model again and goes on from the state, to the same bits."""
         Simulation.__init__(self, **state['arguments'])
         if state['model'] is not None:
-            self._task.batch.set_models(state['model'])
-            self._task.batch.get_model(0, self.model)
-            self.apply_model_changes()
+            self._task.take_model(state['model'], state.get('pairs'))
+            self._model_may_change = True
         self.metric = state['metric']
         self._task.set_physics_state(state['physics'])
         self._divergence.forget()

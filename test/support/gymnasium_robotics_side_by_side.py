@@ -68,7 +68,17 @@ def play(name: str, reference: Any) -> dict[str, Any]:
         apart['reward'] = max(apart['reward'], difference(first[1], second[1]))
         successes = (first[4]['is_success'], second[4]['is_success'])
         apart['success'] = max(apart['success'], difference(*successes))
-        for field in ('qpos', 'qvel', 'ctrl', 'xpos', 'site_xpos', 'time'):
+        for field in (
+            'qpos',
+            'qvel',
+            'ctrl',
+            'xpos',
+            'site_xpos',
+            'time',
+            'cvel',
+            'qacc',
+            'qfrc_bias',
+        ):
             values = (getattr(reference.data, field), getattr(ours.data, field))
             apart['data'] = max(apart['data'], difference(*values))
     goals = np.stack([first[0]['achieved_goal']] * 3), np.stack([first[0]['desired_goal']] * 3)

@@ -151,6 +151,8 @@ class FetchTask(Task):
         skip_unread_stages(model)
         self._settle(model, spec)
         super().__init__(spec, model, batch)
+        stages = mujoco.mjtStage
+        self._last_stage = (stages.mjSTAGE_ACC if batch.keeps_data else stages.mjSTAGE_POS).value
         self.lead_scale = 1.0
         if batch.timing == 'seconds':
             self.lead_scale = lead_scale(1.0 / self.tick_duration)
@@ -258,7 +260,8 @@ class FetchTask(Task):
     def step(self) -> None:
         """Advances one tick; a blocked gripper is shut again, with a forward pass.
 
-        Of the pass only positions are ever read; these models have no actuators, so no efforts.
+        Of the pass only positions are ever read, but where the data are kept for others; these
+        models have no actuators, so no efforts.
         """
         try:
             super().step()
@@ -266,7 +269,7 @@ class FetchTask(Task):
             # The others go on where MuJoCo gave one up.
             if self.config.block_gripper:
                 self._qpos[:, self._fingers] = 0.0
-                self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
+                self.batch.forward(stage=self._last_stage)
 
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
         """Returns the distance to a point."""

@@ -9,11 +9,15 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import mujoco
 import numpy as np
+from mujoco.batch import SimulationError
+from numpy.typing import NDArray
 
+from fetch_hand_sim.simulation.divergence import DivergenceWatch
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.hand import HandTask, load_hand_model
 from fetch_hand_sim.simulation.tasks.task import (
@@ -131,8 +135,8 @@ class HandManipulateTask(HandTask):
     def reset(self, ids: Ids, generators: Generators) -> Array:
         """Drops the object on the palm until it stays there, then samples goals.
 
-        A try that fails is followed by another from the same controls and warm start, as in the
-        reference.
+        A try that fails, also one that MuJoCo gave up, is followed by another from the same
+        controls and warm start, as in the reference.
 
         Raises:
             RuntimeError: If it never stays, which a model or object of one's own may bring about.
@@ -146,11 +150,20 @@ class HandManipulateTask(HandTask):
             self._start_again(left)
             self._object_qpos[left] = [self._sample_start(generator_of[i]) for i in left.tolist()]
             self._ctrl[left] = self._resting_command
-            self.batch.step(left, nstep=self._settling)
-            self.batch.forward(left)
+            lost = self._settle(left)
             height = self._site_xpos[left, self._object_site, 2]
-            left = left[~(height > PALM_HEIGHT)]
+            left = left[~(height > PALM_HEIGHT) | lost[left]]
         raise RuntimeError(f'{self.spec.name}: the object fell off the palm {_MOST_TRIES} times')
+
+    def _settle(self, ids: Ids) -> NDArray[np.bool_]:
+        """Lets objects come to rest; which simulations MuJoCo gave up meanwhile, (N,)."""
+        watch, failed = DivergenceWatch(self.batch), np.zeros(self.batch.nsim, dtype=np.bool_)
+        for advance in (partial(self.batch.step, nstep=self._settling), self.batch.forward):
+            try:
+                advance(ids)
+            except SimulationError as error:
+                failed[error.ids] = True
+        return failed | watch.found()
 
     def _start_again(self, ids: Ids) -> None:
         self.batch.bind('time')[ids] = 0.0

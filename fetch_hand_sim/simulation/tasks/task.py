@@ -13,6 +13,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
+from fetch_hand_sim.simulation.contact_pairs import ListedPairs
 from fetch_hand_sim.simulation.models import prepare_engine
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array
@@ -76,6 +77,7 @@ class Task(ABC):
         spec: The task as data.
         model: The compiled `mujoco.MjModel`; the batch steps with a copy.
         batch: The simulations.
+        pairs: Whose contacts follow what is written into geoms.
         substeps: Physics steps per action.
         tick_duration: Simulated seconds per action.
         start_state: (state size,) `mjSTATE_INTEGRATION` in which episodes start, before anything
@@ -98,6 +100,7 @@ class Task(ABC):
         self.model = model
         self.tick_duration = batch.substeps * float(model.opt.timestep)
         self.batch = Batch(model, batch.num_envs, batch.threads, batch.keeps_data)
+        self.pairs = ListedPairs(model)
         self._outputs: dict[str, Array] = {}
         self._qpos: Array = self.batch.bind('qpos')
         self._qvel: Array = self.batch.bind('qvel')
@@ -150,6 +153,26 @@ class Task(ABC):
     def step(self) -> None:
         """Advances all simulations by one tick under the commands applied last."""
         self.batch.step(nstep=self.substeps)
+
+    def follow_model(self) -> None:
+        """Steps with the model as it is; contacts have what was written into geoms."""
+        self.pairs.follow(self.model)
+        self.batch.set_models(self.model)
+
+    def take_model(self, model: mujoco.MjModel, pairs: ListedPairs | None) -> None:
+        """Steps with a model that was changed before.
+
+        Args:
+            model: The model.
+            pairs: Its `pairs`; None where nobody knows: all of it is as it is meant, then.
+        """
+        self.batch.set_models(model)
+        self.batch.get_model(0, self.model)
+        if pairs is None:
+            self.pairs.note(self.model)
+        else:
+            self.pairs = pairs
+        self.follow_model()
 
     def output(self, name: str) -> Array:
         """Binds a derived field of `MjData`, (N, ...), live and read-only: `xpos`, `cdof`, ...

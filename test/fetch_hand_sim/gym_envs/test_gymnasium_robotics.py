@@ -264,6 +264,13 @@ def test_what_is_written_into_the_data_is_the_simulation(make):
     assert held.time == pytest.approx(before + other.dt)
 
 
+def test_goals_are_drawn_where_the_object_was_put(make):
+    env = make('HandManipulateBlock-v1')
+    env.reset(seed=0)
+    env.data.joint('object:joint').qpos[:3] = 2.0
+    assert np.abs(env._sample_goal()[:3] - 2.0).max() < 0.5
+
+
 def test_what_is_written_into_the_model_counts(make):
     heavy, light = make('FetchPush-v4'), make('FetchPush-v4')
     heavy.model.body('object0').mass *= 50.0

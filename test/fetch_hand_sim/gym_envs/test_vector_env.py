@@ -98,6 +98,19 @@ def test_successes_count_for_those_only_that_the_masks_name(mode):
             assert_same(mine[name], other[name])
 
 
+def test_actions_of_those_who_only_begin_count_for_nothing():
+    env = make_vec('FetchReach', 2, max_episode_steps=3)
+    env.reset(seed=0, options={'reset_mask': np.array([True, False])})
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.zeros((2, 4), np.float32))
+    twin = copy.deepcopy(env)
+    first = env.step(np.full((2, 4), np.nan, np.float32))
+    assert_same(first[0], twin.step(np.ones((2, 4), np.float32))[0])
+    with pytest.raises(ValueError, match='finite'):
+        env.step(np.full((2, 4), np.nan, np.float32))
+
+
 def test_without_autoreset_an_ended_episode_waits_for_its_reset():
     env = make_vec('FetchReach', 2, max_episode_steps=2, autoreset_mode='Disabled')
     env.reset(seed=0)

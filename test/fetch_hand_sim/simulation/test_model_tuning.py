@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 
 import mujoco
 import numpy as np
@@ -130,3 +131,66 @@ def test_nothing_else_differs_from_the_published_model(task):
         assert getattr(tuned, name) == getattr(published, name), name
     for name in ('body_mass', 'body_inertia', 'dof_damping', 'geom_size', 'actuator_gainprm'):
         assert getattr(tuned, name).tobytes() == getattr(published, name).tobytes(), name
+
+
+# Not margins and gaps: MuJoCo keeps those of bodies too, which the published model looks at first.
+CHANGES = {
+    'friction': 0.01,
+    'solref': [0.05, 0.7],
+    'solimp': [0.5, 0.9, 0.01, 0.4, 1.5],
+    'condim': 1,
+    'solmix': 3.0,
+    'priority': 1,
+}
+
+
+def write(model: mujoco.MjModel, field: str, geoms: np.ndarray) -> None:
+    """What friction and the rest are made to be, of some geoms."""
+    getattr(model, f'geom_{field}')[geoms] = CHANGES[field]
+    if field in ('solmix', 'priority'):
+        # These alone change nothing where both geoms have the same.
+        model.geom_friction[geoms] = 0.3
+        model.geom_solref[geoms] = [0.03, 0.8]
+
+
+@pytest.mark.parametrize('field', CHANGES)
+@pytest.mark.parametrize('task', ['HandManipulatePenFull', 'HandManipulateBlockFull'])
+def test_contacts_are_of_what_is_written_into_geoms(task, field):
+    """As in the published model, which has no list of pairs to look at first."""
+    simulation = Simulation(task, num_envs=16, num_threads=1)
+    published = published_model(task, simulation.model)
+    simulation.reset(seed=0)
+    generator = np.random.default_rng(0)
+    for _ in range(10):
+        simulation.step(generator.uniform(-1.0, 1.0, (16, 20)))
+    states = simulation.task.batch.state
+    before = [contacts(simulation.model, state) for state in states]
+    geoms = np.arange(0, simulation.model.ngeom, 2)
+    for model in (simulation.model, published):
+        write(model, field, geoms)
+    simulation.apply_model_changes()
+    found = [contacts(simulation.model, state) for state in states]
+    assert found == [contacts(published, state) for state in states]
+    assert found != before
+
+
+def test_pairs_that_somebody_wrote_himself_stay_until_their_geoms_change():
+    simulation = Simulation('HandManipulateEggFull', num_threads=1)
+    model = simulation.model
+    simulation.apply_model_changes()
+    model.pair_margin[:] = 0.001
+    simulation.apply_model_changes()
+    assert (model.pair_margin == 0.001).all()
+    twin = pickle.loads(pickle.dumps(simulation))
+    assert (twin.model.pair_margin == 0.001).all()
+    for each in (model, twin.model):
+        each.geom_margin[:], each.geom_gap[:] = 0.002, 0.001
+    for each in (simulation, twin):
+        each.apply_model_changes()
+        assert set(each.model.pair_margin.tolist()) == {0.001, 0.004}
+        assert set(each.model.pair_gap.tolist()) == {0.0, 0.002}
+    model.geom_friction[:, 0] = 0.1
+    copied = pickle.loads(pickle.dumps(simulation))
+    simulation.apply_model_changes()
+    copied.apply_model_changes()
+    assert copied.model.pair_friction.tobytes() == model.pair_friction.tobytes()

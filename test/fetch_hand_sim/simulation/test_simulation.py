@@ -252,6 +252,12 @@ def test_a_diverged_simulation_starts_again_and_the_others_go_on(
     for name, values in result.observation.items():
         assert values[2].tobytes() == fresh[name][2].tobytes()
     assert not simulation.step(action).diverged.any()
+    # MuJoCo counts each loss as the first: the state that it throws away has the counter.
+    for number, lost in enumerate((np.nan, 1e12, np.nan), 2):
+        simulation.task.batch.bind('qvel')[2, 1] = lost
+        assert simulation.step(action).diverged.tolist() == [False, False, True, False]
+        assert simulation.divergences == number
+        assert not simulation.step(action).diverged.any()
     assert not list(tmp_path.iterdir()), 'MuJoCo wrote a file into the working directory'
 
 
