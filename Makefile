@@ -17,7 +17,7 @@ STAMP := $(VENV)/.complete
 # not leak in. Bytecode that is not kept would be made again by some hundred processes.
 unexport PYTHONDONTWRITEBYTECODE PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo docs tables pictures test test-nodes test-others test-browser lint format twin bench-sim bench-view bench-camera bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
+.PHONY: help env demo docs tables pictures test test-alone test-nodes test-others test-browser lint format twin bench-sim bench-view bench-camera bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -67,10 +67,12 @@ NODE_TESTS := test/nodes test/fetch_hand_sim/replay_node \
 	test/fetch_hand_sim/episodes/test_episode_recorder.py
 
 test: lint
-	@$(MAKE) --no-print-directory --keep-going -j1 test-nodes test-others
+	@$(MAKE) --no-print-directory --keep-going -j1 test-alone test-nodes test-others
+
+test-alone: env
+	$(BIN)/python -m pytest -m 'alone and not release' $(NODE_TESTS)
 
 test-nodes: env
-	$(BIN)/python -m pytest -m 'alone and not release' $(NODE_TESTS)
 	$(BIN)/python -m pytest -m 'not alone and not release' -n 2 --dist worksteal $(NODE_TESTS)
 
 test-others: env
@@ -136,7 +138,7 @@ torture: env
 
 test-release: env
 	$(BIN)/python -m pytest -m release --timeout 1800 --durations 0
-	PYTHON=$(abspath $(BIN)/python) tools/test_release.sh
+	PYTHON="$$(cd $(BIN) && pwd)/python" tools/test_release.sh
 
 bench-episodes: env
 	$(BIN)/python bench/bench_load.py

@@ -201,7 +201,8 @@ def describe_machine(options: argparse.Namespace) -> str:
         for line in Path('/proc/cpuinfo').read_text().splitlines()
         if line.startswith('model name')
     ]
-    versions = ('mujoco', 'torch', 'stable_baselines3', 'sb3_contrib')
+    tqc = ['sb3_contrib'] if 'sb3_tqc' in options.competitors else []
+    versions = ('mujoco', 'torch', 'stable_baselines3', *tqc)
     parts = [
         models[0] if models else platform.machine(),
         f'{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start',
@@ -247,7 +248,7 @@ def write_csv(rows: Sequence[Row], columns: Sequence[str], path: Path, machine: 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, and writes the files anew after each task. Returns the exit status."""
     options = parse_arguments(arguments)
-    if importlib.util.find_spec('sb3_contrib') is None:
+    if 'sb3_tqc' in options.competitors and importlib.util.find_spec('sb3_contrib') is None:
         hint = 'pip install -r bench/requirements_her.txt'
         print(f'bench_her: sb3_contrib is missing; {hint}', file=sys.stderr)
         return 2

@@ -107,7 +107,6 @@ def train_this_project(options: argparse.Namespace) -> None:
 
 def train_stable_baselines3(options: argparse.Namespace) -> None:
     """Hindsight replay of Stable-Baselines3 with TQC or SAC."""
-    from sb3_contrib import TQC
     from stable_baselines3 import SAC, HerReplayBuffer
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_vec_env
@@ -119,7 +118,11 @@ def train_stable_baselines3(options: argparse.Namespace) -> None:
             return not examiner.done(self.num_timesteps, lambda: self.model)
 
     is_tqc = options.competitor == 'sb3_tqc'
-    algorithm, settings = (TQC, ZOO_TQC) if is_tqc else (SAC, TUNED_SAC)
+    algorithm, settings = SAC, TUNED_SAC
+    if is_tqc:
+        from sb3_contrib import TQC
+
+        algorithm, settings = TQC, ZOO_TQC
     name = f'fetch_hand_sim:fetch_hand_sim/{options.task}-v0'
     environment = make_vec_env(lambda: gymnasium.make(name), 1 if is_tqc else SAC_ENVS)
     model = algorithm(

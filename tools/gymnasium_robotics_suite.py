@@ -129,7 +129,7 @@ def main() -> int:
         directory = Path(temporary)
         try:
             fetch(args.source, directory)
-        except subprocess.CalledProcessError:
+        except (FileNotFoundError, subprocess.CalledProcessError):
             print(f'no {VERSION} of Gymnasium-Robotics at {args.source}', file=sys.stderr)
             return 3
         results = [run_tests(directory), run_examples(directory)]

@@ -90,7 +90,6 @@ def test_what_the_page_asks_for_happens(start_process: Start) -> None:
         connection.subscribe('desired_goal')
         follower = Follower(connection)
         follower.until(lambda p: p.frame is not None and p.facts.rate > 20.0, 'picture')
-        assert follower.picture.facts.missed_ticks == 0 or follower.picture.facts.rate > 0
         assert follower.picture.graphs.distance.values[-1] > 0.0
         goal = np.array([1.3, 0.8, 0.6])
         follower.robot.perform(SetGoal(goal))

@@ -73,7 +73,6 @@ def test_bad_usage_ends_with_status_2(
 def test_competitors_train_on_the_same_task(
     bench_her: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip('sb3_contrib')
     arguments = ['--tasks', 'FetchReach', '--competitors', 'this_project', 'sb3_sac']
     arguments += ['--limit', '1', '--episodes', '5', '--evaluate-every', '500', '--threads', '1']
     assert bench_her.main([*arguments, '--side-by-side', '--output', str(tmp_path)]) == 0

@@ -200,9 +200,9 @@ def test_crafted_metadata_are_refused_at_once(
     saved: Path, field: str, text: str, match: str
 ) -> None:
     rewrite(saved, **{field: text})
-    began = time.perf_counter()
+    began = time.process_time()
     assert_refused(saved, match)
-    assert time.perf_counter() - began < 1.0
+    assert time.process_time() - began < 1.0
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])

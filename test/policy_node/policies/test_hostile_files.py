@@ -66,7 +66,7 @@ def crafted(data: bytes, generator: np.random.Generator) -> bytes:
 
 def outcome(path: Path) -> str:
     """`loads`, or `refused` in one line that is safe to print."""
-    began = time.perf_counter()
+    began = time.process_time()
     try:
         load_policy(path)
     except ValueError as error:
@@ -74,7 +74,7 @@ def outcome(path: Path) -> str:
         assert line.isprintable() and len(line) < 1000, line[:2000]
         return 'refused'
     finally:
-        assert time.perf_counter() - began < 5.0
+        assert time.process_time() - began < 5.0
     return 'loads'
 
 
