@@ -9,6 +9,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from enum import Enum
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
@@ -129,8 +130,9 @@ def attempt(job: Job, command: str) -> Outcome:
         return Outcome.TAKEN
     except CommandError as error:
         # By another process, between a look and a lock.
-        if job.is_finished:
-            return Outcome.FINISHED
+        with suppress(ValueError):
+            if job.is_finished:
+                return Outcome.FINISHED
         complain('benchmark', f'{job.name}: {error}')
         return Outcome.FAILED
     except Exception:

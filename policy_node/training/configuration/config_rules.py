@@ -240,10 +240,10 @@ def _contradictions_of_values(config: ConfigFields) -> Iterator[str]:
         yield f'learning_starts needs replay_transitions of {config.learning_starts} or more'
     if config.correction != 'none' and config.n_step == 1:
         yield f'correction {config.correction} needs n_step above 1'
-    corrected = config.correction
-    if config.trace != DEFAULTS['trace'] and 'lambda' != corrected and config.algorithm != 'ppo':
+    traces = config.correction == 'lambda' or config.algorithm == 'ppo'
+    if config.trace != DEFAULTS['trace'] and not traces:
         yield 'trace needs correction lambda, or algorithm ppo'
-    if config.cut_distance != DEFAULTS['cut_distance'] and corrected != 'cut':
+    if config.cut_distance != DEFAULTS['cut_distance'] and config.correction != 'cut':
         yield 'cut_distance needs correction cut'
     if config.episode_weights != DEFAULTS['episode_weights'] and config.moved_share == 0.0:
         yield f'episode_weights {config.episode_weights} needs moved_share above 0'

@@ -24,6 +24,7 @@ from policy_node.training.replay.transitions import Transitions
 
 # How far an update may move the probability of an action (the paper's value).
 CLIP = 0.2
+# Logarithm of the largest ratio of probabilities: the exponential of 89 is beyond float32.
 LARGEST_LOG_RATIO = 20.0
 _ROOT = math.sqrt(2.0 * math.pi)
 

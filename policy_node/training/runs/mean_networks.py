@@ -29,7 +29,8 @@ def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
                 f'no mean of {first.origin["name"]} and {part.origin["name"]}: they are '
                 f'{_described(first)} and {_described(part)}'
             )
-    if any(part.norm != first.norm for part in parts):
+    kinds = [(part.norm, part.valued_by) for part in parts]
+    if any(kind != kinds[0] for kind in kinds):
         parts = [part.without_critic() for part in parts]
     most = max(1, *(part.critics for part in parts))
     first, *_ = parts = [part.with_critics(most) for part in parts]

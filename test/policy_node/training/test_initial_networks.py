@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.networks.shape_from_config import network_shape
 from policy_node.training.runs.initial_networks import CRITIC_FIRST
+from policy_node.training.runs.mean_networks import mean_of
 from policy_node.training.runs.origins import steps_behind
 from policy_node.training.runs.read_networks import read_initial_networks
 from policy_node.training.runs.run_folder import STATE_FILE
@@ -426,3 +428,10 @@ def test_a_critic_of_other_rewards_is_left_behind(
     actor = started.learner.actor.state_dict()
     for name, value in actor.items():
         assert torch.equal(value, networks.tensors[f'actor.{name}']), name
+
+
+def test_a_mean_of_networks_of_other_rewards_has_no_critic(block_run: Path) -> None:
+    networks = read_initial_networks(str(block_run))
+    assert mean_of([networks, networks]).has_critic
+    dense = replace(networks, valued_by=networks.valued_by | {'reward_type': 'dense'})
+    assert not mean_of([networks, dense]).has_critic
