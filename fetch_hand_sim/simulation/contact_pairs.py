@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 Geoms = NDArray[np.integer[Any]]
 
-# What is mixed, as `MjModel` and `MjsPair` name it.
-_MIXED = ('condim', 'friction', 'margin', 'gap', 'solref', 'solimp')
-_OF_GEOMS = (*_MIXED, 'solmix', 'priority')
+# What is mixed, as `MjModel` and `MjsPair` name it, and what says how.
+_OF_GEOMS = ('condim', 'friction', 'margin', 'gap', 'solref', 'solimp', 'solmix', 'priority')
 
 
 def mix(model: mujoco.MjModel, first: Geoms, second: Geoms) -> dict[str, NDArray[Any]]:
@@ -30,44 +29,35 @@ def mix(model: mujoco.MjModel, first: Geoms, second: Geoms) -> dict[str, NDArray
         first: (n,) their numbers.
         second: Likewise.
     """
-    one = {name: getattr(model, f'geom_{name}')[first] for name in _OF_GEOMS}
-    other = {name: getattr(model, f'geom_{name}')[second] for name in _OF_GEOMS}
-    ahead = np.sign(one['priority'] - other['priority'])
-    share = np.where(ahead == 0, _share(one['solmix'], other['solmix']), (ahead + 1) / 2)
-    larger = {
-        name: np.where(
-            _beside(ahead, one[name]) == 0,
-            np.maximum(one[name], other[name]),
-            np.where(_beside(ahead, one[name]) > 0, one[name], other[name]),
-        )
-        for name in ('condim', 'friction')
-    }
-    between = {
-        name: share[:, None] * one[name] + (1.0 - share)[:, None] * other[name]
-        for name in ('solref', 'solimp')
-    }
+    priority = model.geom_priority
+    # Of two with different priorities the one that decides, mixed with itself.
+    ahead = np.sign(priority[first] - priority[second])
+    deciding = np.where(ahead < 0, second, first), np.where(ahead > 0, first, second)
+    one, other = (
+        {name: getattr(model, f'geom_{name}')[geoms] for name in _OF_GEOMS} for geoms in deciding
+    )
+    share = _share(one['solmix'], other['solmix'])[:, None]
     # Stiffness and damping instead of a time constant are no averages.
-    is_direct = (ahead == 0) & ((one['solref'][:, 0] <= 0) | (other['solref'][:, 0] <= 0))
-    smaller = np.minimum(one['solref'], other['solref'])
+    is_direct = (one['solref'][:, :1] <= 0) | (other['solref'][:, :1] <= 0)
+    averages = {
+        name: share * one[name] + (1.0 - share) * other[name] for name in ('solref', 'solimp')
+    }
     return {
-        'condim': larger['condim'],
+        'condim': np.maximum(one['condim'], other['condim']),
         # Along two axes, about one, about two.
-        'friction': larger['friction'][:, [0, 0, 1, 2, 2]],
-        'margin': one['margin'] + other['margin'],
-        'gap': one['gap'] + other['gap'],
-        'solref': np.where(is_direct[:, None], smaller, between['solref']),
-        'solimp': between['solimp'],
+        'friction': np.maximum(one['friction'], other['friction'])[:, [0, 0, 1, 2, 2]],
+        'margin': model.geom_margin[first] + model.geom_margin[second],
+        'gap': model.geom_gap[first] + model.geom_gap[second],
+        'solref': np.where(
+            is_direct, np.minimum(one['solref'], other['solref']), averages['solref']
+        ),
+        'solimp': averages['solimp'],
     }
 
 
 def _rows(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Rows (n,) of flags (n, ...) in which there is one."""
     return np.asarray(flags.any(axis=tuple(range(1, flags.ndim))))
-
-
-def _beside(values: NDArray[Any], others: NDArray[Any]) -> NDArray[Any]:
-    """Values (n,) to stand beside others (n, ...)."""
-    return values.reshape(len(values), *[1] * (others.ndim - 1))
 
 
 def _share(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:

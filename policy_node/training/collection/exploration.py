@@ -44,8 +44,8 @@ class ActionNoise:
         self._generator = generator
         self._shape = shape
         self._std, self._epsilon = std, epsilon
-        one = np.zeros(1)
-        self._shares = 1.0 + spread * (np.linspace(-1.0, 1.0, shape[0]) if shape[0] > 1 else one)
+        places = np.linspace(-1.0, 1.0, shape[0]) if shape[0] > 1 else np.zeros(1)
+        self._shares = 1.0 + spread * places
         self._ticks = ticks
         self.share = 1.0
         self._uniform, self._noise = np.zeros(shape, np.float32), np.zeros(shape, np.float32)

@@ -10,6 +10,7 @@ from torch import nn
 
 from policy_node.training.learners.actor_critic import Losses
 from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.runs.state_checks import first_not_finite
 from policy_node.training.runs.training_state import Counters
 
 
@@ -55,9 +56,8 @@ def require_finite_networks(modules: Mapping[str, nn.Module], counters: Counters
         TrainingError: If there is one.
     """
     for name, module in modules.items():
-        for key, value in module.state_dict().items():
-            if not torch.isfinite(value).all():
-                raise TrainingError(
-                    f'{name}.{key} is not finite after update {counters.updates}, '
-                    f'after {counters.env_steps} environment steps'
-                )
+        if key := first_not_finite(module.state_dict()):
+            raise TrainingError(
+                f'{name}.{key} is not finite after update {counters.updates}, '
+                f'after {counters.env_steps} environment steps'
+            )

@@ -52,9 +52,16 @@ def require_finite(tensors: Mapping[str, Tensor]) -> None:
     Raises:
         ValueError: If there is one; the tensor is named.
     """
+    if name := first_not_finite(tensors):
+        raise ValueError(f'{name} has a value that is not finite')
+
+
+def first_not_finite(tensors: Mapping[str, Tensor]) -> str:
+    """Name of the first tensor with a value that is no finite number; empty if there is none."""
     for name, value in tensors.items():
         if value.is_floating_point() and not torch.isfinite(value).all():
-            raise ValueError(f'{name} has a value that is not finite')
+            return name
+    return ''
 
 
 def require_adam(optimizer: torch.optim.Adam, state: Mapping[int, Mapping[str, Tensor]]) -> None:

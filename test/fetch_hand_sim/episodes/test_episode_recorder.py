@@ -50,6 +50,21 @@ def ticks() -> Ticks:
     return recorded
 
 
+def recorder_into(
+    directory: Path,
+    on_error: Callable[[str], object],
+    on_slow: Callable[[str], None] = lambda line: None,
+) -> EpisodeRecorder:
+    """A recorder as a robot has it."""
+    return EpisodeRecorder(
+        directory,
+        metadata=lambda status: METADATA,
+        on_error=on_error,
+        on_logged=lambda episode: None,
+        on_slow=on_slow,
+    )
+
+
 def record(
     directory: Path,
     ticks: Ticks,
@@ -58,13 +73,7 @@ def record(
 ) -> tuple[list[str], float]:
     """Logs an episode as a robot does; returns what it complained of and its longest tick."""
     errors: list[str] = []
-    recorder = EpisodeRecorder(
-        directory,
-        metadata=lambda status: METADATA,
-        on_error=errors.append,
-        on_logged=lambda episode: None,
-        on_slow=on_slow,
-    )
+    recorder = recorder_into(directory, errors.append, on_slow)
     longest = 0.0
     for tick, messages in ticks:
         began = time.perf_counter()
@@ -203,12 +212,7 @@ def test_a_disk_that_fails_behind_the_robots_back_is_said_once(
 def test_what_a_paused_robot_receives_reaches_the_system_without_another_tick(
     tmp_path: Path, ticks: Ticks
 ) -> None:
-    recorder = EpisodeRecorder(
-        tmp_path,
-        metadata=lambda status: METADATA,
-        on_error=pytest.fail,
-        on_logged=lambda episode: None,
-    )
+    recorder = recorder_into(tmp_path, pytest.fail)
     recorder.record(*ticks[0])
     for _ in range(3):
         recorder.record_received(COMMANDS, COMMAND)
@@ -241,12 +245,7 @@ def test_a_recorder_that_has_failed_idles(
 
     monkeypatch.setattr(EpisodeWriter, 'store', fail)
     errors: list[str] = []
-    recorder = EpisodeRecorder(
-        tmp_path,
-        metadata=lambda status: METADATA,
-        on_error=errors.append,
-        on_logged=lambda episode: None,
-    )
+    recorder = recorder_into(tmp_path, errors.append)
     for tick in (*ticks, ticks[0]):
         recorder.record(*tick)
     until(lambda: bool(errors))
@@ -273,12 +272,7 @@ def test_a_disk_that_has_failed_holds_the_end_up_no_longer_than_said(
 
     monkeypatch.setattr(EpisodeWriter, 'store', late)
     monkeypatch.setattr(recorder_module, '_LAST_CHANCE', 0.1)
-    recorder = EpisodeRecorder(
-        tmp_path,
-        metadata=lambda status: METADATA,
-        on_error=lambda line: None,
-        on_logged=lambda episode: None,
-    )
+    recorder = recorder_into(tmp_path, lambda line: None)
     for tick in ticks:
         recorder.record(*tick)
     assert begun.wait(10.0)
