@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from msgs_spec.actions import command_from_action
 from msgs_spec.tasks import task_spec
+from policy_node.policies.files import one_line
 from policy_node.policies.policy import LoadedPolicy
 
 Observation = dict[str, NDArray[np.float64]]
@@ -43,9 +44,13 @@ class Commander:
         """Returns the command (action size,), command units, for one observation.
 
         Raises:
-            ValueError: If the policy gives a value that is not finite.
+            ValueError: If the policy fails, or gives a value that is not finite.
         """
-        action, _ = self._policy.predict(observation, deterministic=True)
+        try:
+            action, _ = self._policy.predict(observation, deterministic=True)
+        except Exception as error:
+            # Libraries raise types of their own, and one observation in a thousand may be the cause.
+            raise ValueError(f'{self.description} fails: {one_line(error)}') from None
         if not np.isfinite(action).all():
             raise ValueError(f'{self.description} gives a value that is not finite')
         return np.asarray(command_from_action(self.spec.robot, action), dtype=np.float64)

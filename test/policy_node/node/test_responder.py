@@ -184,6 +184,26 @@ def test_a_command_that_is_not_finite_is_never_sent(case, episode):
     assert (wire.sent, responder.unusable) == ([], 1)
 
 
+def test_a_policy_that_fails_once_answers_the_next_tick(case, episode):
+    class Moody:
+        calls = 0
+
+        def predict(self, observation, *, deterministic=True):
+            self.calls += 1
+            if self.calls == 1:
+                raise RuntimeError('INVALID_ARGUMENT: a node\nof the graph')
+            return np.zeros(4), None
+
+    _, wire, ticks = case
+    moody = Commander(LoadedPolicy(Moody(), 'FetchReach', 'actor moody.onnx'), 25.0)
+    responder = Responder(moody, episode[0], wire, lambda: 7.0)
+    with pytest.raises(ValueError, match=r'actor moody.onnx fails: INVALID_ARGUMENT: a node of'):
+        feed(responder, ticks[0])
+    assert (len(wire.sent), responder.unusable) == (0, 1)
+    feed(responder, ticks[1])
+    assert (len(wire.sent), responder.unusable) == (1, 1)
+
+
 def test_report_says_what_is_wrong(case, episode):
     responder, _, ticks = case
     health = Health('/policy_node')
