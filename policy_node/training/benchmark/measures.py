@@ -169,7 +169,7 @@ def compared(
             for group in (runs, baseline)
         )
         is_known = first and second and runs is not baseline
-        found[f'{name}_p'] = round(rank_sum_chance(first, second), 4) if is_known else ''
+        found[f'{name}_p'] = float(f'{rank_sum_chance(first, second):.4g}') if is_known else ''
     return found
 
 

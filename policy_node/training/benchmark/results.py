@@ -197,7 +197,8 @@ def draw(
     Args:
         bands: By task and arm.
         labels: By arm, in the order of their colours.
-        paper_epochs: Whether the epochs of the paper are marked on a second axis.
+        paper_epochs: Whether the epochs of the paper are marked on a second axis; without them a
+            step is one of 40 ms, at whatever rate.
     """
     from matplotlib.figure import Figure
 
@@ -249,7 +250,8 @@ def _top_of_axis(bands: Mapping[str, Mapping[str, Band]]) -> float:
 def _label(axes: Any, task: str, top: float, paper_epochs: bool) -> None:
     from matplotlib.ticker import EngFormatter
 
-    axes.set(xlabel='environment steps', ylabel='success at the last step')
+    steps = 'environment steps' if paper_epochs else 'steps of 40 ms'
+    axes.set(xlabel=steps, ylabel='success at the last step')
     axes.set_ylim(-0.02 * top, 1.02 * top)
     axes.xaxis.set_major_formatter(EngFormatter(sep=''))
     axes.set_title(task)

@@ -135,9 +135,9 @@ def _best(task: str) -> dict[str, Any]:
     if task.startswith('Fetch'):
         return values
     if task == 'HandReach':
-        # A sparse reward never finds the goals of the ring finger, whose poses lie at the limits of
-        # joints; distance leads there. Values are some fifty times smaller than those of a sparse
-        # reward, and so is what actions may cost.
+        # A sparse reward without grades never finds the goals of the ring finger, whose poses lie
+        # at the limits of joints; distance leads there. Values are some fifty times smaller than
+        # those of a sparse reward, and so is what actions may cost.
         return {
             'reward_type': 'dense',
             'layer_norm': True,
