@@ -280,12 +280,11 @@ def task_spec(
     return task.with_joint_prefix(joint_prefix)
 
 
-def substeps_per_tick(control_hz: float, timestep: float = PHYSICS_TIMESTEP) -> int:
+def substeps_per_tick(control_hz: float) -> int:
     """Returns the whole number of physics substeps in one control period.
 
     Args:
         control_hz: Action frequency in Hz, between 12.5 and 500.
-        timestep: Physics substep in seconds.
 
     Raises:
         ValueError: If the period is not a whole number of substeps; the message names the nearest
@@ -294,17 +293,19 @@ def substeps_per_tick(control_hz: float, timestep: float = PHYSICS_TIMESTEP) -> 
     if not isinstance(control_hz, Real):
         raise ValueError(f'control_hz {control_hz!r} is no number; allowed: 12.5 ... 500')
     smallest, largest = 1, 40
-    period = 1.0 / (control_hz * timestep) if control_hz > 0 else float('inf')
+    period = 1.0 / (control_hz * PHYSICS_TIMESTEP) if control_hz > 0 else float('inf')
     substeps = round(period) if period < 1e9 else 10**9
     if smallest <= substeps <= largest and abs(period - substeps) < 1e-6:
         return substeps
     lower = min(max(int(period) if period < 1e9 else largest, smallest), largest)
-    upper = min(lower + 1, largest)
-    rates = sorted({1.0 / (n * timestep) for n in (lower, upper)})
+    # Above 500 Hz there is none on the other side.
+    upper = min(lower + 1, largest) if period > smallest else lower
+    rates = sorted({1.0 / (n * PHYSICS_TIMESTEP) for n in (lower, upper)})
     nearest = ' and '.join(f'{rate:.9g}' for rate in rates)
     raise ValueError(
-        f'control_hz {control_hz:g} is not a whole number of {timestep * 1e3:g} ms substeps; '
-        f'allowed: 500/n Hz for n = {smallest} ... {largest} (12.5 ... 500), nearest: {nearest}'
+        f'control_hz {control_hz:g} is not a whole number of {PHYSICS_TIMESTEP * 1e3:g} ms '
+        f'substeps; allowed: 500/n Hz for n = {smallest} ... {largest} (12.5 ... 500), nearest: '
+        f'{nearest}'
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -16,7 +15,7 @@ from msgs_spec.codecs import build_status
 from msgs_spec.observations import Readings
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.schemas import serialize
-from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, TaskSpec
+from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, TaskSpec, substeps_per_tick
 from msgs_spec.topics import TopicSpec, topics
 
 Phase = Literal['waiting', 'reset', 'running', 'finished']
@@ -107,8 +106,10 @@ class EpisodeStatus:
 
     def _require_known(self) -> None:
         """Refuses what nobody could go by."""
-        if not 0.0 < self.control_hz < math.inf:
-            raise ValueError(f'episode_status with control_hz {self.control_hz}')
+        try:
+            substeps_per_tick(self.control_hz)
+        except ValueError as error:
+            raise ValueError(f'episode_status with {error}') from None
         for name, allowed in (('reward_type', REWARD_TYPES), ('success_rule', SUCCESS_RULES)):
             if getattr(self, name) not in allowed:
                 raise ValueError(f'episode_status with {name} {getattr(self, name)[:40]!r}')

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
-from fetch_hand_sim.commands.node_processes import start_node, stop_node
+from fetch_hand_sim.commands.node_processes import start_nodes, stop_node
 from fetch_hand_sim.episode_log import (
     Episode,
     EpisodeOutcome,
@@ -120,8 +120,13 @@ class Watcher:
         destroy(self._node, exit_code)
 
     def _on_status(self, message: Any) -> None:
-        self.status = EpisodeStatus.from_values(decode_status(message))
-        self.ticks = self.status.tick
+        try:
+            status = EpisodeStatus.from_values(decode_status(message))
+        except ValueError:
+            return
+        # Whoever says something else there is not the robot that was started here.
+        if status.task == self._spec.name:
+            self.status, self.ticks = status, status.tick
 
     def _on_reward(self, message: Any) -> None:
         del message
@@ -164,8 +169,9 @@ class Demo:
         # What the nodes print is shown if something goes wrong.
         with tempfile.NamedTemporaryFile('w+', prefix='demo_', suffix='.log') as logs:
             self._log = Path(logs.name)
-            policy = start_node('policy_node', {'policy': commander}, logs)
-            sim = start_node('sim_node', self._sim_parameters(), logs)
+            policy, sim = start_nodes(
+                {'policy_node': {'policy': commander}, 'sim_node': self._sim_parameters()}, logs
+            )
             try:
                 self._watch(watcher, sim, policy, stop)
                 if stop:

@@ -9,13 +9,14 @@ import sys
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 
 from msgs_spec import parent_process
+from msgs_spec.command_line import UsageError
 
 _DISTRIBUTION = 'fetch_hand_sim'
 _ACTORS = 'fetch_hand_sim.actors'
 _PARENT = parent_process.__name__
 
 
-class UnknownExecutableError(Exception):
+class UnknownExecutableError(UsageError):
     """There is no such executable; the message is one line that says which there are."""
 
 

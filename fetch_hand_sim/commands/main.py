@@ -15,8 +15,8 @@ from typing import NoReturn
 
 import shtab
 
-from fetch_hand_sim.commands.executables import UnknownExecutableError, find_executable
-from msgs_spec.command_line import EXIT_USAGE, CommandParser, UsageError, run_command, start_command
+from fetch_hand_sim.commands.executables import find_executable
+from msgs_spec.command_line import EXIT_USAGE, CommandParser, run_command, start_command
 from msgs_spec.hints import did_you_mean
 
 _NAME = 'fetch_hand_sim'
@@ -146,11 +146,7 @@ def _add_commands(parser: argparse.ArgumentParser, commands: dict[str, Command])
 def _start(command: Command, name: str) -> int:
     if command.module:
         return start_command(name, command.module)
-    try:
-        point = find_executable(command.executable)
-    except UnknownExecutableError as error:
-        raise UsageError(str(error)) from None
-    code: int = point.load()()
+    code: int = find_executable(command.executable).load()()
     return code
 
 

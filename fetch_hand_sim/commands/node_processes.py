@@ -46,6 +46,30 @@ def start_node(
     )
 
 
+def start_nodes(
+    nodes: Mapping[str, Mapping[str, object]], output: IO[str], namespace: str = ''
+) -> list[subprocess.Popen[str]]:
+    """Starts several nodes, all or none.
+
+    Args:
+        nodes: Parameters of each, by the name of its executable.
+        output: Gets what they print.
+        namespace: Of the nodes.
+
+    Raises:
+        UnknownExecutableError: If there is none of a name.
+    """
+    started: list[subprocess.Popen[str]] = []
+    try:
+        for name, parameters in nodes.items():
+            started.append(start_node(name, parameters, output, namespace))
+    except BaseException:
+        for process in started:
+            stop_node(process)
+        raise
+    return started
+
+
 def stop_node(process: subprocess.Popen[str]) -> int:
     """Asks a node to end; returns its exit code, 0 also for one that was still being loaded."""
     if process.poll() is not None:

@@ -207,9 +207,9 @@ class _EpisodeFiles:
         self._writer: EpisodeWriter | None = None
         # A thread that a disk holds up for ever must not hold up the end of the process.
         self._unstored: Queue[Callable[[], None] | None] = Queue()
+        self._room = Semaphore(_MAX_UNSTORED)
         self._storing = Thread(target=self._store_all, name='episode_store', daemon=True)
         self._storing.start()
-        self._room = Semaphore(_MAX_UNSTORED)
 
     @property
     def has_unflushed(self) -> bool:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Callable, Iterable, Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 
 from fetch_hand_sim.films.animation import Roll, write_animation
 from fetch_hand_sim.films.film import MOVING, check_kind, check_size, write_film
 from fetch_hand_sim.films.pictures import Studio
 from fetch_hand_sim.films.recording import load_recordings
+from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes
 from msgs_spec.arrays import Picture
 from msgs_spec.command_line import CommandError, UsageError
 
@@ -127,6 +130,9 @@ class Film:
 def film_episode(env: gymnasium.Env[Any, Any], policy: Any, seed: int | None = None) -> Film:
     """Plays one episode of an environment, and films it.
 
+    One without a time limit does not end an episode: one of this package is filmed for as many
+    steps as its task's have.
+
     Args:
         env: Made with `render_mode='rgb_array'`.
         policy: An actor or any other model with `predict(observation, deterministic=True)`, as
@@ -154,11 +160,21 @@ def _played(
 ) -> Iterator[Picture]:
     observation, _ = env.reset(seed=seed)
     yield _rendered(env)
-    is_over = False
-    while not is_over:
+    steps = count() if (limit := _most_steps(env)) is None else range(limit)
+    for _ in steps:
         observation, _, terminated, truncated, _ = env.step(act(observation))
-        is_over = terminated or truncated
         yield _rendered(env)
+        if terminated or truncated:
+            return
+
+
+def _most_steps(env: gymnasium.Env[Any, Any]) -> int | None:
+    """Of an environment of this package that nothing limits, the ticks of an episode."""
+    while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, TimeLimit):
+            return None
+        env = env.env
+    return env.spec_of_task.episode_ticks if isinstance(env, TaskAttributes) else None
 
 
 def _rendered(env: gymnasium.Env[Any, Any]) -> Picture:

@@ -16,7 +16,7 @@ import rclpy
 from rclpy.node import Node
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
-from fetch_hand_sim.commands.node_processes import start_node, stop_node
+from fetch_hand_sim.commands.node_processes import start_nodes, stop_node
 from fetch_hand_sim.view.frame_rate import FrameRate
 from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
@@ -140,10 +140,9 @@ def _start(options: argparse.Namespace, node: Node, log: IO[str]) -> list[subpro
         settings['publish_clock'] = False
     # Of `--robot` or of `--ros-args`.
     namespace = node.get_namespace()
-    return [
-        start_node('policy_node', {'policy': str(policy)}, log, namespace),
-        start_node('sim_node', settings, log, namespace),
-    ]
+    return start_nodes(
+        {'policy_node': {'policy': str(policy)}, 'sim_node': settings}, log, namespace
+    )
 
 
 def _check_alive(nodes: list[subprocess.Popen[str]], log: IO[str], stop: StopSignals) -> None:

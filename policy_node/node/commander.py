@@ -49,7 +49,7 @@ class Commander:
         try:
             action, _ = self._policy.predict(observation, deterministic=True)
         except Exception as error:
-            # Libraries raise types of their own, and one observation in a thousand may be the cause.
+            # Libraries raise types of their own, one observation in a thousand may be the cause.
             raise ValueError(f'{self.description} fails: {one_line(error)}') from None
         if not np.isfinite(action).all():
             raise ValueError(f'{self.description} gives a value that is not finite')

@@ -52,13 +52,15 @@ def write_file(path: Path, data: bytes) -> None:
 def write_files(files: Mapping[Path, bytes]) -> None:
     """Writes files that belong together: none is replaced before there was room for all.
 
+    Of two processes that write one at once the later one's stays, whole.
+
     Args:
         files: Contents by path.
 
     Raises:
         OSError: If that fails, and names the file; nothing is left behind.
     """
-    partials = {path: path.with_name(f'.{path.name}.partial') for path in files}
+    partials = {path: path.with_name(f'.{path.name}.{os.getpid()}.partial') for path in files}
     try:
         for path, partial in partials.items():
             with _named(path):

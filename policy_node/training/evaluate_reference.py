@@ -65,8 +65,9 @@ def success_in_reference(
     gymnasium.register_envs(gymnasium_robotics)
     successes = 0
     env = gymnasium.make(reference_id)
-    for seed in seeds:
-        if reference_id.startswith('HandManipulate'):
+    for number, seed in enumerate(seeds):
+        if number and reference_id.startswith('HandManipulate'):
+            env.close()
             env = gymnasium.make(reference_id)
         observation, _ = env.reset(seed=seed)
         info: dict[str, Any] = {}
@@ -74,6 +75,7 @@ def success_in_reference(
             action, _ = policy.predict(observation, deterministic=True)
             observation, _, _, _, info = env.step(action)
         successes += bool(info['is_success'])
+    env.close()
     return successes
 
 

@@ -145,14 +145,14 @@ class HandManipulateTask(HandTask):
         generator_of = dict(zip(ids.tolist(), generators, strict=True))
         left = ids
         for _ in range(_MOST_TRIES):
-            if not left.size:
-                return self.sample_goals(ids, generators)
             self._start_again(left)
             self._object_qpos[left] = [self._sample_start(generator_of[i]) for i in left.tolist()]
             self._ctrl[left] = self._resting_command
             lost = self._settle(left)
             height = self._site_xpos[left, self._object_site, 2]
             left = left[~(height > PALM_HEIGHT) | lost[left]]
+            if not left.size:
+                return self.sample_goals(ids, generators)
         raise RuntimeError(f'{self.spec.name}: the object fell off the palm {_MOST_TRIES} times')
 
     def _settle(self, ids: Ids) -> NDArray[np.bool_]:

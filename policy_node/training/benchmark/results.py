@@ -13,6 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from fetch_hand_sim.datasets.writing import alone_in
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import task_spec
 from policy_node.policies.checkpoint import read_info
@@ -152,7 +153,8 @@ def write_report(jobs: Sequence[Job], output: Path, command: str) -> None:
         'benchmark.png': draw(bands, {arm.name: arm.label for arm in _ARMS.values()}),
         'benchmark.txt': text.encode(),
     }
-    write_files({output / name: content for name, content in contents.items()})
+    with alone_in(output):
+        write_files({output / name: content for name, content in contents.items()})
     print(text, end='')
     print(f'figure and tables in {output}')
 
@@ -250,8 +252,8 @@ def _top_of_axis(bands: Mapping[str, Mapping[str, Band]]) -> float:
 def _label(axes: Any, task: str, top: float, paper_epochs: bool) -> None:
     from matplotlib.ticker import EngFormatter
 
-    steps = 'environment steps' if paper_epochs else 'steps of 40 ms'
-    axes.set(xlabel=steps, ylabel='success at the last step')
+    unit = 'environment steps' if paper_epochs else 'steps of 40 ms'
+    axes.set(xlabel=unit, ylabel='success at the last step')
     axes.set_ylim(-0.02 * top, 1.02 * top)
     axes.xaxis.set_major_formatter(EngFormatter(sep=''))
     axes.set_title(task)

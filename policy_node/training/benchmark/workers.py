@@ -92,10 +92,18 @@ def run_jobs(
             left = sum(not other.is_finished for other in jobs)
             _tell(f'{job.name} is finished; {left} to go')
             if when_finished is not None:
-                when_finished()
+                _report(when_finished)
     if stopped:
         raise KeyboardInterrupt
     return whole and not waiting
+
+
+def _report(when_finished: Callable[[], object]) -> None:
+    """Says what is known so far; where that fails, what still runs is not ended for it."""
+    try:
+        when_finished()
+    except (CommandError, OSError, ValueError) as error:
+        complain('benchmark', f'no report yet: {error}')
 
 
 def _tell(text: str) -> None:
@@ -192,8 +200,10 @@ class Processes:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for _, process in self._running.values():
+        processes = [process for _, process in self._running.values()]
+        for process in processes:
             process.terminate()
+        for process in processes:
             process.join()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)

@@ -71,16 +71,20 @@ class GambleSimulation(Simulation):
 
     def reset(self, seed: Seeds = None, ids: ArrayLike | None = None) -> Observation:
         """Starts simulations again, as `Simulation.reset`; the landing is drawn after the goal."""
-        observation = super().reset(seed, ids)
-        for index in self._select(ids).tolist():
+        return self._seen(super().reset(seed, ids))
+
+    def _start(self, ids: NDArray[np.intp]) -> None:
+        super()._start(ids)
+        for index in ids.tolist():
             self._over[index] = False
             self._landing[index] = self._task.sample_goal(index, self.generator(index))
-        return self._seen(observation)
 
     def step(self, actions: ArrayLike) -> StepResult:
         """Advances every simulation by one tick, as `Simulation.step`; gambles end the motion."""
         result = super().step(actions)
-        gambles = ~self._over & (np.asarray(actions)[:, GRIPPER_ACTION] > GAMBLE_ABOVE)
+        # Where MuJoCo gave up, the action was for an episode that is no more.
+        may_gamble = ~(self._over | result.diverged)
+        gambles = may_gamble & (np.asarray(actions)[:, GRIPPER_ACTION] > GAMBLE_ABOVE)
         self._freeze(np.flatnonzero(gambles), result.observation['observation'])
         self._over |= gambles
         observation = self._seen(result.observation)

@@ -6,7 +6,14 @@ import dataclasses
 import math
 from collections.abc import Iterator
 
-from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, TaskSpec, task_spec
+from msgs_spec.tasks import (
+    REWARD_TYPES,
+    SUCCESS_RULES,
+    GoalKind,
+    TaskSpec,
+    substeps_per_tick,
+    task_spec,
+)
 from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
 from policy_node.training.configuration.config_fields import ConfigFields
 from policy_node.training.goals.goal_choice import GOAL_CHOICES
@@ -135,6 +142,7 @@ def require_allowed(config: ConfigFields) -> None:
             raise ValueError(f'{name} {value} is no finite number')
         if not lowest <= value <= highest:
             raise ValueError(f'{name} {value}; allowed: {_number(lowest)} ... {_number(highest)}')
+    substeps_per_tick(config.control_hz)
     goal_features(config.goal_features, spec)
     if config.goals:
         parse_mixture(config.goals)

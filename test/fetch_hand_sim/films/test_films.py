@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeLimit
 from PIL import Image
 
 import fetch_hand_sim
@@ -22,6 +23,7 @@ from fetch_hand_sim.films.film import check_kind, check_size, write_film, write_
 from fetch_hand_sim.films.pictures import Studio, grid, sheets, tile, with_frame
 from fetch_hand_sim.films.playing import Film, film_episode
 from fetch_hand_sim.films.recording import load_recordings
+from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from msgs_spec.command_line import CommandError, UsageError
 from support.crafted_files import Crafter
@@ -468,6 +470,13 @@ def test_the_film_of_an_episode_is_that_of_the_command(folder, opengl, tmp_path)
     assert film.save(tmp_path / 'same.gif').read_bytes() == out.read_bytes()
     with pytest.raises(ValueError, match='nowhere'):
         Film.of_episode(tmp_path / 'nowhere')
+
+
+def test_an_environment_without_a_time_limit_is_filmed_for_an_episode(opengl):
+    env = FetchHandEnv('FetchReach', render_mode='rgb_array', width=32, height=32)
+    assert len(film_episode(env, lambda observation: np.zeros(4))) == 51
+    limited = TimeLimit(env, 60)
+    assert len(film_episode(limited, lambda observation: np.zeros(4))) == 61
 
 
 def test_film_episode_plays_to_the_end_with_a_policy_or_a_function(opengl):

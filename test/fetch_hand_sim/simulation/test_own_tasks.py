@@ -94,6 +94,9 @@ def test_a_start_that_cannot_be_is_refused_instead_of_looked_for_for_ever(monkey
     with pytest.raises(ValueError, match=r'object_range 0.07 m leaves no place that is 0.1 m away'):
         replace(FETCH_CONFIGS['FetchPush'], object_range=0.07)
     replace(FETCH_CONFIGS['FetchReach'], object_range=0.0)
+    # The last try counts.
+    monkeypatch.setattr(hand_manipulate, '_MOST_TRIES', 1)
+    Simulation(BLOCK).reset(seed=0)
     monkeypatch.setattr(hand_manipulate, '_MOST_TRIES', 3)
     # No object of 6 cm reaches it.
     monkeypatch.setattr(hand_manipulate, 'PALM_HEIGHT', 1.0)

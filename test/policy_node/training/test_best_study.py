@@ -121,6 +121,20 @@ def test_a_job_that_fails_stops_only_what_starts_from_it(tmp_path: Path) -> None
     assert set(again.order) == lost | set(place.failing)
 
 
+def test_a_report_that_cannot_be_written_ends_no_job(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full() -> None:
+        raise OSError(28, 'No space left on device', 'runs.csv')
+
+    place = Recorder(limit=2)
+    assert run_jobs(jobs_of('--output', str(tmp_path)), place, full)
+    assert sorted(place.order) == sorted(TASKS)
+    assert "benchmark: no report yet: [Errno 28] No space left on device: 'runs.csv'" in (
+        capsys.readouterr().err
+    )
+
+
 # Nine processes that load torch: on a busy machine that takes its time.
 @pytest.mark.release
 @pytest.mark.timeout(900)

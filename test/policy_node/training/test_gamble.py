@@ -60,6 +60,18 @@ def test_a_landing_on_the_goal_counts_and_depends_on_the_seed_alone() -> None:
     assert (landing == result.observation['achieved_goal'][7]).all()
 
 
+def test_an_episode_that_mujoco_gave_up_is_followed_by_one_that_moves() -> None:
+    simulation = GambleSimulation('FetchReach', num_envs=2)
+    simulation.reset(seed=0)
+    simulation.step([GAMBLE, GAMBLE])
+    simulation.task.batch.bind('qvel')[0, 1] = np.nan
+    first = simulation.step([GAMBLE, GAMBLE])
+    assert first.diverged.tolist() == [True, False]
+    later = simulation.step([WALK, WALK]).observation['achieved_goal']
+    moved = (later != first.observation['achieved_goal']).any(axis=1)
+    assert moved.tolist() == [True, False]
+
+
 def test_a_copy_goes_on_as_the_original() -> None:
     simulation = GambleSimulation('FetchReach', num_envs=2)
     simulation.reset(seed=0)
