@@ -36,14 +36,17 @@ class TopicCodec:
 
     Args:
         topic: Any topic but those of type DiagnosticArray.
+        requires_frame: Whether `decode` refuses what is said in another frame than the topic's; an
+            empty `frame_id` is none.
 
     Attributes:
         topic: The topic.
         size: Bytes of a message as this class encodes it.
     """
 
-    def __init__(self, topic: TopicSpec) -> None:
+    def __init__(self, topic: TopicSpec, *, requires_frame: bool = False) -> None:
         self.topic = topic
+        self._requires_frame = requires_frame and bool(topic.frame)
         self._is_bool = topic.type_name == 'std_msgs/msg/Bool'
         markers = np.pi * np.arange(1, topic.size + 1)
         self._template, stamped = (
@@ -74,10 +77,13 @@ class TopicCodec:
         A message of this project's layout takes a tenth of the time of any other.
 
         Raises:
-            ValueError: If the bytes are no such message or do not fit the topic.
+            ValueError: If the bytes are no such message, do not fit the topic, or are of another
+                frame where that counts.
         """
         if len(data) != self.size or any(data[run] != fixed for run, fixed in self._fixed):
             message = deserialize(self.topic.type_name, data)
+            if self._requires_frame:
+                codecs.check_frame(self.topic, message.header.frame_id)
             stamp = codecs.message_stamp(message) if self._has_stamp else 0
             return stamp, codecs.decode(self.topic, message)
         seconds, nanoseconds = _STAMP.unpack_from(data, _BODY) if self._has_stamp else (0, 0)

@@ -83,6 +83,16 @@ def decode_status(message: Any) -> dict[str, str]:
     return {pair.key: pair.value for status in message.status for pair in status.values}
 
 
+def check_frame(topic: TopicSpec, frame: str) -> None:
+    """Refuses a `frame_id` that is neither the topic's nor empty.
+
+    Raises:
+        ValueError: One line says which is allowed.
+    """
+    if frame not in ('', topic.frame):
+        raise ValueError(f'frame_id {frame[:40]!r} given; allowed: {topic.frame!r} or empty')
+
+
 def checked_size(topic: TopicSpec, values: ArrayLike) -> Array:
     """Returns `values` as float64, or raises ValueError if they do not fit the topic."""
     vector = np.asarray(values, dtype=np.float64)

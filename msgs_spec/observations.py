@@ -17,6 +17,9 @@ from msgs_spec.rotations import matrix_to_euler, quaternion_to_matrix
 from msgs_spec.tasks import PHYSICS_TIMESTEP, GoalKind, TaskSpec, substeps_per_tick
 from msgs_spec.topics import topic
 
+# Joints without a value that are named in an error.
+_NAMED = 4
+
 # What sensors say: vectors (..., topic.size) by name of the topic.
 Readings = Mapping[str, Array]
 
@@ -132,15 +135,29 @@ class ObservationAssembler:
                 leading axes, such as ticks; others are ignored.
 
         Raises:
-            ValueError: If a topic is missing or holds a value that is not finite.
+            ValueError: If a topic is missing, or a value that is needed is not finite. Others need
+                not be there, such as the efforts of a robot that measures none.
         """
         for name in (spec.name for spec in self.topics):
             if name not in vectors:
                 raise ValueError(f'no {name} for an observation of {self._task.name}')
-            if not np.isfinite(vectors[name]).all():
-                raise ValueError(f'{name}: not every value is finite')
-        return {
-            'observation': observation(self._task, vectors, self._tick_duration),
-            'achieved_goal': vectors['achieved_goal'].copy(),
-            'desired_goal': vectors['desired_goal'].copy(),
-        }
+        with np.errstate(all='ignore'):
+            found = observation(self._task, vectors, self._tick_duration)
+        goals = {name: vectors[name].copy() for name in ('achieved_goal', 'desired_goal')}
+        if not all(np.isfinite(values).all() for values in (found, *goals.values())):
+            raise ValueError(self._what_is_not_finite(vectors))
+        return {'observation': found, **goals}
+
+    def _what_is_not_finite(self, vectors: Readings) -> str:
+        for spec in self.topics:
+            strange = ~np.isfinite(vectors[spec.name].reshape(-1, spec.size)).all(axis=0)
+            if not strange.any():
+                continue
+            if spec.name != 'joint_states':
+                return f'{spec.name}: not every value is finite'
+            # Parts one after the other, each with a value for every joint.
+            labels = [f'{part.name} of {name}' for part in spec.layout for name in spec.names]
+            found = [labels[place] for place in np.flatnonzero(strange).tolist()]
+            rest = f' and {len(found) - _NAMED} more' if len(found) > _NAMED else ''
+            return f'{spec.name}: no finite {", ".join(found[:_NAMED])}{rest}'
+        return 'too large a value for an observation'

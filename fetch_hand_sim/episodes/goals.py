@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
-from msgs_spec.codecs import decode, message_stamp
+from msgs_spec.codecs import check_frame, decode, message_stamp
 from msgs_spec.topics import TopicSpec
 
 # Goals beyond, in metres, would overflow in distances and rewards sooner or later.
@@ -31,7 +31,7 @@ def accept_goal(
     if runner.is_between_episodes:
         raise ValueError('no episode is running')
     if reads_header:
-        _check_frame(topic, message.header.frame_id)
+        check_frame(topic, message.header.frame_id)
         _check_stamp(runner, message_stamp(message))
     goal = decode(topic, message)
     beyond = np.abs(goal) > FARTHEST_GOAL
@@ -39,11 +39,6 @@ def accept_goal(
         allowed = f'-{FARTHEST_GOAL:g} ... {FARTHEST_GOAL:g}'
         raise ValueError(f'{goal[beyond][0]:g} given; allowed: {allowed}')
     runner.set_goal(goal)
-
-
-def _check_frame(topic: TopicSpec, frame: str) -> None:
-    if frame not in ('', topic.frame):
-        raise ValueError(f'frame_id {frame[:40]!r} given; allowed: {topic.frame!r} or empty')
 
 
 def _check_stamp(runner: EpisodeRunner, stamp_ns: int) -> None:

@@ -44,13 +44,20 @@ class Commander:
         """Returns the command (action size,), command units, for one observation.
 
         Raises:
-            ValueError: If the policy fails, or gives a value that is not finite.
+            ValueError: If the policy fails, or gives something else than finite numbers, as many
+                as an action has.
         """
         try:
             action, _ = self._policy.predict(observation, deterministic=True)
+            action = np.asarray(action, dtype=np.float64)
         except Exception as error:
             # Libraries raise types of their own, one observation in a thousand may be the cause.
             raise ValueError(f'{self.description} fails: {one_line(error)}') from None
         if not np.isfinite(action).all():
             raise ValueError(f'{self.description} gives a value that is not finite')
+        if action.shape != (self.spec.robot.action_size,):
+            raise ValueError(
+                f'{self.description} gives shape {action.shape}; '
+                f'allowed: ({self.spec.robot.action_size},)'
+            )
         return np.asarray(command_from_action(self.spec.robot, action), dtype=np.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 from msgs_spec.diagnostics import Increase, Report
@@ -66,9 +67,9 @@ class Health:
         self._name = name
         self._responder: Responder | None = None
         self._tick_duration = 0.0
-        self._answered, self._dropped, self._unusable = Increase(), Increase(), Increase()
+        self._begin_counting()
         self._then = 0.0
-        # When there was one robot at most.
+        # When there was one robot at most, and one source of each of its topics.
         self._alone_at = -math.inf
         self._said: set[str] = set()
 
@@ -76,7 +77,11 @@ class Health:
         """Takes the robot that was found; a period begins, in seconds of the responder's clock."""
         self._responder, self._then = responder, now
         self._tick_duration = 1.0 / status.control_hz
-        self._answered, self._dropped, self._unusable = Increase(), Increase(), Increase()
+        self._begin_counting()
+
+    def _begin_counting(self) -> None:
+        self._answered, self._dropped = Increase(), Increase()
+        self._unusable, self._failed = Increase(), Increase()
 
     def stop(self) -> None:
         """Waits for a robot again."""
@@ -89,6 +94,7 @@ class Health:
         pace: Pace | None = None,
         elsewhere: Sequence[str] = (),
         missing: Sequence[str] = (),
+        publishers: Mapping[str, int] = MappingProxyType({}),
     ) -> Report:
         """Closes a period and reports on it.
 
@@ -98,6 +104,7 @@ class Health:
             pace: What the robot says of its pace; None counts as real time.
             elsewhere: Namespaces of other robots, told where there is none here.
             missing: Topics of the robot that nobody publishes, so that it cannot be answered.
+            publishers: How many publish each of its topics.
         """
         if self._responder is None:
             report = Report(self._name, '', {'robots': str(robots)}, 'waits for a robot')
@@ -110,11 +117,15 @@ class Health:
             )
         if robots and missing:
             report.warn(f'no state: nobody publishes {", ".join(missing)}')
-        if robots <= 1:
+        shared = [f'{count} publish {name}' for name, count in publishers.items() if count > 1]
+        if robots <= 1 and not shared:
             self._alone_at = now
         # One that was killed and its successor are one.
         elif now - self._alone_at > MEMORY_OF_THE_GRAPH:
-            report.warn(f'{robots} robots publish here; give each a namespace')
+            if robots > 1:
+                report.warn(f'{robots} robots publish here; give each a namespace')
+            else:
+                report.warn(f'state of several: {", ".join(shared)}')
         return report
 
     def news(self, report: Report) -> list[str]:
@@ -141,7 +152,9 @@ class Health:
             'rate (Hz)': f'{rate:.2f}',
             **{f'inference {name} (ms)': value for name, value in inference.items()},
             'incomplete ticks dropped': str(responder.join.dropped),
+            'ticks overtaken': str(responder.overtaken),
             'unusable messages': str(responder.unusable),
+            'failures of the policy': str(responder.failed),
             'observation age (s)': '-' if age is None else f'{age:.3f}',
         }
         task = responder.commander.spec.name
@@ -150,6 +163,9 @@ class Health:
         dropped = self._dropped.since(responder.join.dropped)
         if dropped:
             report.warn(f'incomplete ticks: {dropped:.0f} dropped')
+        failed = self._failed.since(responder.failed)
+        if failed:
+            report.fail(f'no command: {failed:.0f} times, {responder.last_failure}')
         unusable = self._unusable.since(responder.unusable)
         if unusable:
             report.warn(f'unusable messages: {unusable:.0f}')

@@ -56,6 +56,7 @@ class PolicyNode(Node):
         self._settings = declare_parameters(self, POLICY_NODE)
         self._loaded = self._load_ahead()
         self._status: EpisodeStatus | None = None
+        self._refused: EpisodeStatus | None = None
         self._status_stamp = 0
         self._responder: Responder | None = None
         self._answered_status: EpisodeStatus | None = None
@@ -89,12 +90,22 @@ class PolicyNode(Node):
                     # Only then the middleware lets go of topics that the next robot may type anew.
                     loop.serve_pending(_SERVED_AT_ONCE)
                 if self._responder is not None:
-                    self._responder.send_unsent()
+                    self._answer(self._responder, loop)
                 elif self._status is not None:
                     self._start(self._status, loop, stop)
                 self._report_when_due()
         finally:
             loop.close()
+
+    def _answer(self, responder: Responder, loop: EventLoop) -> None:
+        if responder.is_due:
+            # Of a robot that is faster than its policy, what came meanwhile is newer.
+            loop.serve_pending(_SERVED_AT_ONCE)
+        try:
+            responder.answer()
+        except ValueError as error:
+            self.get_logger().warning(f'no command: {error}', **seldom(_WARN_PERIOD))
+        responder.send_unsent()
 
     def _load_ahead(self) -> LoadedPolicy | None:
         """Loads what can be loaded before a robot says its task: mistakes show at once."""
@@ -162,23 +173,39 @@ class PolicyNode(Node):
         for parameter in parameters:
             if parameter.name != 'policy' or not result.successful:
                 continue
-            # One that is gone may be followed by a robot of another task.
-            status = self._status if self.count_publishers(self._status_name) else None
-            settings = self._settings
-            task = status.task if status else settings['task'] or None
             try:
-                loaded = load_policy(parameter.value, task, trust=settings['trust'])
-                if status is not None:
-                    Commander(loaded, status.control_hz)
-                self._loaded = loaded
-            except TaskMissing:
-                self._loaded = None
+                self._loaded, self._status = self._load_for_one(parameter.value)
             except ValueError as error:
                 return SetParametersResult(successful=False, reason=str(error))
-            settings['policy'] = parameter.value
-            self._status = status
+            self._settings['policy'] = parameter.value
+            self._refused = None
             self._is_replaced = self._answered_status is not None
         return result
+
+    def _load_for_one(self, name: str) -> tuple[LoadedPolicy | None, EpisodeStatus | None]:
+        """Returns a policy and the robot it is for; None for what is not known yet.
+
+        Raises:
+            ValueError: If there is no such policy, or it fits no robot; one line says why.
+        """
+        is_there = self.count_publishers(self._status_name) > 0
+        known = [each for each in (self._status, self._refused) if each is not None]
+        # One that is gone may be followed by a robot of another task.
+        robots = [*known] if known and is_there else [None]
+        problems = []
+        for status in robots:
+            task = status.task if status else self._settings['task'] or None
+            try:
+                loaded = load_policy(name, task, trust=self._settings['trust'])
+                if status is not None:
+                    Commander(loaded, status.control_hz)
+            except TaskMissing:
+                return None, status
+            except ValueError as error:
+                problems.append(error)
+            else:
+                return loaded, status
+        raise problems[0]
 
     def _leave(self) -> None:
         """Lets go of the robot that was answered; another policy, or another robot, follows."""
@@ -252,12 +279,34 @@ class PolicyNode(Node):
             self.get_logger().warning(f'ignored: {error}', **seldom(_WARN_PERIOD))
             return
         stamp = message_stamp(message)
+        if not self._may_follow(status):
+            return
         # A robot that was started again, or an episode that is replayed again.
         if self._responder is not None and (
             status.phase == 'waiting' or stamp < self._status_stamp
         ):
             self._responder.forget()
         self._status, self._status_stamp = status, stamp
+
+    def _may_follow(self, status: EpisodeStatus) -> bool:
+        """Whether who speaks is the robot that is answered, or another that the policy fits.
+
+        A stranger in the namespace does not end what is between a robot and its policy.
+        """
+        answered, refused = self._answered_status, self._refused
+        if answered is None or status.is_of_same_robot(answered) or self._is_replaced:
+            return True
+        if refused is not None and status.is_of_same_robot(refused):
+            return False
+        try:
+            Commander(self._load_for(status), status.control_hz)
+        except ValueError as error:
+            self._refused = status
+            self.get_logger().warning(
+                f'ignored: a robot of {status.task} at {status.control_hz:g} Hz: {error}'
+            )
+            return False
+        return True
 
     def _on_diagnostics(self, message: Any) -> None:
         pace = read_pace(message, self.get_namespace())
@@ -272,7 +321,9 @@ class PolicyNode(Node):
         robots = self.count_publishers(self._status_name)
         elsewhere = [] if robots or now < self._elsewhere_from else self._robots_elsewhere()
         pace = self._pace if now < self._pace_until else None
-        report = self._health.report(now, robots, pace, elsewhere, missing)
+        state = [each for each in self._of_robot if isinstance(each, Subscription)]
+        publishers = {each.topic_name: self.count_publishers(each.topic_name) for each in state}
+        report = self._health.report(now, robots, pace, elsewhere, missing, publishers)
         self._diagnostics.publish(encode_reports(report))
         for line in self._health.news(report):
             self.get_logger().warning(line)

@@ -16,11 +16,18 @@ from msgs_spec.tasks import task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
 from policy_node.node.commander import Commander
-from policy_node.node.stamp_join import StampJoin
+from policy_node.node.stamp_join import StampJoin, Vectors
+from policy_node.policies.files import one_line
+
+# Seconds until a policy that failed is asked again about the same tick.
+_ASK_AGAIN = 1.0
 
 
 class Responder:
-    """Answers each complete tick of one robot with one command.
+    """Answers the newest complete tick of one robot with one command.
+
+    `receive` takes what comes, `answer` follows once nothing more is waiting: of a robot that is
+    faster than its policy, ticks are left out instead of answered ever later.
 
     Args:
         commander: Who decides.
@@ -33,7 +40,10 @@ class Responder:
         topics: The topics it needs.
         join: Joins them by stamp.
         answered: Commands sent.
-        unusable: Messages that could not be read, or held a value that is not finite.
+        overtaken: Complete ticks that were not answered because a newer one was there.
+        unusable: Messages that could not be read, and ticks of which no observation can be made.
+        failed: Observations that the policy had no command for.
+        last_failure: What it said at the last of them.
         inference: Wall time from a complete observation to its command.
         received_at: When the last observation was complete, seconds of the clock.
         interval: Seconds between the last two; infinite before.
@@ -52,18 +62,27 @@ class Responder:
         self._send = send
         self._clock = clock
         self._commands = TopicCodec(topic(spec, 'commands'))
-        self._sources = {source.name: TopicCodec(source) for source in self._assembler.topics}
+        self._sources = {
+            source.name: TopicCodec(source, requires_frame=True)
+            for source in self._assembler.topics
+        }
+        self._due: Vectors | None = None
+        self._asked: dict[str, NDArray[np.float64]] | None = None
+        self._ask_again_at = 0.0
         self._unsent: bytes | None = None
         self.topics = self._assembler.topics
         self.join = StampJoin(source.name for source in self.topics)
         self.answered = 0
+        self.overtaken = 0
         self.unusable = 0
+        self.failed = 0
+        self.last_failure = ''
         self.inference = Durations()
         self.received_at: float | None = None
         self.interval = math.inf
 
     def receive(self, name: str, data: bytes) -> None:
-        """Takes one message; the one that completes a tick is answered.
+        """Takes one message; with the one that completes a tick, that tick is due.
 
         Args:
             name: Its topic.
@@ -74,12 +93,34 @@ class Responder:
         """
         try:
             stamp, vector = self._sources[name].decode(data)
-            vectors = self.join.add(name, stamp, vector)
-            if vectors is not None:
-                self._answer(self._assembler.assemble(vectors))
         except ValueError:
             self.unusable += 1
             raise
+        vectors = self.join.add(name, stamp, vector)
+        if vectors is not None:
+            self.overtaken += self.is_due
+            self._due = vectors
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a complete tick waits for its answer."""
+        return self._due is not None
+
+    def answer(self) -> None:
+        """Answers the tick that is due, if there is one.
+
+        One that the policy had no command for is asked about again once a second until a newer one
+        is there: in lockstep there is none before it has an answer.
+
+        Raises:
+            ValueError: If there is no answer, in one line; it is counted.
+        """
+        if self._due is not None:
+            self._asked = self._observed(self._due)
+        elif self._asked is None or self._clock() < self._ask_again_at:
+            return
+        self._answer(self._asked)
+        self._asked = None
 
     def send_unsent(self) -> None:
         """Sends the last command if nobody has heard it yet."""
@@ -90,14 +131,29 @@ class Responder:
     def forget(self) -> None:
         """Starts anew with a robot that did: its stamps begin again."""
         self.join.forget()
-        self._unsent = None
+        self._due = self._asked = self._unsent = None
+
+    def _observed(self, vectors: Vectors) -> dict[str, NDArray[np.float64]]:
+        self._due = self._asked = None
+        try:
+            return self._assembler.assemble(vectors)
+        except Exception as error:
+            # Formulas of somebody's own task may raise anything.
+            self.unusable += 1
+            raise ValueError(f'no observation: {one_line(error)}') from None
 
     def _answer(self, observation: dict[str, NDArray[np.float64]]) -> None:
         began = self._clock()
         if self.received_at is not None:
             self.interval = began - self.received_at
         self.received_at = began
-        command = self.commander.command(observation)
+        try:
+            command = self.commander.command(observation)
+        except ValueError as error:
+            self.failed += 1
+            self.last_failure = str(error)
+            self._ask_again_at = began + _ASK_AGAIN
+            raise
         self.inference.add(self._clock() - began)
         self._unsent = self._commands.encode(0, command)
         self.send_unsent()

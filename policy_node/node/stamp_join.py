@@ -18,11 +18,15 @@ class StampJoin:
 
     Stamps that are incomplete when a later one completes are dropped, and so is everything that
     arrives for a stamp no later than the last complete one: an actor wants the newest state, not
-    every state.
+    every state. A stamp of long before is a simulation started anew as soon as it is complete; a
+    stranger's message on one of the topics, with a stamp from anywhere, is never.
 
     Args:
         topics: Names of the topics to join.
-        max_pending: Incomplete stamps kept; the oldest goes first.
+        max_pending: Incomplete stamps kept; the one that came first goes first.
+
+    Attributes:
+        dropped: Incomplete stamps that were given up.
     """
 
     def __init__(self, topics: Iterable[str], max_pending: int = 8) -> None:
@@ -43,17 +47,15 @@ class StampJoin:
         Returns:
             The vectors of all topics if they are complete for this stamp, else None.
         """
-        if self._last is not None and stamp <= self._last:
-            if self._last - stamp <= _LONGEST_DELAY:
-                return None
-            self.forget()
+        if self._last is not None and 0 <= self._last - stamp <= _LONGEST_DELAY:
+            return None
         vectors = self._pending.setdefault(stamp, {})
         vectors[topic] = vector
         if vectors.keys() == self._topics:
             self._complete(stamp)
             return vectors
         while len(self._pending) > self._max_pending:
-            del self._pending[min(self._pending)]
+            del self._pending[next(iter(self._pending))]
             self.dropped += 1
         return None
 
@@ -64,7 +66,9 @@ class StampJoin:
 
     def _complete(self, stamp: int) -> None:
         self._last = stamp
-        incomplete = [other for other in self._pending if other < stamp]
-        self.dropped += len(incomplete)
-        for other in (*incomplete, stamp):
+        del self._pending[stamp]
+        # Late by now, or of the time before a new beginning.
+        lost = [other for other in self._pending if not stamp < other <= stamp + _LONGEST_DELAY]
+        self.dropped += len(lost)
+        for other in lost:
             del self._pending[other]

@@ -130,9 +130,8 @@ def test_needed_topics_are_needed(name):
     for missing in needed:
         with pytest.raises(ValueError, match=f'no {missing} for an observation of {name}'):
             assembler.assemble({key: vectors[key] for key in needed if key != missing})
-        broken = vectors[missing].copy()
-        broken[-1] = np.nan
-        with pytest.raises(ValueError, match=f'{missing}: not every value is finite'):
+        broken = np.full_like(vectors[missing], np.nan)
+        with pytest.raises(ValueError, match=f'{missing}: (not every value is|no) finite'):
             assembler.assemble(vectors | {missing: broken})
 
 

@@ -72,6 +72,7 @@ def batch_run(spec: TaskSpec, episodes: int) -> list[dict[str, list[bytes]]]:
         published = {source.name: data for source, data in messages}
         for source in responder.topics:
             responder.receive(source.name, published[source.name])
+        responder.answer()
         command = deserialize('std_msgs/msg/Float64MultiArray', sent[-1])
         buffer.accept(command.data)
         if tick.status.phase != 'finished':

@@ -231,20 +231,38 @@ def test_topics_that_a_robot_lacks_are_named(start_process: Start) -> None:
     assert 'commands come from' not in output
 
 
-def test_a_robot_of_a_rate_that_physics_has_not_is_refused(start_process: Start) -> None:
-    """By a policy for any rate, too; what is no rate at all comes from no robot."""
+def test_a_robot_of_a_rate_that_physics_has_not_is_none(start_process: Start) -> None:
     policy = start_process(*POLICY_NODE, *ros_args(policy='random'))
     with client(REACH) as robot:
         robot.connect('episode_status')
         for control_hz in ('0', '30.0'):
             publish_status(robot, control_hz=control_hz)
-            robot.spin(0.5)
-        robot.spin_until(lambda: policy.poll() is not None, 'end of the policy')
-    code, output = finish(policy)
-    assert code == 1
-    assert 'ignored: episode_status with control_hz 0.0' in output
-    assert 'policy_node: control_hz 30 is not' in output
+            robot.spin(1.5)
+    assert policy.poll() is None
+    output = end(policy)
+    for control_hz in ('0', '30'):
+        assert f'ignored: episode_status with control_hz {control_hz} is not' in output
     assert 'Traceback' not in output
+
+
+def test_a_robot_that_does_not_fit_ends_nothing_that_works(start_process: Start) -> None:
+    policy = start_process(*POLICY_NODE, *ros_args(policy='FetchReach'))
+    sim = _answered_robot(start_process, REACH)
+    with client(REACH) as robot:
+        robot.subscribe('applied_command')
+        robot.connect('episode_status')
+        for values in ({'control_hz': '50.0'}, {'task': 'HandReach'}):
+            publish_status(robot, **values)
+            robot.spin(0.5)
+        count = len(robot.received['applied_command'])
+        robot.spin_until(
+            lambda: len(robot.received['applied_command']) > count + 10, 'more commands'
+        )
+    end(sim)
+    output = end(policy)
+    assert 'ignored: a robot of FetchReach at 50 Hz: actor FetchReach.safetensors was' in output
+    assert 'ignored: a robot of HandReach at 25 Hz: ' in output
+    assert 'the robot changed' not in output
 
 
 @pytest.mark.alone

@@ -105,6 +105,7 @@ def test_a_policy_answers_a_robot_with_renamed_joints(task, simulations):
     for spec, data in messages:
         if spec.name in {source.name for source in responder.topics}:
             responder.receive(spec.name, data)
+    responder.answer()
     assert (len(sent), responder.unusable) == (1, 0)
 
 

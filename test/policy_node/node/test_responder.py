@@ -13,7 +13,7 @@ from msgs_spec.actions import command_from_action
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode
 from msgs_spec.diagnostics import Level, Report, encode_reports
-from msgs_spec.schemas import deserialize
+from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import topic
@@ -62,6 +62,13 @@ def case(episode):
 def feed(responder, tick):
     for source in responder.topics:
         responder.receive(source.name, tick[source.name])
+    responder.answer()
+
+
+def moved(tick, name, stamp):
+    """A message of a tick with another stamp."""
+    codec = TopicCodec(topic(REACH, name))
+    return codec.encode(stamp, codec.decode(tick[name])[1])
 
 
 def test_each_tick_gets_one_command_whatever_the_order(case):
@@ -70,6 +77,7 @@ def test_each_tick_gets_one_command_whatever_the_order(case):
         names = [source.name for source in responder.topics]
         for name in np.random.default_rng(index).permutation(names):
             responder.receive(str(name), tick[str(name)])
+        responder.answer()
         feed(responder, tick)  # once more, as a robot in lockstep may send it
     assert len(wire.sent) == len(ticks) == responder.answered
     message = deserialize('std_msgs/msg/Float64MultiArray', wire.sent[0])
@@ -138,6 +146,7 @@ def test_hostile_bytes_are_refused_in_one_line_and_counted(case, hostile_count):
             data += bytes(generator.integers(0, 256, generator.integers(1, 2000)).tolist())
         try:
             responder.receive(name, bytes(data))
+            responder.answer()
         except ValueError as error:
             refused += 1
             assert len(str(error)) < 1000
@@ -181,7 +190,18 @@ def test_a_command_that_is_not_finite_is_never_sent(case, episode):
     responder = Responder(lost, episode[0], wire, lambda: 7.0)
     with pytest.raises(ValueError, match=r'actor lost.onnx gives a value that is not finite'):
         feed(responder, ticks[0])
-    assert (wire.sent, responder.unusable) == ([], 1)
+    assert (wire.sent, responder.failed, responder.unusable) == ([], 1, 0)
+
+
+@pytest.mark.parametrize('answer', [None, [[0.0, 0.0, 0.0, 0.0]], ['left'], {'action': 0}])
+def test_an_answer_that_is_no_action_is_one_line(answer):
+    class Strange:
+        def predict(self, observation, *, deterministic=True):
+            return answer, None
+
+    strange = Commander(LoadedPolicy(Strange(), 'FetchReach', 'actor strange.onnx'), 25.0)
+    with pytest.raises(ValueError, match=r'actor strange.onnx (fails: |gives )'):
+        strange.command({'observation': np.zeros(10)})
 
 
 def test_a_policy_that_fails_once_answers_the_next_tick(case, episode):
@@ -196,12 +216,105 @@ def test_a_policy_that_fails_once_answers_the_next_tick(case, episode):
 
     _, wire, ticks = case
     moody = Commander(LoadedPolicy(Moody(), 'FetchReach', 'actor moody.onnx'), 25.0)
-    responder = Responder(moody, episode[0], wire, lambda: 7.0)
+    now = [7.0]
+    responder = Responder(moody, episode[0], wire, lambda: now[0])
     with pytest.raises(ValueError, match=r'actor moody.onnx fails: INVALID_ARGUMENT: a node of'):
         feed(responder, ticks[0])
-    assert (len(wire.sent), responder.unusable) == (0, 1)
+    assert (len(wire.sent), responder.failed, responder.unusable) == (0, 1, 0)
+    health = Health('/policy_node')
+    health.start(responder, episode[0], 6.0)
+    report = health.report(7.0, 1)
+    assert report.level == Level.ERROR
+    assert report.message == (
+        'no command: 1 times, actor moody.onnx fails: INVALID_ARGUMENT: a node of the graph'
+    )
+    # In lockstep the robot waits for this answer.
+    now[0] = 7.9
+    responder.answer()
+    assert wire.sent == []
+    now[0] = 8.0
+    responder.answer()
+    responder.answer()
+    assert (len(wire.sent), responder.failed) == (1, 1)
+    feed(responder, ticks[0])
     feed(responder, ticks[1])
-    assert (len(wire.sent), responder.unusable) == (1, 1)
+    assert len(wire.sent) == 2
+    assert health.report(8.0, 1).level == Level.OK
+
+
+def test_of_ticks_that_wait_the_newest_is_answered(case):
+    responder, wire, ticks = case
+    for tick in ticks:
+        for source in responder.topics:
+            responder.receive(source.name, tick[source.name])
+    assert responder.is_due
+    responder.answer()
+    assert not responder.is_due
+    responder.answer()
+    assert (len(wire.sent), responder.overtaken) == (1, len(ticks) - 1)
+
+
+@pytest.mark.parametrize('stamp', [0, 10**18])
+def test_a_stranger_on_a_topic_keeps_nobody_from_being_answered(case, stamp):
+    """With a stamp of 0, as `ros2 topic pub` gives, or of wall time."""
+    responder, wire, ticks = case
+    second = 10**9
+    for number, tick in enumerate(ticks):
+        at = (100 * second) + number * 40_000_000
+        for source in responder.topics:
+            responder.receive(source.name, moved(tick, source.name, at))
+            responder.receive('desired_goal', moved(tick, 'desired_goal', stamp + number))
+        responder.answer()
+    assert len(wire.sent) == len(ticks)
+
+
+def test_many_stamps_of_the_future_do_not_silence_a_policy(case):
+    responder, wire, ticks = case
+    for number in range(12):
+        message = moved(ticks[0], 'desired_goal', 10**18 + number)
+        responder.receive('desired_goal', message)
+    for tick in ticks:
+        feed(responder, tick)
+    assert len(wire.sent) == len(ticks)
+
+
+def test_what_the_observation_does_not_need_may_be_missing(case):
+    """As efforts of a robot that measures none; what it needs is named."""
+    responder, wire, ticks = case
+    source = topic(REACH, 'joint_states')
+    stamp, vector = TopicCodec(source).decode(ticks[0]['joint_states'])
+    count = len(source.names)
+    vector[2 * count :] = math.nan
+    feed(responder, ticks[0] | {'joint_states': TopicCodec(source).encode(stamp, vector)})
+    assert len(wire.sent) == 1
+    vector[count - 1] = math.inf
+    bad = ticks[1] | {'joint_states': TopicCodec(source).encode(stamp + 40_000_000, vector)}
+    finger = source.names[-1]
+    with pytest.raises(ValueError, match=f'joint_states: no finite position of {finger}, effort'):
+        feed(responder, bad)
+
+
+def test_a_pose_in_another_frame_is_no_state(case):
+    responder, _, ticks = case
+    source = topic(REACH, 'end_effector_pose')
+    message = deserialize(source.type_name, ticks[0][source.name])
+    for frame, is_refused in (('base_link', True), ('', False), ('world', False)):
+        message.header.frame_id = frame
+        data = serialize(source.type_name, message)
+        if is_refused:
+            with pytest.raises(ValueError, match=r"frame_id 'base_link' given; allowed: 'world'"):
+                responder.receive(source.name, data)
+        else:
+            responder.receive(source.name, data)
+    assert responder.unusable == 1
+
+
+def test_a_second_source_of_a_topic_is_named():
+    health, publishers = Health('/policy_node'), {'/joint_states': 1, '/desired_goal': 2}
+    health.report(5.0, 1)
+    assert health.report(10.0, 1, publishers=publishers).level == Level.OK
+    report = health.report(40.0, 1, publishers=publishers)
+    assert report.message == 'state of several: 2 publish /desired_goal'
 
 
 def test_report_says_what_is_wrong(case, episode):
