@@ -19,6 +19,8 @@ from msgs_spec.schemas import serialize
 from msgs_spec.topics import DIAGNOSTICS
 
 REPORT_PERIOD = 1.0
+# What a stamp can say, whose seconds are an int32: a machine may believe that it is 2038.
+_LATEST = (2**31 - 1) * 10**9
 
 
 def next_report(due: float, now: float) -> float:
@@ -81,7 +83,7 @@ def encode_reports(*reports: Report) -> bytes:
     It is stamped with wall time, as REP 107 has it, whatever clock the node follows: what it says
     is of that time, and the reports of several nodes can be put in order.
     """
-    stamp_ns = time.time_ns()
+    stamp_ns = min(time.time_ns(), _LATEST)
     message, *others = (
         build_status(
             DIAGNOSTICS,

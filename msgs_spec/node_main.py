@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, MutableMapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol
@@ -47,6 +50,7 @@ class StopSignals:
 
     def __init__(self) -> None:
         self.received: str | None = None
+        self._count = 0
         for number in heard([signal.SIGINT, signal.SIGTERM, signal.SIGHUP]):
             signal.signal(number, self._handle)
 
@@ -57,6 +61,12 @@ class StopSignals:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
         self.received = signal.Signals(number).name
+        self._count += 1
+
+    def watch(self) -> Callable[[], bool]:
+        """Returns what says whether another signal has come since now."""
+        before = self._count
+        return lambda: self._count > before
 
 
 class RunnableNode(Protocol):
@@ -139,6 +149,7 @@ def run_node(
     # First of all: what follows takes long enough for people to change their mind.
     stop = StopSignals()
     keep_discovery_local()
+    find_place_for_logs()
     if not shared_memory:
         leave_out_shared_memory()
     try:
@@ -166,6 +177,20 @@ def run_node(
     finally:
         rclpy.try_shutdown()
     return EXIT_SUCCESS
+
+
+def find_place_for_logs(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Without a home that may be written to, as in many a container, ROS starts no node."""
+    if any(map(environment.get, ('ROS_LOG_DIR', 'ROS_HOME'))):
+        return
+    home = environment.get('HOME', '')
+    folder = os.path.join(home, '.ros', 'log')
+    while home and not os.path.exists(folder):
+        folder = os.path.dirname(folder)
+    if not home or not os.access(folder, os.W_OK):
+        # Where not even that can be written, ROS says so.
+        with suppress(FileNotFoundError):
+            environment['ROS_LOG_DIR'] = tempfile.gettempdir()
 
 
 def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any) -> None:

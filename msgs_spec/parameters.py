@@ -151,7 +151,7 @@ SIM_NODE = (
         'joint_prefix',
         'string',
         JOINT_PREFIX,
-        'What the names of joints begin with in joint_states and joint_commands, such as rh_.',
+        'What the names of joints begin with in joint_states and joint_commands, such as left_.',
         longest=LONGEST_JOINT_PREFIX,
     ),
     ParameterSpec(

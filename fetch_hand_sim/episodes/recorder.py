@@ -37,6 +37,10 @@ _MAX_UNSTORED = 16
 # Seconds of waiting that are worth a line, and seconds between two lines.
 _SLOW = 0.1
 _SLOW_PERIOD = 10.0
+# Seconds between two looks at whether anybody still waits for the disk at the end, and seconds
+# after which it is said that this is what is waited for.
+_LOOK_AFTER = 0.1
+_PATIENCE = 3.0
 # Seconds that a disk which has failed may still hold up the end.
 _LAST_CHANCE = 5.0
 
@@ -124,12 +128,34 @@ class EpisodeRecorder:
         if self._status is not None:
             self._put(partial(self._files.write_received, topic, data, is_refused))
 
-    def close(self, reason: str) -> None:
-        """Completes everything, also what is still being completed."""
+    def close(self, reason: str, gives_up: Callable[[], bool] = lambda: False) -> None:
+        """Completes everything, also what is still being completed.
+
+        Args:
+            reason: What cuts the running episode short, if there is one.
+            gives_up: Asked now and then while the disk takes its time: whether to leave what it
+                has not taken, which `recover_episodes` completes.
+        """
         self._end(reason)
         self._backlog.close()
-        self._thread.join(_LAST_CHANCE if self.has_failed else None)
-        self._files.close(_LAST_CHANCE if self.has_failed else None)
+        began = time.monotonic()
+        self._await(self._thread, gives_up, began)
+        self._files.finish()
+        self._await(self._files.storing, gives_up, began)
+
+    def _await(self, thread: Thread, gives_up: Callable[[], bool], began: float) -> None:
+        """Waits for the end of a thread that a disk may hold up, also for ever."""
+        if self.has_failed:
+            thread.join(_LAST_CHANCE)
+            return
+        has_said = False
+        while thread.is_alive() and not self.has_failed:
+            thread.join(_LOOK_AFTER)
+            if gives_up():
+                self._fail('episode log stopped: the disk was not waited for any more')
+            elif not has_said and time.monotonic() - began > _PATIENCE:
+                has_said = True
+                self._on_slow('waiting for the disk; another signal (Ctrl-C) gives up')
 
     def _end(self, reason: str | None) -> None:
         """Completes the running episode, if there is one; with a reason, marked as cut short."""
@@ -208,8 +234,8 @@ class _EpisodeFiles:
         # A thread that a disk holds up for ever must not hold up the end of the process.
         self._unstored: Queue[Callable[[], None] | None] = Queue()
         self._room = Semaphore(_MAX_UNSTORED)
-        self._storing = Thread(target=self._store_all, name='episode_store', daemon=True)
-        self._storing.start()
+        self.storing = Thread(target=self._store_all, name='episode_store', daemon=True)
+        self.storing.start()
 
     @property
     def has_unflushed(self) -> bool:
@@ -243,10 +269,9 @@ class _EpisodeFiles:
             writer.end(episode_result(status), reason)
             self._unstored.put(partial(self._store, writer, status, reason is None))
 
-    def close(self, seconds: float | None) -> None:
-        """Waits until all files are on the disk; so long at most, None for as long as it takes."""
+    def finish(self) -> None:
+        """Nothing more comes: `storing` ends once all files are on the disk."""
         self._unstored.put(None)
-        self._storing.join(seconds)
 
     def _store_all(self) -> None:
         """Stores files until there are no more; runs in a thread of its own."""

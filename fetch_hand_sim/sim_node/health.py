@@ -157,7 +157,8 @@ class Health:
             report.warn(f'{line}; {robot.buffer.last_far_out}')
         goals_rejected = growth['goals_rejected'].since(robot.counters.goals_rejected)
         if goals_rejected:
-            report.warn(f'{goals_rejected:.0f} goals rejected')
+            reason = robot.counters.last_goal_rejection
+            report.warn(f'{goals_rejected:.0f} goals rejected; {reason}')
 
 
 def lasting_problems(robot: Robot, surroundings: Surroundings) -> list[tuple[Level, str]]:

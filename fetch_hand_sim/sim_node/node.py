@@ -5,7 +5,9 @@ One thread does everything but completing log files, because a tick takes 2 ms o
 
 from __future__ import annotations
 
+import errno
 import gc
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -38,7 +40,6 @@ from msgs_spec.ros import (
     await_acknowledgements,
     rclpy_profile,
     ros_message_class,
-    seldom,
 )
 from msgs_spec.ros_parameters import declare_parameters, set_callback
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
@@ -49,6 +50,8 @@ _WARN_PERIOD = 1.0
 _BEAT_TIME = 0.01
 # Callbacks that are served before a tick which is due: far more than an orderly network leaves.
 _SERVED_FIRST = 100
+# What may happen to a disk, and stops the log alone; another error names no place for one.
+_OF_A_DISK = (errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO)
 # Seconds a robot waits for the name of a commander who is about to give it.
 _INTRODUCTION_TIME = 1.0
 
@@ -65,6 +68,7 @@ class SimNode(Node):
         self._settings = declare_parameters(self, SIM_NODE)
         self._refuse_simulated_time()
         self._robot = self._make_robot()
+        self._warn_after: dict[str, float] = {}
         self._recording_context: RecordingContext | None = None
         self._recorder = self._make_recorder()
         self._outputs = self._open_topics()
@@ -144,6 +148,13 @@ class SimNode(Node):
             with_compiled_model=self._settings['log_compiled_model'],
             perturb_limit=self._settings['perturb_limit'],
         )
+        try:
+            Path(directory).mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            pass
+        except OSError as error:
+            if error.errno not in _OF_A_DISK:
+                raise UsageError(f'episode_dir: {directory}: {error.strerror}') from None
         try:
             leftovers = find_leftovers(Path(directory))
         except EpisodeLogError as error:
@@ -306,7 +317,9 @@ class SimNode(Node):
 
     def _close(self, stop: StopSignals) -> None:
         if self._recorder is not None:
-            self._recorder.close(stop.received or 'end of the run')
+            error = sys.exception()
+            reason = 'end of the run' if error is None else f'error: {type(error).__name__}'
+            self._recorder.close(stop.received or reason, stop.watch())
         await_acknowledgements(self._outputs.values())
 
     # Callbacks
@@ -315,8 +328,12 @@ class SimNode(Node):
         end = '' if episode.is_complete else ', cut short'
         self.get_logger().info(f'{_episode_line(episode.status)}{end}, {episode.path}')
 
-    def _warn(self, line: str) -> None:
-        self.get_logger().warning(line, **seldom(_WARN_PERIOD))
+    def _warn(self, topic: str, line: str) -> None:
+        # A logger's own throttle would have one topic silence the others.
+        now = time.monotonic()
+        if now >= self._warn_after.get(topic, 0.0):
+            self._warn_after[topic] = now + _WARN_PERIOD
+            self.get_logger().warning(f'{topic} dropped: {line}')
 
     def _on_commander(self, checkpoint_sha256: str | None) -> None:
         self._has_introduction = True

@@ -30,7 +30,7 @@ class Receivers:
         robot: Gets commands and goals.
         log: Gets messages; None for none.
         on_commander: Gets the SHA-256 of the commander's checkpoint, None if it has none.
-        warn: Gets a line about what was refused; expected to throttle.
+        warn: Gets the topic and a line about what was refused; expected to throttle.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Receivers:
         robot: Robot,
         log: ReceivedLog | None,
         on_commander: Callable[[str | None], None],
-        warn: Callable[[str], None],
+        warn: Callable[[str, str], None],
     ) -> None:
         self._robot = robot
         self._log = log
@@ -67,7 +67,7 @@ class Receivers:
                 handle(spec, message)
             except ValueError as error:
                 is_refused = True
-                self._warn(f'{spec.name} dropped: {error}')
+                self._warn(spec.name, str(error))
             if self._log is not None:
                 # Serialised again, because senders leave the bytes between fields uninitialised.
                 data = serialize(spec.type_name, message)
@@ -87,10 +87,10 @@ class Receivers:
 
     def _drop(self, spec: TopicSpec, reason: str, line: str) -> None:
         if spec.name == 'set_goal':
-            self._robot.counters.goals_rejected += 1
+            self._robot.count_rejected_goal(line)
         elif spec.name.endswith('commands'):
             self._robot.buffer.count_rejection(reason, line)
-        self._warn(f'{spec.name} dropped: {line}')
+        self._warn(spec.name, line)
 
     def _policy_status(self, spec: TopicSpec, message: Any) -> None:
         del spec

@@ -45,6 +45,7 @@ class Counters:
         given_up: Episodes ended by a reset.
         goals_set: Goals accepted from outside.
         goals_rejected: Goals refused.
+        last_goal_rejection: Why the last of them was.
         tick_time: Wall time of a tick: command, physics, encoding, publishing, logging.
     """
 
@@ -54,6 +55,7 @@ class Counters:
     given_up: int = 0
     goals_set: int = 0
     goals_rejected: int = 0
+    last_goal_rejection: str = ''
     tick_time: Durations = field(default_factory=Durations)
 
 
@@ -176,10 +178,15 @@ class Robot:
         """
         try:
             accept_goal(self.runner, topic, message)
-        except ValueError:
-            self.counters.goals_rejected += 1
+        except ValueError as error:
+            self.count_rejected_goal(str(error))
             raise
         self.counters.goals_set += 1
+
+    def count_rejected_goal(self, reason: str) -> None:
+        """Counts a goal that was refused, and keeps why."""
+        self.counters.goals_rejected += 1
+        self.counters.last_goal_rejection = reason
 
     def perturb(self, topic: TopicSpec, message: Any) -> None:
         """Pushes a body during the next tick.

@@ -29,7 +29,7 @@ from fetch_hand_sim.visualization_node.transforms import (
 from msgs_spec.arrays import Picture
 from msgs_spec.event_loop import BEAT, EventLoop
 from msgs_spec.listeners import Listeners
-from msgs_spec.node_main import StopSignals
+from msgs_spec.node_main import NodeFailure, StopSignals
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.ros import (
     count_publishers,
@@ -136,8 +136,12 @@ class VisualizationNode(Node):
         """Takes another robot."""
         self._camera.close()
         self._latest = self._unmarked = self._undrawn = self._scalars = None
-        self._scene = Scene(spec.name)
-        self._transforms = Transforms(spec.name, self._prefix)
+        try:
+            self._scene = Scene(spec.name)
+            self._transforms = Transforms(spec.name, self._prefix)
+        except ValueError as error:
+            # Of a task that is described here and simulated elsewhere.
+            raise NodeFailure(str(error)) from None
         for source in scalar_topics(spec):
             if source.name not in self._outputs:
                 self._open(source)

@@ -22,7 +22,7 @@ from msgs_spec.actions import command_from_action
 from msgs_spec.codecs import build_message, decode, message_stamp
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.ros import rclpy_profile
-from msgs_spec.schemas import deserialize
+from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import topic, topics
 from support.graph import (
@@ -182,6 +182,12 @@ def test_bad_commands_are_dropped_and_good_ones_clipped(
         for bad in ([0.0] * 3, [0.0] * 5, [], [float('nan'), 0, 0, 0], [0, float('inf'), 0, 0]):
             send(robot, *bad)
             robot.spin(0.1)
+        # While commands are complained of, why a goal was refused is said too.
+        robot.connect('set_goal')
+        far = build_message(topic(REACH, 'set_goal'), 0, [0.0, 0.0, 1e6])
+        robot.publish('set_goal', serialize('geometry_msgs/msg/PointStamped', far))
+        send(robot, 0.0)
+        robot.spin(0.3)
         assert robot.received['applied_command'] == []
         send(robot, 0.25, -7.0, 1e300, 0.5)
         robot.spin_until(lambda: bool(robot.received['applied_command']), 'a tick')
@@ -190,9 +196,10 @@ def test_bad_commands_are_dropped_and_good_ones_clipped(
     code, output = finish(sim)
     assert code == 0, output
     assert 'commands dropped: 3 values given; allowed: 4' in output
+    assert 'set_goal dropped: 1e+06 given; allowed: -1000 ... 1000' in output
     assert 'Traceback' not in output
     (episode,) = episodes_in(tmp_path)
-    assert len(episode.topics['/commands'].messages) == 6
+    assert len(episode.topics['/commands'].messages) == 7
 
 
 def test_robot_rests_before_the_first_command_and_holds_after_the_last(
@@ -391,6 +398,7 @@ def test_bad_parameters_end_with_one_line_and_code_2(start_process: Start) -> No
         ({'seed': -1}, '0 ... 4294967295'),
         ({'seed': 'seven'}, '0 ... 4294967295'),
         ({'mode': 'warp'}, "'realtime', 'lockstep'"),
+        ({'episode_dir': '/proc/here'}, 'episode_dir: /proc/here: No such file or directory'),
         ({'real_time_factor': -1.0}, '0 or 0.01 ... 1000'),
         ({'use_sim_time': 1}, "'use_sim_time' to '1' of type 'INTEGER', expecting type 'BOOL'"),
     ]

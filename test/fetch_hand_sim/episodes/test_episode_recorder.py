@@ -197,6 +197,24 @@ def test_a_disk_that_takes_nothing_any_more_stops_the_log(
     assert longest < 2.0
 
 
+def test_a_disk_that_never_takes_the_end_is_waited_for_until_somebody_gives_up(
+    tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stuck, errors, slow = threading.Event(), [], []
+    monkeypatch.setattr(EpisodeWriter, 'store', lambda *_: stuck.wait(20.0) and None)
+    monkeypatch.setattr(recorder_module, '_PATIENCE', 0.3)
+    recorder = recorder_into(tmp_path / 'recorder', errors.append, slow.append)
+    for tick, messages in ticks:
+        recorder.record(tick, messages)
+    began = time.monotonic()
+    recorder.close('end', lambda: bool(slow) and time.monotonic() - began > 0.6)
+    assert 0.6 < time.monotonic() - began < 5.0
+    stuck.set()
+    assert slow == ['waiting for the disk; another signal (Ctrl-C) gives up']
+    assert errors == ['episode log stopped: the disk was not waited for any more']
+    assert recorder.has_failed
+
+
 def test_a_disk_that_fails_behind_the_robots_back_is_said_once(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:

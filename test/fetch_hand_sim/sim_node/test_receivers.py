@@ -25,7 +25,9 @@ def test_hostile_messages_are_refused_and_counted_and_no_state_is_lost(make, tas
     case = make('realtime', task=task, factor=0.0)
     spec = case.robot.runner.spec
     lines = []
-    receivers = Receivers(case.robot, None, lambda sha256: None, lines.append)
+    receivers = Receivers(
+        case.robot, None, lambda sha256: None, lambda name, line: lines.append(line)
+    )
     targets = [each for each in topics(spec) if each.direction == 'subscribed']
     callbacks = {each.name: receivers.callback(each) for each in targets}
     joint_states = TopicCodec(topic(spec, 'joint_states'))
@@ -72,7 +74,11 @@ def listening(make):
     case = make()
     case.robot.tick()
     case.log, case.lines, case.commanders = Log(), [], []
-    case.receivers = Receivers(case.robot, case.log, case.commanders.append, case.lines.append)
+
+    def warn(name, line):
+        case.lines.append(f'{name} dropped: {line}')
+
+    case.receivers = Receivers(case.robot, case.log, case.commanders.append, warn)
     return case
 
 

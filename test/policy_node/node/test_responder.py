@@ -317,6 +317,15 @@ def test_a_second_source_of_a_topic_is_named():
     assert report.message == 'state of several: 2 publish /desired_goal'
 
 
+def test_a_machine_that_believes_it_is_later_than_2038_reports_all_the_same(monkeypatch):
+    monkeypatch.setattr('msgs_spec.diagnostics.time.time_ns', lambda: 2**31 * 10**9 + 5)
+    message = deserialize(
+        'diagnostic_msgs/msg/DiagnosticArray',
+        encode_reports(Report('/policy_node', '', {}, 'well')),
+    )
+    assert message.header.stamp.sec == 2**31 - 1
+
+
 def test_report_says_what_is_wrong(case, episode):
     responder, _, ticks = case
     health = Health('/policy_node')

@@ -1,0 +1,55 @@
+"""Where ROS puts its logs, and signals that come twice."""
+
+from __future__ import annotations
+
+import os
+import signal
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from msgs_spec import node_main
+from msgs_spec.node_main import StopSignals, find_place_for_logs
+
+
+@pytest.mark.parametrize(
+    ('given', 'is_moved'),
+    [
+        ({}, True),
+        ({'HOME': ''}, True),
+        ({'HOME': 'writable'}, False),
+        ({'HOME': 'writable/not/there/yet'}, False),
+        ({'HOME': 'locked'}, True),
+        ({'HOME': 'locked', 'ROS_HOME': 'elsewhere'}, False),
+        ({'ROS_LOG_DIR': 'elsewhere'}, False),
+    ],
+)
+def test_logs_of_ros_go_where_they_can(
+    given: dict[str, str], is_moved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ('writable', 'locked'):
+        (tmp_path / name).mkdir()
+    environment = dict(given)
+    if given.get('HOME'):
+        environment['HOME'] = str(tmp_path / given['HOME'])
+    before = dict(environment)
+    # Root may write everywhere.
+    monkeypatch.setattr(node_main.os, 'access', lambda path, mode: not str(path).endswith('locked'))
+    find_place_for_logs(environment)
+    added = {'ROS_LOG_DIR': tempfile.gettempdir()} if is_moved else {}
+    assert environment == before | added
+
+
+def test_a_second_signal_is_told_from_the_first() -> None:
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        stop = StopSignals()
+        os.kill(os.getpid(), signal.SIGTERM)
+        gives_up = stop.watch()
+        assert stop.received == 'SIGTERM' and not gives_up()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert gives_up()
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
