@@ -195,8 +195,8 @@ POLICY_NODE = (
         'policy',
         'string',
         '',
-        'Shipped actor, file (.safetensors, .onnx, .zip), random or resting; empty takes the '
-        'shipped actor of the task. May be set while it acts.',
+        'Shipped actor, file (.safetensors, .onnx, .zip), module:function, random or resting; empty '
+        'takes the shipped actor of the task. May be set while it acts.',
         read_only=False,
         former='checkpoint',
     ),
@@ -204,7 +204,7 @@ POLICY_NODE = (
         'trust',
         'bool',
         False,
-        'Whether to load a .zip, which runs the code in it.',
+        'Whether to load a .zip or module:function, which runs the code in it.',
     ),
     ParameterSpec(
         'task',

@@ -10,6 +10,7 @@ import numpy as np
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from policy_node.policies.files import one_line
 from policy_node.policies.policy import LoadedPolicy, Policy, RandomPolicy, RestingPolicy
+from policy_node.policies.python_policy import is_python_name, load_python
 from policy_node.policies.shipped import actor_path, shipped_actors
 
 if TYPE_CHECKING:
@@ -20,7 +21,8 @@ _WARM_UP_CALLS = 20
 # For help texts and descriptions of parameters.
 POLICY_NAMES = (
     'a shipped actor (FetchReach), a file (.safetensors, .onnx; .zip of Stable-Baselines3 if you '
-    'trust it), random or resting; default: the shipped actor of the task'
+    'trust it), a function of yours (module:function, if you trust it), random or resting; '
+    'default: the shipped actor of the task'
 )
 
 
@@ -50,9 +52,10 @@ def load_policy(
 
     Args:
         name: Task name of a shipped actor; file of an actor of this project, as checkpoint or ONNX;
-            .zip of Stable-Baselines3; `random`, `resting`; or '' for the shipped actor of `task`.
+            .zip of Stable-Baselines3; `module:function` of somebody's code (`python_policy.py`);
+            `random`, `resting`; or '' for the shipped actor of `task`.
         task: Refuse a policy of any other task. Needed where the name does not tell.
-        trust: Whether a file may run code of its own: a .zip of Stable-Baselines3 does.
+        trust: Whether code may be run: a .zip of Stable-Baselines3 holds some, a function is some.
 
     Raises:
         TaskMissing: If the policy needs a task and none is given.
@@ -61,8 +64,11 @@ def load_policy(
     name = str(name)
     if name in (RANDOM, RESTING):
         return _untrained(name, task)
-    path = actor_path(name, (RANDOM, RESTING)) if name else _shipped(task)
-    loaded = _read(path, task, trust)
+    if is_python_name(name) and not Path(name).exists():
+        loaded = _made_by(name, task, trust)
+    else:
+        path = actor_path(name, (RANDOM, RESTING)) if name else _shipped(task)
+        loaded = _read(path, task, trust)
     _try_out(loaded, task_spec(loaded.task))
     return loaded
 
@@ -102,6 +108,15 @@ def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:
     from policy_node.policies.numpy_actor import load_checkpoint
 
     return load_checkpoint(path, task)
+
+
+def _made_by(name: str, task: str | None, trust: bool) -> LoadedPolicy:
+    if not trust:
+        raise ValueError(
+            f'{name} is code that would be run; if you trust it, say so (--trust; trust:=true for '
+            'policy_node)'
+        )
+    return load_python(name, _require_task(name, task))
 
 
 def _require_task(name: str, task: str | None) -> str:

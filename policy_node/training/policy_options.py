@@ -28,7 +28,7 @@ def add_policy_options(parser: argparse.ArgumentParser, former: str | None = Non
     add(
         '--trust',
         action='store_true',
-        help='load a .zip of Stable-Baselines3, which runs the code in it',
+        help='load a .zip of Stable-Baselines3, or module:function, which runs the code in it',
     )
 
 

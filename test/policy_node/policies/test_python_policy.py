@@ -1,0 +1,129 @@
+"""Policies of somebody's own code, by `module:function`."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msgs_spec.tasks import task_spec
+from policy_node import load_policy
+from policy_node.node.commander import Commander
+from support.fresh_actor import observations
+
+_MODULE = """
+import numpy as np
+
+
+class Model:
+    control_hz = 50.0
+
+    def __init__(self, task):
+        self.task = task
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.full((*observation['observation'].shape[:-1], 4), 0.25), None
+
+
+def model(task):
+    return Model(task)
+
+
+def function(task):
+    def act(observation):
+        assert observation['observation'].shape == (10,)
+        return [*(observation['desired_goal'] - observation['achieved_goal']), 0.0]
+
+    return act
+
+
+def fails(task):
+    raise RuntimeError(f'no weights\\nfor {task}')
+
+
+def wrong(task):
+    return lambda observation: [0.0]
+
+
+nothing = 5
+number = lambda task: 7
+"""
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A module in the working directory, of which no other test has heard."""
+    name = f'policies_of_{tmp_path.name}'.replace('-', '_')
+    (tmp_path / f'{name}.py').write_text(_MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, 'path', list(sys.path))
+    return name
+
+
+def test_a_model_acts_as_its_library_says(module: str) -> None:
+    found = load_policy(f'{module}:model', 'FetchReach', trust=True)
+    assert (found.task, found.description, found.control_hz) == (
+        'FetchReach',
+        f'{module}:model',
+        50.0,
+    )
+    action, _ = found.policy.predict(observations(task_spec('FetchReach'), 3))
+    assert action.tolist() == np.full((3, 4), 0.25).tolist()
+    with pytest.raises(ValueError, match='was trained at 50 Hz; the robot runs at 25 Hz'):
+        Commander(found, 25.0)
+
+
+def test_a_function_answers_one_observation_and_batches_row_by_row(module: str) -> None:
+    policy = load_policy(f'{module}:function', 'FetchReach', trust=True).policy
+    batch = observations(task_spec('FetchReach'), 2, 3)
+    actions, _ = policy.predict(batch)
+    wanted = batch['desired_goal'] - batch['achieved_goal']
+    np.testing.assert_array_equal(actions[..., :3], wanted)
+    one, _ = policy.predict({name: values[1, 2] for name, values in batch.items()})
+    np.testing.assert_array_equal(one, actions[1, 2])
+
+
+@pytest.mark.parametrize(
+    ('function', 'line'),
+    [
+        ('fails', 'makes no policy: RuntimeError: no weights for FetchReach'),
+        ('missing', 'makes no policy: AttributeError: .*missing'),
+        ('nothing', 'makes no policy: TypeError: '),
+        ('number', 'makes int; allowed: an object with predict, or a function'),
+        ('wrong', r'answers with \[0.\]; allowed: 4 finite numbers'),
+    ],
+)
+def test_what_makes_no_policy_is_said_in_one_line(module: str, function: str, line: str) -> None:
+    with pytest.raises(ValueError, match=f'{module}:{function} {line}') as caught:
+        load_policy(f'{module}:{function}', 'FetchReach', trust=True)
+    assert '\n' not in str(caught.value)
+
+
+def test_no_code_is_run_without_trust_and_no_module_is_an_error(module: str) -> None:
+    with pytest.raises(ValueError, match=r'is code that would be run; .*trust:=true'):
+        load_policy(f'{module}:fails', 'FetchReach')
+    assert module not in sys.modules
+    with pytest.raises(ValueError, match="ModuleNotFoundError: No module named 'nowhere_at_all'"):
+        load_policy('nowhere_at_all:make', 'FetchReach', trust=True)
+    with pytest.raises(ValueError, match='needs a task; allowed: '):
+        load_policy(f'{module}:model', trust=True)
+    with pytest.raises(ValueError, match=r"no actor 'C:/model.onnx'"):
+        load_policy('C:/model.onnx', 'FetchReach', trust=True)
+
+
+def test_a_function_is_evaluated_as_any_policy(module: str, tmp_path: Path) -> None:
+    command = [sys.executable, '-m', 'policy_node.training.evaluate_policy']
+    words = ['--policy', f'{module}:function', '--task', 'FetchReach', '--trust']
+    done = subprocess.run(
+        [*command, *words, '--episodes', '8', '--num-envs', '8', '--threads', '1'],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=None,
+    )
+    assert done.returncode == 0, done.stderr
+    assert f'{module}:function' in done.stdout
