@@ -185,7 +185,7 @@ SIM_NODE = (
     ParameterSpec(
         'log_compiled_model',
         'bool',
-        True,
+        False,
         'Whether each log carries the compiled model, 3 MB, beside its MJCF text.',
     ),
 )
@@ -195,8 +195,8 @@ POLICY_NODE = (
         'policy',
         'string',
         '',
-        'Shipped actor, file (.safetensors, .onnx, .zip), module:function, random or resting; empty '
-        'takes the shipped actor of the task. May be set while it acts.',
+        'Shipped actor, file (.safetensors, .onnx, .zip), module:function, random or resting; '
+        'empty takes the shipped actor of the task. May be set while it acts.',
         read_only=False,
         former='checkpoint',
     ),

@@ -84,7 +84,8 @@ class EpisodeStatus:
         if missing:
             raise ValueError(f'episode_status without {", ".join(missing)}')
         phases: dict[str, Phase] = {phase: phase for phase in PHASES}
-        flags = {'True': True, 'False': False}
+        # As Python writes them, and as C++ and YAML do.
+        flags = {'True': True, 'true': True, '1': True, 'False': False, 'false': False, '0': False}
         try:
             status = cls(
                 task=values['task'],

@@ -29,7 +29,7 @@ class RecordingContext:
         self,
         simulation: Simulation,
         *,
-        with_compiled_model: bool = True,
+        with_compiled_model: bool = False,
         perturb_limit: float = 0.0,
     ) -> None:
         self._simulation = simulation

@@ -141,6 +141,12 @@ def test_status_survives_exactly():
     assert EpisodeStatus.from_values(values | {'later': 'addition'}) == tick.status
 
 
+@pytest.mark.parametrize(('said', 'is_success'), [('true', True), ('1', True), ('0', False)])
+def test_robots_of_other_languages_say_success_as_they_do(said, is_success):
+    values = episode_status(TASKS['HandReach']).to_values() | {'is_success': said}
+    assert EpisodeStatus.from_values(values).is_success is is_success
+
+
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
