@@ -33,6 +33,11 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     it the keyword arguments of this class. `pickle` and `copy.deepcopy` keep the state: both go on
     to the same bits.
 
+    Subclasses, and who has the object, may bring methods of Gymnasium-Robotics' names:
+    `_sample_goal()`, `_get_obs()`, `_is_success(achieved_goal, desired_goal)`, and
+    `compute_terminated`, `compute_truncated` and `compute_reward` (achieved_goal, desired_goal,
+    info). Resets and steps ask them, in the order of the reference.
+
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
@@ -110,10 +115,15 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         super().reset(seed=seed)
         self._physics.send()
         self._release_goal()
-        observation = self.simulation.reset(seed=[self.np_random])
+        draws_goals = self._draws_goals()
+        observation = _first(self.simulation.reset(seed=[self.np_random]))
         self._physics.receive()
+        if not draws_goals:
+            self.goal = self._sample_goal()
+        if not draws_goals or self.overrides('_get_obs'):
+            observation = self._get_obs()
         self._show()
-        return _first(observation), {}
+        return observation, {}
 
     def step(
         self, action: NDArray[np.float32]
@@ -126,7 +136,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         Returns:
             Observation, reward, terminated (never), truncated (only if MuJoCo lost the simulation:
             the observation is then the first of a new episode) and a dictionary with `is_success`
-            and `diverged`.
+            and `diverged`. Methods that a subclass overrides may say otherwise.
 
         Raises:
             ValueError: If the action has a wrong shape or is not finite.
@@ -139,16 +149,27 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
                 f'not {given.shape}'
             )
         self._physics.send()
+        draws_goals = self._draws_goals()
         result = self.simulation.step(clip_actions(given[None]))
         self._physics.receive()
-        self._show()
         diverged = bool(result.diverged[0])
+        if diverged and not draws_goals:
+            self.goal = self._sample_goal()
+        self._show()
+        if not draws_goals or any(self.overrides(name) for name in _EVALUATION):
+            return self._evaluate(diverged)
         info = {'is_success': float(result.success[0]), 'diverged': diverged}
-        observation, reward = _first(result.observation), result.reward[0]
-        if self.rewards_otherwise:
-            goals = observation['achieved_goal'], observation['desired_goal']
-            reward = self.compute_reward(*goals, info)
-        return observation, float(reward), False, diverged, info
+        return _first(result.observation), float(result.reward[0]), False, diverged, info
+
+    def _evaluate(self, diverged: bool) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """What a step gives, asked of the methods, in the order of `robot_env.py`."""
+        observation = self._get_obs()
+        goals = observation['achieved_goal'], self.goal
+        info = {'is_success': self._is_success(*goals), 'diverged': diverged}
+        terminated = bool(self.compute_terminated(*goals, info))
+        # Whatever a subclass says: the observation of a lost simulation is that of a new episode.
+        truncated = bool(self.compute_truncated(*goals, info)) or diverged
+        return observation, float(self.compute_reward(*goals, info)), terminated, truncated, info
 
     @property
     def model(self) -> Any:
@@ -195,6 +216,23 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         self._physics.send()
         return self.__dict__.copy()
 
+    def _draws_goals(self) -> bool:
+        """Lets the simulation draw goals, unless `_sample_goal` is overridden; which of both."""
+        draws_goals = not self.overrides('_sample_goal')
+        self.simulation.task.draws_goals = draws_goals
+        return draws_goals
+
+    def _get_obs(self) -> Observation:
+        self._physics.send()
+        return _first(self.simulation.observe())
+
+    def _is_success(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> Any:
+        return self.simulation.compute_success(achieved_goal, desired_goal).astype(np.float64)[()]
+
+    def _sample_goal(self) -> Array:
+        self._physics.send()
+        return self.simulation.task.sample_goal(0, self.np_random)
+
     def _release_goal(self) -> None:
         """Who kept the goal until now keeps it."""
         self.simulation.goals = self.simulation.goals.copy()
@@ -202,6 +240,16 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     def _show(self) -> None:
         if self.render_mode == 'human':
             self.render()
+
+
+# What is asked after a step, where somebody overrides one of them.
+_EVALUATION = (
+    '_get_obs',
+    '_is_success',
+    'compute_terminated',
+    'compute_truncated',
+    'compute_reward',
+)
 
 
 def _first(observation: Observation) -> Observation:

@@ -1,8 +1,8 @@
 """The tasks as code written for Gymnasium-Robotics 1.4.2 expects them.
 
 Names, types and defaults are the reference's (`robot_env.py`, `fetch_env.py`, `reach.py`,
-`manipulate.py`). Left out are the hooks that its subclasses override; `docs/gymnasium_robotics.md`
-lists what is equal and what differs.
+`manipulate.py`). Of the hooks that its subclasses override, those of goals, observations and
+endings are there; `docs/gymnasium_robotics.md` lists what is equal and what differs.
 """
 
 from __future__ import annotations
@@ -133,8 +133,9 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
         """Advances one tick, with the reference's types: sparse rewards and successes float32."""
         observation, reward, terminated, truncated, info = super().step(action)
-        info['is_success'] = np.float32(info['is_success'])
-        if not self.rewards_otherwise:
+        if not self.overrides('_is_success'):
+            info['is_success'] = np.float32(info['is_success'])
+        if not self.overrides('compute_reward'):
             reward = as_reference(np.float64(reward), self.reward_type)
         return observation, reward, terminated, truncated, info
 
@@ -170,19 +171,11 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         """As `FetchHandEnv`, without OpenGL."""
         return super().__getstate__() | {'_mujoco_renderer': None}
 
-    def _get_obs(self) -> Observation:
-        self._physics.send()
-        return {name: rows[0] for name, rows in self.simulation.observe().items()}
-
     def _get_achieved_goal(self) -> Array:
         return self._get_obs()['achieved_goal']
 
     def _is_success(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> Any:
-        return self.simulation.compute_success(achieved_goal, desired_goal).astype(np.float32)[()]
-
-    def _sample_goal(self) -> Array:
-        self._physics.send()
-        return self.simulation.task.sample_goal(0, self.np_random)
+        return super()._is_success(achieved_goal, desired_goal).astype(np.float32)[()]
 
 
 class FetchEnv(RobotEnv):
@@ -288,6 +281,13 @@ class ManipulateEnv(RobotEnv):
             randomize_initial_rotation=physics.config.randomizes_rotation,
             relative_control=False,
         )
+
+    def compute_reward(self, achieved_goal: ArrayLike, goal: ArrayLike, info: Any = None) -> Any:
+        """As `RobotEnv`; what is sparse follows from an overridden `_is_success`, as there."""
+        if self.reward_type == 'sparse' and self.overrides('_is_success'):
+            success = np.asarray(self._is_success(achieved_goal, goal), dtype=np.float32)
+            return (success - np.float32(1.0))[()]
+        return super().compute_reward(achieved_goal, goal, info)
 
     def _goal_distance(self, goal_a: ArrayLike, goal_b: ArrayLike) -> tuple[Any, Any]:
         distance, rotation = self.simulation.metric.distances(goal_a, goal_b)

@@ -67,18 +67,19 @@ class FetchHandVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Steps all environments."""
         assert self._actions is not None, 'step_async comes before step_wait'
-        observation, reward, _, truncated, info = self.batch.step(self._actions)
+        observation, reward, terminated, truncated, info = self.batch.step(self._actions)
+        ended = terminated | truncated
         # What an ended episode says of its last step.
         last = info.get('final_info', info)
         columns = {
-            name: np.where(truncated, last[name], info[name]) for name in ('is_success', 'diverged')
+            name: np.where(ended, last[name], info[name]) for name in ('is_success', 'diverged')
         }
-        columns['TimeLimit.truncated'] = truncated
+        columns['TimeLimit.truncated'] = truncated & ~terminated
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         infos: list[dict[str, Any]] = [dict(zip(columns, row, strict=True)) for row in rows]
-        for index in np.flatnonzero(truncated).tolist():
+        for index in np.flatnonzero(ended).tolist():
             infos[index]['terminal_observation'] = info['final_obs'][index]
-        return observation, reward.astype(np.float32), truncated, infos
+        return observation, reward.astype(np.float32), ended, infos
 
     def close(self) -> None:
         """Frees the renderer."""

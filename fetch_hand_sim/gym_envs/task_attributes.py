@@ -48,19 +48,18 @@ class TaskAttributes:
         """
         return self.simulation.compute_reward(achieved_goal, desired_goal, info)
 
-    @property
-    def rewards_otherwise(self) -> bool:
-        """Whether a subclass, or who has the object, brought a `compute_reward` of its own.
+    def overrides(self, name: str) -> bool:
+        """Whether a subclass, or who has the object, brought a method `name` of its own.
 
-        Steps then ask it, as those of Gymnasium-Robotics do: hindsight has the same rewards.
+        Steps and resets then ask it, as those of Gymnasium-Robotics do.
         """
-        module = getattr(type(self).compute_reward, '__module__', '')
-        return 'compute_reward' in self.__dict__ or not module.startswith('fetch_hand_sim.')
+        module = getattr(getattr(type(self), name), '__module__', '')
+        return name in self.__dict__ or not module.startswith('fetch_hand_sim.')
 
     def compute_terminated(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
-    ) -> bool:
-        """Never: a reached goal is to be kept."""
+    ) -> Any:
+        """Never: a reached goal is to be kept; a subclass may end episodes there."""
         return False
 
     def compute_truncated(

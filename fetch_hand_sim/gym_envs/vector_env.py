@@ -37,6 +37,10 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     (`SAME_STEP`), or by `reset_mask` only (`DISABLED`). `pickle` and `copy.deepcopy` keep the
     state.
 
+    Subclasses may bring `compute_reward`, `compute_terminated` and `compute_truncated` of
+    (achieved_goal, desired_goal, info) for all N at once: goals (N, goal size), results (N,). The
+    other methods that count in `FetchHandEnv` are refused.
+
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         num_envs: Number of copies N.
@@ -56,6 +60,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
     Raises:
         ValueError: If an argument is not allowed; the message says what is.
+        TypeError: If a subclass has a method that would count in `FetchHandEnv` only.
     """
 
     metadata = {  # noqa: RUF012 - as in gymnasium.vector.VectorEnv
@@ -86,6 +91,9 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             if max_episode_steps < 1:
                 raise ValueError(f'max_episode_steps must be at least 1, not {max_episode_steps}')
         check_render_mode(render_mode, _RENDER_MODES)
+        for name in _OF_SINGLE:
+            if hasattr(self, name):
+                raise TypeError(_refusal(name))
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.simulation = Simulation(
             task,
@@ -113,6 +121,12 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._seeds: list[int | None] = [None] * num_envs
         self._pictures = Pictures(self.simulation, width, height, default_camera_config)
         self.set_thresholds(distance_threshold, rotation_threshold)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuses a method that would be asked by single environments and is not here."""
+        if name in _OF_SINGLE:
+            raise TypeError(_refusal(name))
+        super().__setattr__(name, value)
 
     def reset(
         self,
@@ -158,13 +172,14 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
         Returns:
             Observations (N, ...), rewards (N,), terminated (N,), never, truncated (N,), at the end
-            of an episode, or when MuJoCo lost the simulation, and a dictionary with `is_success`
-            and `diverged` (N,), masked by `_is_success` and `_diverged` where an episode only
-            started. In mode `SAME_STEP` also `final_obs` (N,), a dictionary for each episode that
-            ended, and `final_info`.
+            of an episode, or when MuJoCo lost the simulation, both also where a subclass says so,
+            and a dictionary with `is_success` and `diverged` (N,), masked by `_is_success` and
+            `_diverged` where an episode only started. In mode `SAME_STEP` also `final_obs` (N,), a
+            dictionary for each episode that ended, and `final_info`.
 
         Raises:
-            ValueError: If the actions have a wrong shape or are not finite.
+            ValueError: If the actions have a wrong shape or are not finite, or what a subclass says
+                of endings is not (N,) booleans.
             gymnasium.error.ResetNeeded: If one was never reset or, in mode `DISABLED`, an
                 episode has ended.
         """
@@ -186,12 +201,14 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             success = success & ~started
         self._elapsed = np.where(started, 0, self._elapsed + 1)
         # Not a `RobotEpisode` each: nobody reads ticks here, and 64 cost half a millisecond.
-        self._ended = truncated = has_ended(self._elapsed, self._episode_steps, diverged)
+        truncated = has_ended(self._elapsed, self._episode_steps, diverged)
+        terminated = self._endings('compute_terminated', result) & ~started
+        truncated |= self._endings('compute_truncated', result) & ~started
+        self._ended = ended = terminated | truncated
         info = _masked({'is_success': success.astype(np.float64), 'diverged': diverged}, ~started)
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
-            observation, info = self._start_next(observation, info, truncated)
-        terminated = np.zeros(self.num_envs, dtype=bool)
-        return self._ordered(observation), reward, terminated, truncated.copy(), info
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
+            observation, info = self._start_next(observation, info, ended)
+        return self._ordered(observation), reward, terminated, truncated, info
 
     def _ordered(self, observation: Observation) -> Observation:
         """An observation with its parts in the order of the space, as Gymnasium's batches."""
@@ -199,11 +216,22 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
     def _rewards(self, result: StepResult) -> Array:
         """Rewards (N,) of a step."""
-        if not self.rewards_otherwise:
+        if not self.overrides('compute_reward'):
             return result.reward
-        info = {'is_success': result.success.astype(np.float64), 'diverged': result.diverged}
-        goals = result.observation['achieved_goal'], result.observation['desired_goal']
-        return np.asarray(self.compute_reward(*goals, info), dtype=np.float64)
+        return np.asarray(self.compute_reward(*_evaluated(result)), dtype=np.float64)
+
+    def _endings(self, name: str, result: StepResult) -> Flags:
+        """Which episodes end by a method that somebody overrides, (N,)."""
+        if not self.overrides(name):
+            return np.zeros(self.num_envs, dtype=bool)
+        ends = getattr(self, name)(*_evaluated(result))
+        flags = np.full(self.num_envs, ends) if isinstance(ends, bool) else np.asarray(ends)
+        if flags.dtype != bool or flags.shape != (self.num_envs,):
+            raise ValueError(
+                f'{name} of a batch gives booleans of shape ({self.num_envs},), one for each '
+                f'environment, not {ends!r:.60}'
+            )
+        return flags
 
     def _start_next(
         self, last: Observation, info: dict[str, Any], ended: Flags
@@ -354,8 +382,23 @@ _OF_EACH: dict[str, Callable[[FetchHandVectorEnv], Sequence[Any]]] = {
 }
 # What one environment of a batch does not do without the others.
 _FOR_ALL = ('reset', 'step', 'close')
+# What only single environments ask of a subclass.
+_OF_SINGLE = ('_get_obs', '_is_success', '_sample_goal')
 # Names of the single environment for what the batch calls otherwise.
 _SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_observation_space'}
+
+
+def _refusal(name: str) -> str:
+    return (
+        f'a batch does not ask {name}; it asks compute_reward, compute_terminated and '
+        "compute_truncated; single environments (vectorization_mode='sync') ask the others too"
+    )
+
+
+def _evaluated(result: StepResult) -> tuple[Array, Array, dict[str, Any]]:
+    """Achieved and desired goals (N, goal size) of a step and its info."""
+    info = {'is_success': result.success.astype(np.float64), 'diverged': result.diverged}
+    return result.observation['achieved_goal'], result.observation['desired_goal'], info
 
 
 def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:

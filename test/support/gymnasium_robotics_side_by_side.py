@@ -97,15 +97,63 @@ def play(name: str, reference: Any) -> dict[str, Any]:
     }
 
 
+def override(env: Any) -> list[str]:
+    """Overrides the methods of an environment that count; their names as they are called."""
+    calls: list[str] = []
+    sample_goal, get_obs, reward = env._sample_goal, env._get_obs, env.compute_reward
+
+    def noted(name: str, method: Any) -> Any:
+        def call(*arguments: Any) -> Any:
+            calls.append(name)
+            return method(*arguments)
+
+        return call
+
+    methods = {
+        '_sample_goal': lambda: sample_goal() + 0.01,
+        '_get_obs': lambda: {key: 2.0 * values for key, values in get_obs().items()},
+        '_is_success': lambda achieved, goal: np.float32(achieved[0] - goal[0]),
+        'compute_terminated': lambda achieved, goal, info: len(calls) > 15,
+        'compute_truncated': lambda achieved, goal, info: len(calls) > 20,
+        'compute_reward': lambda achieved, goal, info: float(reward(achieved, 2.0 * goal, info)),
+    }
+    for name, method in methods.items():
+        setattr(env, name, noted(name, method))
+    return calls
+
+
+def play_overridden(reference: Any, ours: Any) -> dict[str, Any]:
+    """Both with the same methods overridden: how far they are apart, and what differs."""
+    first_calls, second_calls = override(reference), override(ours)
+    first, second = reference.reset(seed=5), ours.reset(seed=5)
+    apart = difference(reference.goal, ours.goal)
+    differ = []
+    for _ in range(4):
+        apart = max(apart, *(difference(first[0][key], second[0][key]) for key in first[0]))
+        action = np.ones(ours.action_space.shape, np.float32)
+        first, second = reference.step(action), ours.step(action)
+        if first[2:4] != second[2:4] or types(first) != types(second):
+            differ.append(f'{first[1:4]} {second[1:4]}')
+        success = difference(first[4]['is_success'], second[4]['is_success'])
+        apart = max(apart, success, difference(first[1], second[1]))
+    if first_calls != second_calls:
+        differ.append(f'{first_calls} {second_calls}')
+    return {'apart': apart, 'differ': differ, 'ended': [bool(end) for end in first[2:4]]}
+
+
 def main() -> None:
     """Makes the reference's environments, then replaces their ids."""
     warnings.simplefilter('ignore')
     names = sys.argv[1:]
     gymnasium.register_envs(gymnasium_robotics)
     references = {name: gymnasium.make(name).unwrapped for name in names}
+    overridden = {name: gymnasium.make(name).unwrapped for name in names}
     known = [name for name in gymnasium.registry if name.startswith(('Fetch', 'Hand'))]
     fetch_hand_sim.register_gymnasium_robotics(override=True)
-    print(json.dumps({'known': known, **{n: play(n, r) for n, r in references.items()}}))
+    report = {name: play(name, reference) for name, reference in references.items()}
+    for name, reference in overridden.items():
+        report[name]['overridden'] = play_overridden(reference, gymnasium.make(name).unwrapped)
+    print(json.dumps({'known': known, **report}))
 
 
 main()

@@ -80,6 +80,7 @@ class Task(ABC):
         pairs: Whose contacts follow what is written into geoms.
         substeps: Physics steps per action.
         tick_duration: Simulated seconds per action.
+        draws_goals: Whether `reset` draws goals; else they are zero until somebody sets them.
         start_state: (state size,) `mjSTATE_INTEGRATION` in which episodes start, before anything
             is drawn.
         ASSET: The MJCF asset, of a class whose tasks all have the same.
@@ -97,6 +98,7 @@ class Task(ABC):
         prepare_engine()
         self.spec = spec
         self.substeps = batch.substeps
+        self.draws_goals = True
         self.model = model
         self.tick_duration = batch.substeps * float(model.opt.timestep)
         self.batch = Batch(model, batch.num_envs, batch.threads, batch.keeps_data)
@@ -135,6 +137,8 @@ class Task(ABC):
 
     def sample_goals(self, ids: Ids, generators: Generators) -> Array:
         """Draws goals (n, goal size), one simulation after the other."""
+        if not self.draws_goals:
+            return np.zeros((ids.size, self.spec.goal.size))
         pairs = zip(ids.tolist(), generators, strict=True)
         return np.array([self.sample_goal(index, generator) for index, generator in pairs])
 

@@ -66,6 +66,66 @@ def test_steps_are_rewarded_by_the_compute_reward_that_an_environment_was_given(
     assert env.step(np.zeros(4, np.float32))[1] == 7.0
 
 
+class Demanding:
+    """Goals, observations, successes and endings of somebody's own."""
+
+    def _sample_goal(self):
+        return np.array([1.3, 0.7, 0.6])
+
+    def _get_obs(self):
+        observation = super()._get_obs()
+        return observation | {'observation': 0.0 * observation['observation']}
+
+    def _is_success(self, achieved_goal, desired_goal):
+        return desired_goal[0] == 1.3
+
+    def compute_terminated(self, achieved_goal, desired_goal, info):
+        return info['is_success']
+
+    def compute_truncated(self, achieved_goal, desired_goal, info):
+        return True
+
+
+@pytest.mark.parametrize('base', [FetchHandEnv, FetchEnv])
+def test_the_methods_of_a_subclass_count(base):
+    env = type('Mine', (Demanding, base), {})('FetchReach')
+    for _ in range(2):
+        observation, _ = env.reset(seed=0)
+        assert observation['desired_goal'].tolist() == env.goal.tolist() == [1.3, 0.7, 0.6]
+        assert not observation['observation'].any()
+        observation, reward, terminated, truncated, info = env.step(np.zeros(4, np.float32))
+        assert not observation['observation'].any()
+        assert (reward, terminated, truncated, info['is_success']) == (-1.0, True, True, True)
+
+
+def test_a_lost_simulation_goes_on_to_a_goal_of_its_own():
+    env = make('FetchPush').unwrapped
+    env._sample_goal = lambda: np.array([1.3, 0.7, 0.6])
+    env.compute_truncated = lambda achieved_goal, desired_goal, info: False
+    env.reset(seed=0)
+    env.goal = np.zeros(3)
+    env.simulation.task.batch.bind('qvel')[0, 0] = np.nan
+    observation, _, _, truncated, info = env.step(np.zeros(4))
+    assert truncated and info['diverged']
+    assert observation['desired_goal'].tolist() == [1.3, 0.7, 0.6]
+
+
+@pytest.mark.parametrize('task', ['FetchPush', 'HandReach'])
+def test_a_method_that_only_calls_the_original_changes_no_bit(task):
+    plain, env = (
+        make(task, reward_type='dense').unwrapped,
+        make(task, reward_type='dense').unwrapped,
+    )
+    env._sample_goal = env._sample_goal
+    action = np.ones(env.action_space.shape, np.float32)
+    played = [each.reset(seed=3)[:1] + each.step(action) for each in (plain, env)]
+    for first, second in zip(played[0][:2], played[1][:2], strict=True):
+        assert {key: values.tobytes() for key, values in first.items()} == {
+            key: values.tobytes() for key, values in second.items()
+        }
+    assert played[0][2:] == played[1][2:]
+
+
 @pytest.mark.parametrize('task', ['FetchSlide', 'HandManipulatePenRotate'])
 def test_an_episode_equals_the_simulation_and_is_truncated(task):
     env, simulation = make(task, reward_type='dense'), Simulation(task, reward_type='dense')

@@ -86,6 +86,14 @@ def test_the_reference_and_ours_are_equal_side_by_side(name, report):
     assert set(report[name]['missing']) <= LEFT_OUT
 
 
+@pytest.mark.parametrize('name', COMPARED)
+def test_methods_that_are_overridden_count_as_in_the_reference(name, report):
+    overridden = report[name]['overridden']
+    assert overridden['differ'] == []
+    assert overridden['apart'] < 1e-14
+    assert overridden['ended'] == [True, True]
+
+
 def test_all_ids_of_the_same_physics_are_there(report):
     # Other versions need mujoco-py; touch sensors are not simulated.
     versions = {'Fetch': 'v4', 'HandR': 'v3', 'HandM': 'v1'}

@@ -12,7 +12,9 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import fetch_hand_sim
+from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.gym_envs.registration import environment_id
+from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from msgs_spec.tasks import TASKS
 
 
@@ -123,6 +125,52 @@ def test_without_autoreset_an_ended_episode_waits_for_its_reset():
     assert state_of(env) == before
     env.reset(options={'reset_mask': np.array([True, False])})
     assert env.step(env.action_space.sample())[3].tolist() == [False, True]
+
+
+class Reaching:
+    """Ends episodes at the goal, and those whose goal lies to the right."""
+
+    def compute_terminated(self, achieved_goal, desired_goal, info):
+        return info['is_success'] > 0.0
+
+    def compute_truncated(self, achieved_goal, desired_goal, info):
+        return desired_goal[..., 1] < 0.75
+
+
+@pytest.mark.parametrize('mode', [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_endings_of_a_subclass_count_as_in_gymnasiums_vectorisation(mode):
+    arguments = {'task': 'FetchReach', 'distance_threshold': 0.12}
+    env = type('Batch', (Reaching, FetchHandVectorEnv), {})(
+        num_envs=6, autoreset_mode=mode, **arguments
+    )
+    single = type('Single', (Reaching, FetchHandEnv), {})
+    reference = gymnasium.vector.SyncVectorEnv(
+        [lambda: single(**arguments)] * 6, autoreset_mode=mode
+    )
+    assert_same(env.reset(seed=1)[0], reference.reset(seed=1)[0])
+    ends = np.zeros((2, 6))
+    for _ in range(8):
+        actions = env.action_space.sample()
+        ours, theirs = env.step(actions), reference.step(actions)
+        for mine, other in zip(ours[:4], theirs[:4], strict=True):
+            assert_same(mine, other)
+        ends += ours[2:4]
+    assert ends.any(axis=1).all() and not ends.all()
+
+
+def test_what_a_batch_does_not_ask_is_refused():
+    single = {'_sample_goal': lambda self: np.zeros(3)}
+    with pytest.raises(TypeError, match='a batch does not ask _sample_goal; it asks compute_rew'):
+        type('Batch', (FetchHandVectorEnv,), single)('FetchReach')
+    env = FetchHandVectorEnv('FetchReach', 2)
+    with pytest.raises(TypeError, match='a batch does not ask _get_obs'):
+        env._get_obs = None
+    env.compute_terminated = lambda achieved_goal, desired_goal, info: np.bool_(True)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r'compute_terminated .* booleans of shape \(2,\), one'):
+        env.step(np.zeros((2, 4)))
+    env.compute_terminated = lambda achieved_goal, desired_goal, info: True
+    assert env.step(np.zeros((2, 4)))[2].tolist() == [True, True]
 
 
 def test_attributes_and_calls_are_those_of_the_members():
