@@ -14,6 +14,7 @@ from fetch_hand_sim.simulation.arguments import require_whole
 from fetch_hand_sim.simulation.opengl import start_glfw
 from fetch_hand_sim.simulation.rendering import (
     HEIGHT,
+    LARGEST_SIDE,
     WIDTH,
     SceneRenderer,
     make_camera,
@@ -44,7 +45,7 @@ class Pictures:
         camera: Attributes of `mujoco.MjvCamera`; None for the task's view.
 
     Raises:
-        ValueError: If the size is not positive or the camera has no such attribute.
+        ValueError: If the size is not allowed, or the camera has no such attribute or value.
     """
 
     def __init__(
@@ -56,8 +57,8 @@ class Pictures:
     ) -> None:
         for name, side in (('width', width), ('height', height)):
             require_whole(name, side)
-            if side < 1:
-                raise ValueError(f'{name} must be at least 1 pixel, not {side}')
+            if not 1 <= side <= LARGEST_SIDE:
+                raise ValueError(f'{name} must be 1 ... {LARGEST_SIDE} pixels, not {side}')
         known = [name for name in dir(mujoco.MjvCamera) if not name.startswith('_')]
         for name in camera or {}:
             if name not in known:
@@ -65,7 +66,7 @@ class Pictures:
                 raise ValueError(
                     f'default_camera_config: {name!r} is not known; allowed: {allowed}'
                 )
-        set_attributes(mujoco.MjvCamera(), camera or {})
+        set_attributes(mujoco.MjvCamera(), camera or {}, simulation.model)
         self._simulation = simulation
         self._size = (width, height)
         self._camera = dict(camera or {})

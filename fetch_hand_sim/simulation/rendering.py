@@ -112,7 +112,7 @@ def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.Mj
     camera = mujoco.MjvCamera()
     if name is None or isinstance(name, Mapping):
         scene.view.apply(camera)
-        set_attributes(camera, name or {})
+        set_attributes(camera, name or {}, scene.model)
         return camera
     names = [scene.model.camera(index).name for index in range(scene.model.ncam)]
     if name not in names:
@@ -122,11 +122,19 @@ def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.Mj
     return camera
 
 
-def set_attributes(camera: mujoco.MjvCamera, attributes: Mapping[str, Any]) -> None:
+def set_attributes(
+    camera: mujoco.MjvCamera, attributes: Mapping[str, Any], model: mujoco.MjModel
+) -> None:
     """Sets attributes of a camera that it has.
 
+    Args:
+        camera: The camera.
+        attributes: New values by name.
+        model: What it looks at.
+
     Raises:
-        ValueError: If a value is of another type or length.
+        ValueError: If a value is of another type or length, is not finite, or names a type, body or
+            camera that is not there.
     """
     for name, value in attributes.items():
         try:
@@ -137,8 +145,32 @@ def set_attributes(camera: mujoco.MjvCamera, attributes: Mapping[str, Any]) -> N
         except (TypeError, ValueError):
             allowed = f'as {getattr(camera, name)!r}'
             raise ValueError(
-                f'default_camera_config: {name} {value!r}; allowed: {allowed}'
+                f'default_camera_config: {name} {value!r:.60}; allowed: {allowed}'
             ) from None
+    _check_camera(camera, model)
+
+
+def _check_camera(camera: mujoco.MjvCamera, model: mujoco.MjModel) -> None:
+    """Refuses what would draw nothing, or end the process inside MuJoCo at the first picture."""
+    for name in ('azimuth', 'distance', 'elevation', 'lookat'):
+        if not np.isfinite(getattr(camera, name)).all():
+            raise ValueError(f'default_camera_config: {name} {getattr(camera, name)} is not finite')
+    kinds = mujoco.mjtCamera
+    fixed, tracking = kinds.mjCAMERA_FIXED.value, kinds.mjCAMERA_TRACKING.value
+    if camera.type not in (kinds.mjCAMERA_FREE.value, fixed, tracking):
+        raise ValueError(
+            f'default_camera_config: type {camera.type}; allowed: 0 (free), 1 (tracking), 2 (fixed)'
+        )
+    for kind, name, count in (
+        (fixed, 'fixedcamid', model.ncam),
+        (tracking, 'trackbodyid', model.nbody),
+    ):
+        number = getattr(camera, name)
+        if camera.type == kind and not 0 <= number < count:
+            allowed = f'0 ... {count - 1}' if count else 'none'
+            raise ValueError(
+                f'default_camera_config: type {kind} with {name} {number}; allowed: {allowed}'
+            )
 
 
 def simulation_frame(simulation: Simulation, index: int = 0) -> Frame:
