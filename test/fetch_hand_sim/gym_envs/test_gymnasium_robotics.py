@@ -136,6 +136,17 @@ def test_importing_gymnasium_robotics_later_takes_nothing_back():
     assert result.stderr == ''
 
 
+def test_a_worker_process_finds_the_ids_by_their_module():
+    name = 'fetch_hand_sim.gymnasium_robotics_ids:FetchReach-v4'
+    workers = gymnasium.vector.AsyncVectorEnv([lambda: gymnasium.make(name)], context='spawn')
+    (spec,) = workers.get_attr('spec')
+    assert workers.reset(seed=0)[0]['observation'].shape == (1, 10)
+    workers.close()
+    assert (spec.id, spec.kwargs['task']) == ('FetchReach-v4', 'FetchReach')
+    assert spec.entry_point.startswith('fetch_hand_sim.')
+    assert fetch_hand_sim.make(name, control_hz=50).spec.max_episode_steps == 100
+
+
 def test_touch_sensors_say_it_too_where_the_references_are_replaced(registry):
     name = 'HandManipulatePenRotate_ContinuousTouchSensors-v1'
     if name not in registry:

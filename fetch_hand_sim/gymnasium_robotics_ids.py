@@ -1,0 +1,9 @@
+"""Registers the ids of Gymnasium-Robotics when it is imported, in worker processes too.
+
+Gymnasium imports what stands before the colon:
+`gymnasium.make('fetch_hand_sim.gymnasium_robotics_ids:FetchReach-v4')`.
+"""
+
+from fetch_hand_sim import register_gymnasium_robotics
+
+register_gymnasium_robotics(override=True)
