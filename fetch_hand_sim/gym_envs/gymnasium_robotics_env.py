@@ -64,7 +64,8 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     Attributes:
         n_substeps: Physics steps per action.
         initial_time: Simulated time at which episodes start, s.
-        initial_qpos: Joint positions from which they start, before anything is drawn.
+        initial_qpos: Joint positions from which they start, before anything is drawn; read-only, as
+            all arrays of facts.
         initial_qvel: Joint velocities likewise.
         fullpath: The MJCF file.
     """
@@ -119,8 +120,12 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         return own | {'has_object'}
 
     def _state(self, **facts: Any) -> None:
-        """Makes facts about the task attributes that cannot be changed."""
+        """Makes facts about the task attributes that cannot be changed, arrays included."""
         stated: frozenset[str] = self.__dict__.get('_stated', frozenset())
+        for fact in facts.values():
+            for array in fact if isinstance(fact, tuple) else (fact,):
+                if isinstance(array, np.ndarray):
+                    array.flags.writeable = False
         self.__dict__.update(facts)
         self.__dict__['_stated'] = stated | facts.keys()
 
@@ -170,6 +175,11 @@ class RobotEnv(FetchHandEnv, GoalEnv):
     def __getstate__(self) -> dict[str, Any]:
         """As `FetchHandEnv`, without OpenGL."""
         return super().__getstate__() | {'_mujoco_renderer': None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Goes on from the state; copies of arrays are writable until they are stated again."""
+        self.__dict__.update(state)
+        self._state(**{name: state[name] for name in state['_stated']})
 
     def _get_achieved_goal(self) -> Array:
         return self._get_obs()['achieved_goal']
@@ -275,7 +285,7 @@ class ManipulateEnv(RobotEnv):
             target_position=position,
             target_rotation=rotation,
             target_position_range=TARGET_RANGE.copy(),
-            parallel_quats=list(physics.parallel_quaternions),
+            parallel_quats=tuple(physics.parallel_quaternions.copy()),
             ignore_z_target_rotation=self.spec_of_task.ignores_z_rotation,
             randomize_initial_position=True,
             randomize_initial_rotation=physics.config.randomizes_rotation,

@@ -238,6 +238,14 @@ def test_a_batch_takes_and_gives_what_single_environments_do(make):
 def test_what_is_fixed_cannot_be_changed_in_vain(make):
     with pytest.raises(AttributeError, match='obj_range of FetchPush is fixed'):
         make('FetchPush-v4').obj_range = 0.3
+    fetch, block = make('FetchPush-v4'), make('HandManipulateBlock-v1')
+    for env in (fetch, block, copy.deepcopy(fetch), pickle.loads(pickle.dumps(block))):
+        arrays = [getattr(env, name) for name in sorted(env.stated)]
+        arrays = [array for array in arrays if isinstance(array, np.ndarray)]
+        for array in (*arrays, *getattr(env, 'parallel_quats', ())):
+            with pytest.raises(ValueError, match='read-only'):
+                array[:] = 0.0
+        assert len(arrays) == 3
 
 
 @pytest.mark.parametrize('name', ['FetchPickAndPlace-v4', 'HandManipulateEggRotate-v1'])
