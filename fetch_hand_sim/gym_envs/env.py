@@ -182,6 +182,12 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return self._physics.data
 
     @property
+    def dt(self) -> float:
+        """Simulated seconds per step; follows `model.opt.timestep`."""
+        self._physics.send()
+        return super().dt
+
+    @property
     def goal(self) -> Array:
         """The desired goal of this episode, (goal size,), live until there is another."""
         return np.asarray(self.simulation.goals[0])

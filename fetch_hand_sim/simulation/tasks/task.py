@@ -159,9 +159,10 @@ class Task(ABC):
         self.batch.step(nstep=self.substeps)
 
     def follow_model(self) -> None:
-        """Steps with the model as it is; contacts have what was written into geoms."""
+        """Steps with the model as it is, its time step included; contacts follow their geoms."""
         self.pairs.follow(self.model)
         self.batch.set_models(self.model)
+        self.tick_duration = self.substeps * float(self.model.opt.timestep)
 
     def take_model(self, model: mujoco.MjModel, pairs: ListedPairs | None) -> None:
         """Steps with a model that was changed before.

@@ -291,6 +291,19 @@ def test_what_is_written_into_the_data_is_the_simulation(make):
     assert held.time == pytest.approx(before + other.dt)
 
 
+def test_another_time_step_is_that_of_dt_and_of_observed_velocities(make):
+    env = make('FetchPush-v4')
+    env.reset(seed=0)
+    env.model.opt.timestep = 0.001
+    assert env.dt == 0.02
+    before = env.data.time
+    observation = env.step(np.ones(4, np.float32))[0]['observation']
+    assert env.data.time - before == pytest.approx(0.02)
+    velocity = env.simulation.readings()['end_effector_twist'][0, :3]
+    assert np.array_equal(observation[20:23], velocity * 0.02)
+    assert copy.deepcopy(env).dt == 0.02
+
+
 def test_goals_are_drawn_where_the_object_was_put(make):
     env = make('HandManipulateBlock-v1')
     env.reset(seed=0)
