@@ -30,8 +30,8 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
     """One task with dictionary observations, for hindsight experience replay.
 
     Episodes never terminate; `gymnasium.make` truncates them after the task's number of steps. Give
-    it the keyword arguments of this class. `pickle` and `copy.deepcopy` keep the state: both go on
-    to the same bits.
+    it the keyword arguments of this class. `pickle` and `copy` keep the state: they go on to the
+    same bits, and have no physics in common.
 
     Subclasses, and who has the object, may bring methods of Gymnasium-Robotics' names:
     `_sample_goal()`, `_get_obs()`, `_is_success(achieved_goal, desired_goal)`, and

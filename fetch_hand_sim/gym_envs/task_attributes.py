@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Real
-from typing import Any
+from typing import Any, Self
 
 import gymnasium
 import numpy as np
@@ -27,6 +28,10 @@ class TaskAttributes:
     spec_of_task: TaskSpec
     simulation: Simulation
     _spec: EnvSpec | None = None
+
+    def __copy__(self) -> Self:
+        """As `copy.deepcopy`: two environments have no physics or generators in common."""
+        return copy.deepcopy(self)
 
     @property
     def spec(self) -> EnvSpec | None:

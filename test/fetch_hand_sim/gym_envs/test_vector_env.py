@@ -216,6 +216,17 @@ def test_a_copy_goes_on_to_the_same_bits():
             assert_same(mine, other)
 
 
+@pytest.mark.parametrize('kind', [FetchHandEnv, FetchHandVectorEnv])
+def test_a_shallow_copy_has_no_physics_in_common(kind):
+    env = kind('FetchPush')
+    env.reset(seed=0)
+    before = state_of(env)
+    twin = copy.copy(env)
+    twin.step(np.ones(env.action_space.shape, np.float32))
+    twin.reset()
+    assert state_of(env) == before != state_of(twin)
+
+
 def test_pictures_show_each_environment(monkeypatch):
     monkeypatch.setenv('MUJOCO_GL', 'egl')
     env = make_vec('FetchReach', 2, render_mode='rgb_array', width=96, height=64)
