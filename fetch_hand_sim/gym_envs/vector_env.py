@@ -45,7 +45,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         num_envs: Number of copies N.
         max_episode_steps: Steps per episode; None for the task's own number.
-        num_threads: Threads that step them; 0 for all processors.
+        num_threads: Threads that step them; 0 for all processors that the process may use.
         reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
         success_rule: `gymnasium` (released code) or `paper` (its text).
         control_hz: Actions per simulated second: 500/n for n = 1 ... 40. With another than 25 use

@@ -76,7 +76,8 @@ class Simulation:
     Args:
         task: One of the thirteen tasks (`msgs_spec.tasks.TASKS`).
         num_envs: Number of copies N.
-        num_threads: Threads that step them; 0 for all processors.
+        num_threads: Threads that step them; 0 for all processors that the process may use
+            (`taskset`, `os.sched_setaffinity`). There are never more than copies.
         reward_type: `sparse` or `dense`.
         success_rule: `gymnasium` (released code) or `paper` (its text).
         control_hz: Actions per simulated second: 500/n for n = 1 ... 40.

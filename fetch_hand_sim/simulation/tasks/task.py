@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ class BatchConfig:
 
     Attributes:
         num_envs: Number of simulations N.
-        num_threads: Threads that step them; 0 for all processors.
+        num_threads: Threads that step them; 0 for all processors that the process may use.
         substeps: Physics steps per action.
         keeps_data: Whether each simulation keeps an `MjData` of its own, so that all that MuJoCo
             computes can be read, at the cost of its memory.
@@ -46,7 +47,14 @@ class BatchConfig:
     @property
     def threads(self) -> int:
         """Threads of the pool: never more than simulations."""
-        return min(self.num_threads, self.num_envs) if self.num_threads else 0
+        return min(self.num_threads or _processors(), self.num_envs)
+
+
+def _processors() -> int:
+    """How many processors this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @dataclass(frozen=True, slots=True)

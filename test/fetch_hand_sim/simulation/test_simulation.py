@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import gc
 import logging
+import os
 import subprocess
 import sys
 import weakref
@@ -78,6 +79,14 @@ def test_neither_neighbours_nor_threads_change_a_bit(task):
     expected = play(batch, played)
     assert play(threaded, played).tobytes() == expected.tobytes()
     assert play(single, played[:, 37:38]).tobytes() == expected[:, 37:38].tobytes()
+
+
+@pytest.mark.parametrize(('may_use', 'num_envs', 'threads'), [(1, 3, 1), (4, 3, 3), (2, 3, 2)])
+def test_threads_are_as_many_as_processors_that_may_be_used(
+    may_use, num_envs, threads, monkeypatch
+):
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda _: set(range(may_use)))
+    assert Simulation('FetchReach', num_envs).task.batch.nthread == threads
 
 
 @pytest.mark.parametrize('task', ['FetchPush', 'HandManipulatePenFull'])
