@@ -131,7 +131,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         """Advances one tick.
 
         Args:
-            action: (action size,); what lies outside [-1, 1] is clipped.
+            action: (action size,); what lies outside [-1, 1], also infinitely far, is clipped.
 
         Returns:
             Observation, reward, terminated (never), truncated (only if MuJoCo lost the simulation:
@@ -139,7 +139,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             and `diverged`. Methods that a subclass overrides may say otherwise.
 
         Raises:
-            ValueError: If the action has a wrong shape or is not finite.
+            ValueError: If the action has a wrong shape, or a value is not a number (NaN).
             gymnasium.error.ResetNeeded: If it was never reset.
         """
         given = np.asarray(action)

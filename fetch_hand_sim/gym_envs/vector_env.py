@@ -168,7 +168,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         """Advances every environment by one tick, or starts it again if its episode had ended.
 
         Args:
-            actions: (N, action size); what lies outside [-1, 1] is clipped.
+            actions: (N, action size); what lies outside [-1, 1], also infinitely far, is clipped.
 
         Returns:
             Observations (N, ...), rewards (N,), terminated (N,), never, truncated (N,), at the end
@@ -178,8 +178,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             dictionary for each episode that ended, and `final_info`.
 
         Raises:
-            ValueError: If the actions have a wrong shape or are not finite, or what a subclass says
-                of endings is not (N,) booleans.
+            ValueError: If the actions have a wrong shape, a value is not a number (NaN), or what a
+                subclass says of endings is not (N,) booleans.
             gymnasium.error.ResetNeeded: If one was never reset or, in mode `DISABLED`, an
                 episode has ended.
         """

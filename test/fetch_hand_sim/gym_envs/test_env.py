@@ -223,8 +223,10 @@ def test_actions_out_of_range_are_clipped(dtype):
         size = env.action_space.shape
         env.reset(seed=0)
         clipped = env.step(np.ones(size, dtype=dtype))[0]['observation']
-        env.reset(seed=0)
-        assert np.array_equal(env.step(np.full(size, 3, dtype=dtype))[0]['observation'], clipped)
+        for far in (3.0, np.inf):
+            env.reset(seed=0)
+            observation = env.step(np.full(size, far, dtype=dtype))[0]['observation']
+            assert np.array_equal(observation, clipped)
 
 
 def test_a_diverged_episode_is_truncated():

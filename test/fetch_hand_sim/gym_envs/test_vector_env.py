@@ -379,6 +379,14 @@ def test_bad_resets_move_nothing(bad):
     assert state_of(env) == before
 
 
+def test_actions_that_are_infinite_are_clipped():
+    first, second = make_vec('FetchPush', 2), make_vec('FetchPush', 2)
+    for env in (first, second):
+        env.reset(seed=0)
+    far = np.array([[np.inf, -np.inf, 0, 0]] * 2)
+    assert_same(first.step(far)[0], second.step(np.clip(far, -1.0, 1.0))[0])
+
+
 def test_bad_actions_move_nothing():
     env = make_vec('HandReach', 2)
     env.reset(seed=0)
