@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 import gymnasium
 from gymnasium.envs.registration import (
     EnvSpec,
+    VectorizeMode,
     find_highest_version,
     get_env_id,
     parse_env_id,
@@ -117,11 +118,18 @@ def make_vec(
         ValueError: If a wrapper is for single environments only, or an argument is not allowed.
     """
     name = _id_of(name)
+    batch = VectorizeMode.VECTOR_ENTRY_POINT
+    mode = arguments.pop('vectorization_mode', None)
+    if mode not in (None, batch, batch.value):
+        raise ValueError(
+            f'vectorization_mode {mode!r} is for gymnasium.make_vec with the id; this makes '
+            f'batches; allowed: None, {batch.value!r}'
+        )
     chosen = [_wrapper_of_batches(wrapper) for wrapper in wrappers]
     env = gymnasium.make_vec(
         name,
         num_envs=num_envs,
-        vectorization_mode='vector_entry_point',
+        vectorization_mode=batch,
         **_with_length(name, arguments),
     )
     for wrapper in chosen:

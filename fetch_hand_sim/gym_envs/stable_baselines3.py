@@ -72,7 +72,8 @@ class FetchHandVecEnv(VecEnv):
         # What an ended episode says of its last step.
         last = info.get('final_info', info)
         columns = {
-            name: np.where(ended, last[name], info[name]) for name in ('is_success', 'diverged')
+            name: np.where(ended, last[name], info.get(name, last[name]))
+            for name in ('is_success', 'diverged')
         }
         columns['TimeLimit.truncated'] = truncated & ~terminated
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)

@@ -24,6 +24,8 @@ from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
 
 Flags = NDArray[np.bool_]
 
+# What Gymnasium takes for episodes that no number of steps ends.
+_NO_LIMIT = -1
 # A window shows one environment.
 _RENDER_MODES = [mode for mode in RENDER_MODES if mode != 'human']
 
@@ -44,7 +46,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         num_envs: Number of copies N.
-        max_episode_steps: Steps per episode; None for the task's own number.
+        max_episode_steps: Steps per episode; None for the task's own number, -1 for no limit.
         num_threads: Threads that step them; 0 for all processors that the process may use.
         reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
         success_rule: `gymnasium` (released code) or `paper` (its text).
@@ -57,6 +59,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         default_camera_config: Attributes of `mujoco.MjvCamera`; None for the task's view.
         distance_threshold: Success within this distance, metres; None for the task's own.
         rotation_threshold: Success within this rotation, radians; None for the task's own.
+        disable_env_checker: Of no account; `gymnasium.make_vec` hands it to batches, too.
 
     Raises:
         ValueError: If an argument is not allowed; the message says what is.
@@ -85,11 +88,15 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         default_camera_config: Mapping[str, Any] | None = None,
         distance_threshold: float | None = None,
         rotation_threshold: float | None = None,
+        disable_env_checker: bool | None = None,
     ) -> None:
         if max_episode_steps is not None:
             require_whole('max_episode_steps', max_episode_steps)
-            if max_episode_steps < 1:
-                raise ValueError(f'max_episode_steps must be at least 1, not {max_episode_steps}')
+            if max_episode_steps < 1 and max_episode_steps != _NO_LIMIT:
+                raise ValueError(
+                    'max_episode_steps must be at least 1, or -1 for no limit, not '
+                    f'{max_episode_steps}'
+                )
         check_render_mode(render_mode, _RENDER_MODES)
         for name in _OF_SINGLE:
             if hasattr(self, name):
@@ -116,6 +123,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._episode_steps = max_episode_steps or self.spec_of_task.episode_ticks
+        if max_episode_steps == _NO_LIMIT:
+            self._episode_steps = np.iinfo(np.int64).max
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
         self._seeds: list[int | None] = [None] * num_envs
@@ -150,8 +159,14 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
                 integer.
             ValueError: If an option is unknown, the mask has another shape, a seed is negative or
                 there are too many or too few.
+            gymnasium.error.ResetNeeded: If the mask leaves out one that was never reset.
         """
         mask = self._reset_mask(options)
+        waiting = np.flatnonzero(~(mask | self.simulation.is_started))
+        if waiting.size:
+            raise gymnasium.error.ResetNeeded(
+                f'the first reset is one of all; reset_mask leaves out {waiting.tolist()!s:.60}'
+            )
         ids = np.flatnonzero(mask)
         seeds = self._each_seed(seed)
         observation = self.simulation.reset(seed=[seeds[i] for i in ids.tolist()], ids=ids)
@@ -174,8 +189,9 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             Observations (N, ...), rewards (N,), terminated (N,), never, truncated (N,), at the end
             of an episode, or when MuJoCo lost the simulation, both also where a subclass says so,
             and a dictionary with `is_success` and `diverged` (N,), masked by `_is_success` and
-            `_diverged` where an episode only started. In mode `SAME_STEP` also `final_obs` (N,), a
-            dictionary for each episode that ended, and `final_info`.
+            `_diverged` where an episode only started, and missing where all only started. In mode
+            `SAME_STEP` also `final_obs` (N,), a dictionary for each episode that ended, and
+            `final_info`.
 
         Raises:
             ValueError: If the actions have a wrong shape, a value is not a number (NaN), or what a
@@ -334,7 +350,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         elif name not in _SETTABLE:
             allowed = ', '.join(('goal', *_SETTABLE))
             raise AttributeError(f'{name!r} of a batch cannot be set; allowed: {allowed}')
-        elif any(value != each[0] for value in each):
+        elif not all(np.array_equal(value, each[0]) for value in each):
             raise ValueError(f'the environments of a batch share {name}; given: {each}')
         else:
             setattr(self, name, each[0])
@@ -402,7 +418,9 @@ def _evaluated(result: StepResult) -> tuple[Array, Array, dict[str, Any]]:
 
 
 def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
-    """Info as Gymnasium batches it: values (N,) and for whom they count."""
+    """Info as Gymnasium batches it: values (N,) and for whom they count; nothing for nobody."""
+    if not mask.any():
+        return {}
     return {**values, **{f'_{name}': mask.copy() for name in values}}
 
 

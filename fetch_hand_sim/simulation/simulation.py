@@ -181,6 +181,11 @@ class Simulation:
         self._model_may_change = True
         self._task.follow_model()
 
+    @property
+    def is_started(self) -> NDArray[np.bool_]:
+        """Which simulations have been reset before, (N,)."""
+        return self._is_started.copy()
+
     def generator(self, index: int) -> np.random.Generator:
         """The random generator of simulation `index`, live: starts and goals are drawn from it."""
         generator = self._generators[index]

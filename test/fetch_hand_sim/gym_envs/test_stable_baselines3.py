@@ -79,6 +79,16 @@ def test_what_concerns_all_environments_is_not_done_to_some():
         env.reset()
 
 
+def test_an_episode_that_a_method_of_somebodys_own_ends_has_no_time_limit():
+    env = FetchHandVecEnv('FetchReach', 2, max_episode_steps=2)
+    env.batch.compute_terminated = lambda achieved_goal, desired_goal, info: np.array([True, False])
+    env.reset()
+    first, second = (env.step(np.zeros((2, 4), np.float32)) for _ in range(2))
+    assert first[2].tolist() == [True, False] and second[2].tolist() == [True, True]
+    assert 'terminal_observation' in first[3][0]
+    assert [info['TimeLimit.truncated'] for info in second[3]] == [False, True]
+
+
 def test_films_are_as_fast_as_the_robots():
     for rate in (25.0, 50.0):
         assert FetchHandVecEnv('FetchReach', control_hz=rate).metadata['render_fps'] == rate

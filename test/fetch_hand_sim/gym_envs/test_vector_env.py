@@ -70,14 +70,10 @@ def test_it_equals_gymnasiums_vectorisation_over_several_episodes(task, mode):
         assert list(ours[0]) == list(theirs[0])
         for mine, other in zip(ours[:4], theirs[:4], strict=True):
             assert_same(mine, other)
-        assert_same(ours[4]['is_success'], theirs[4].get('is_success', np.zeros(3)))
-        assert_same(ours[4]['_is_success'], theirs[4].get('_is_success', np.zeros(3, dtype=bool)))
-        assert ('final_obs' in ours[4]) == ('final_obs' in theirs[4])
-        if 'final_obs' in ours[4]:
-            assert_same(ours[4]['_final_obs'], theirs[4]['_final_obs'])
-            assert_same(ours[4]['final_info'], theirs[4]['final_info'])
-            for mine, other in zip(ours[4]['final_obs'], theirs[4]['final_obs'], strict=True):
-                assert_same(mine, other)
+        finals = [info.pop('final_obs', [{}] * 3) for info in (ours[4], theirs[4])]
+        assert_same(ours[4], theirs[4])
+        for mine, other in zip(*finals, strict=True):
+            assert_same(mine, other)
         ends += ours[3].all()
     assert ends == (2 if mode is AutoresetMode.NEXT_STEP else 3)
 
@@ -102,7 +98,6 @@ def test_successes_count_for_those_only_that_the_masks_name(mode):
 
 def test_actions_of_those_who_only_begin_count_for_nothing():
     env = make_vec('FetchReach', 2, max_episode_steps=3)
-    env.reset(seed=0, options={'reset_mask': np.array([True, False])})
     env.reset(seed=0)
     for _ in range(3):
         env.step(np.zeros((2, 4), np.float32))
@@ -397,8 +392,28 @@ def test_bad_actions_move_nothing():
 
 
 def test_an_episode_has_at_least_one_step():
-    with pytest.raises(ValueError, match='max_episode_steps must be at least 1, not 0'):
+    with pytest.raises(ValueError, match='must be at least 1, or -1 for no limit, not 0'):
         make_vec('FetchReach', 2, max_episode_steps=0)
+
+
+def test_arguments_of_gymnasium_are_those_of_its_vectorisation():
+    env = make_vec('FetchReach', 2, max_episode_steps=-1, disable_env_checker=True)
+    env.reset(seed=0)
+    assert not any(env.step(np.zeros((2, 4)))[3].any() for _ in range(55))
+    with pytest.raises(ValueError, match='distance_threshold must be a number of at least 0, not'):
+        env.unwrapped.set_attr('distance_threshold', np.array([0.1, 0.1]))
+    assert fetch_hand_sim.make_vec('FetchReach', vectorization_mode='vector_entry_point')
+    with pytest.raises(ValueError, match="mode 'sync' is for gymnasium"):
+        fetch_hand_sim.make_vec('FetchReach', 2, vectorization_mode='sync')
+
+
+def test_the_first_reset_is_one_of_all():
+    env = make_vec('FetchReach', 3)
+    mask = np.array([False, True, False])
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r'reset_mask leaves out \[0, 2\]'):
+        env.reset(options={'reset_mask': mask})
+    env.reset(seed=0)
+    env.reset(options={'reset_mask': mask})
 
 
 @pytest.mark.parametrize(
