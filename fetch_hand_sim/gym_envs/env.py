@@ -206,7 +206,8 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             camera plane. `human`: None, after drawing into a window. None without a render mode.
 
         Raises:
-            RuntimeError: If there is no OpenGL or, for `human`, no display.
+            RuntimeError: If there is no OpenGL or, for `human`, no display, or another thread drew
+                the first picture.
         """
         if self.render_mode is None:
             return None

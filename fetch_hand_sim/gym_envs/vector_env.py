@@ -287,7 +287,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         """Returns a picture of every environment; None without a render mode.
 
         Raises:
-            RuntimeError: If there is no OpenGL.
+            RuntimeError: If there is no OpenGL, or another thread drew the first picture.
         """
         if self.render_mode is None:
             return None

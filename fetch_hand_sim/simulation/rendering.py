@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import threading
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -51,6 +53,7 @@ class SceneRenderer:
         scene.model.vis.global_.offwidth = max(width, int(scene.model.vis.global_.offwidth))
         scene.model.vis.global_.offheight = max(height, int(scene.model.vis.global_.offheight))
         prepare_opengl()
+        self._thread = threading.get_ident()
         try:
             self._renderer = mujoco.Renderer(scene.model, height, width)
         except Exception as error:
@@ -62,29 +65,55 @@ class SceneRenderer:
         Args:
             frame: The tick.
             trail: Where the object or gripper was before.
+
+        Raises:
+            RuntimeError: If another thread opened the OpenGL context.
         """
         self._update(frame)
         scene = self._renderer.scene
         for marker in self._scene.markers(frame, trail):
             marker.draw(scene.geoms[scene.ngeom])
             scene.ngeom += 1
-        return np.asarray(self._renderer.render())
+        with self._in_its_thread():
+            return np.asarray(self._renderer.render())
 
     def render_depth(self, frame: Frame) -> NDArray[np.float32]:
         """Returns the distance of what is seen from the camera plane, (height, width), metres.
 
         Markers are left out: they are no part of the world.
+
+        Raises:
+            RuntimeError: If another thread opened the OpenGL context.
         """
         self._update(frame)
         self._renderer.enable_depth_rendering()
         try:
-            return np.asarray(self._renderer.render())
+            with self._in_its_thread():
+                return np.asarray(self._renderer.render())
         finally:
             self._renderer.disable_depth_rendering()
 
     def close(self) -> None:
-        """Frees the OpenGL context."""
-        self._renderer.close()
+        """Frees the OpenGL context.
+
+        Raises:
+            RuntimeError: If another thread opened it.
+        """
+        with self._in_its_thread():
+            self._renderer.close()
+
+    @contextlib.contextmanager
+    def _in_its_thread(self) -> Iterator[None]:
+        """Says in one line what OpenGL says at length to a thread that did not open the context."""
+        try:
+            yield
+        except Exception as error:
+            if threading.get_ident() == self._thread:
+                raise
+            raise RuntimeError(
+                'OpenGL draws in one thread only: render and close in the thread of the first '
+                f'picture, or make the environment where it is drawn ({type(error).__name__})'
+            ) from error
 
     def _update(self, frame: Frame) -> None:
         # Again: a forked process may have come by a renderer of its parent's.

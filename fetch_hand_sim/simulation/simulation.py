@@ -147,6 +147,18 @@ class Simulation:
         return f'{type(self).__name__}({self.spec.name!r}, num_envs={self.num_envs})'
 
     @property
+    def goals(self) -> Array:
+        """The desired goals, (N, goal size), live; of another shape a `ValueError`."""
+        return self._goals
+
+    @goals.setter
+    def goals(self, goals: ArrayLike) -> None:
+        wanted = np.asarray(goals, dtype=np.float64)
+        if wanted.shape != (shape := (self.num_envs, self.spec.goal.size)):
+            raise ValueError(f'goals of {self.spec.name} have shape {shape}, not {wanted.shape}')
+        self._goals = wanted
+
+    @property
     def task(self) -> Task:
         """The physics of the task."""
         return self._task

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
 import numpy as np
@@ -377,6 +378,21 @@ def test_rendering_gives_a_picture_or_says_what_it_needs(
         'rendering needs OpenGL: apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6'
     )
     assert result.stdout.strip() in (picture, reason[:80].strip()), result.stderr
+
+
+def test_another_thread_than_that_of_the_first_picture_is_told_so(monkeypatch):
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    env = make('FetchReach', render_mode='rgb_array', width=32, height=32)
+    env.reset(seed=0)
+    try:
+        before = env.render()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    with ThreadPoolExecutor(1) as another:
+        for call in (env.render, env.close):
+            with pytest.raises(RuntimeError, match='render and close in the thread of the first'):
+                another.submit(call).result()
+    assert (env.render() == before).all()
 
 
 def test_pictures_show_the_threshold_that_holds(monkeypatch):

@@ -114,6 +114,18 @@ def test_seeds_and_goals_come_in_the_order_of_the_simulations():
     assert simulation.goals[[2, 0]].tolist() == [[1.3, 0.7, 0.6], [1.2, 0.8, 0.5]]
 
 
+def test_goals_of_another_shape_are_refused_before_anything_moves():
+    simulation = Simulation('FetchPush', num_envs=2, num_threads=1)
+    simulation.reset(seed=0)
+    before = state_of(simulation)
+    with pytest.raises(ValueError, match=r'goals of FetchPush have shape \(2, 3\), not \(3,\)'):
+        simulation.goals = np.zeros(3)
+    assert state_of(simulation) == before
+    simulation.goals = live = np.ones((2, 3))
+    live[1] = 2.0
+    assert simulation.step(np.zeros((2, 4))).observation['desired_goal'][1].tolist() == [2.0] * 3
+
+
 def test_without_a_seed_the_generators_go_on():
     simulation = Simulation('FetchPush', num_envs=2)
     goals = [simulation.reset(seed=0)['desired_goal'], simulation.reset()['desired_goal']]
