@@ -18,7 +18,11 @@ from fetch_hand_sim.gym_envs.pictures import (
 )
 from fetch_hand_sim.gym_envs.shared_physics import SharedPhysics
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
-from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
+from fetch_hand_sim.gym_envs.task_attributes import (
+    TaskAttributes,
+    check_reset_options,
+    goals_of_options,
+)
 from fetch_hand_sim.simulation import Observation, Simulation
 from fetch_hand_sim.simulation.arguments import finite_goal
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
@@ -101,26 +105,31 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
         Args:
             seed: Starts the random generator again; None lets it go on.
-            options: None or empty; there are none.
+            options: `goal`, (goal size,): the desired goal, instead of one that is drawn. As
+                `Simulation.set_goal` takes it, quaternions are normalised and taken in the
+                hemisphere nearest to the object's. What else is drawn stays that of the seed.
 
         Returns:
             The observation, and an empty dictionary.
 
         Raises:
             TypeError: If options is not a dictionary.
-            ValueError: If there are options.
+            ValueError: If an option is unknown or the goal is none.
             gymnasium.error.Error: If the seed is no integer or negative.
         """
-        check_reset_options(options, allowed=())
+        check_reset_options(options, allowed=('goal',))
+        asked = goals_of_options(options, np.ones(1, dtype=bool), self.spec_of_task)
         super().reset(seed=seed)
         self._physics.send()
         self._release_goal()
         draws_goals = self._draws_goals()
         observation = _first(self.simulation.reset(seed=[self.np_random]))
         self._physics.receive()
-        if not draws_goals:
+        if asked is not None:
+            self.simulation.set_goal(asked)
+        elif not draws_goals:
             self.goal = self._sample_goal()
-        if not draws_goals or self.overrides('_get_obs'):
+        if asked is not None or not draws_goals or self.overrides('_get_obs'):
             observation = self._get_obs()
         self._show()
         return observation, {}

@@ -11,10 +11,12 @@ from typing import Any, Self
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.tasks import RewardType, TaskSpec
+from fetch_hand_sim.simulation.arguments import finite_goals, nearest_quaternions
+from msgs_spec.arrays import Array
+from msgs_spec.tasks import GoalKind, RewardType, TaskSpec
 
 
 class TaskAttributes:
@@ -163,3 +165,27 @@ def check_reset_options(options: Any, allowed: tuple[str, ...]) -> None:
         if name not in allowed:
             known = ', '.join(allowed) or 'none'
             raise ValueError(f'reset option {name!r} is not known; allowed: {known}')
+
+
+def goals_of_options(options: Any, mask: NDArray[np.bool_], spec: TaskSpec) -> Array | None:
+    """The goals that options of `reset` ask for; checked before anything has moved.
+
+    Args:
+        options: A dictionary with `goal`, (goal size,) for all or (N, goal size), or without.
+        mask: (N,) which environments start.
+        spec: The task.
+
+    Returns:
+        (n, goal size), of the n that start, unit quaternions; None where goals are drawn.
+
+    Raises:
+        ValueError: If the shape is another, a value is not finite or a quaternion is zero.
+    """
+    if not options or 'goal' not in options:
+        return None
+    given, one = np.asarray(options['goal']), (spec.goal.size,)
+    shape = (mask.size, *one)
+    if given.shape not in (one, shape):
+        raise ValueError(f'a goal of {spec.name} has shape {one} or {shape}, not {given.shape}')
+    goals = finite_goals(np.broadcast_to(given, shape)[mask], int(mask.sum()), spec)
+    return nearest_quaternions(goals, goals) if spec.goal is GoalKind.POSE else goals

@@ -15,7 +15,11 @@ from numpy.typing import NDArray
 from fetch_hand_sim.episodes.robot_episode import has_ended
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures, check_render_mode, render_fps
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
-from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes, check_reset_options
+from fetch_hand_sim.gym_envs.task_attributes import (
+    TaskAttributes,
+    check_reset_options,
+    goals_of_options,
+)
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.arguments import finite_goal, require_whole
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
@@ -149,6 +153,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             seed: One seed (environment i takes seed + i), one per environment, or None: the random
                 generators go on.
             options: `reset_mask`, booleans (N,): which environments start again; default all.
+                `goal`, (N, goal size) or (goal size,) for all of them: desired goals of those that
+                start, as `FetchHandEnv.reset` takes one.
 
         Returns:
             The observations of all environments, in the order of the space, and an empty
@@ -157,8 +163,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         Raises:
             TypeError: If options is not a dictionary, the mask is no boolean array or a seed is no
                 integer.
-            ValueError: If an option is unknown, the mask has another shape, a seed is negative or
-                there are too many or too few.
+            ValueError: If an option is unknown, mask or goal has another shape, a goal is none, a
+                seed is negative or there are too many or too few.
             gymnasium.error.ResetNeeded: If the mask leaves out one that was never reset.
         """
         mask = self._reset_mask(options)
@@ -167,12 +173,16 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             raise gymnasium.error.ResetNeeded(
                 f'the first reset is one of all; reset_mask leaves out {waiting.tolist()!s:.60}'
             )
+        goals = goals_of_options(options, mask, self.spec_of_task)
         ids = np.flatnonzero(mask)
         seeds = self._each_seed(seed)
         observation = self.simulation.reset(seed=[seeds[i] for i in ids.tolist()], ids=ids)
         for index in ids.tolist():
             if seeds[index] is not None:
                 self._seeds[index] = seeds[index]
+        if goals is not None:
+            self.simulation.set_goal(goals, ids)
+            observation = self.simulation.observe()
         self._elapsed[mask] = 0
         self._ended[mask] = False
         return self._ordered(observation), {}
@@ -377,8 +387,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         ]
 
     def _reset_mask(self, options: Any) -> Flags:
-        check_reset_options(options, allowed=('reset_mask',))
-        if not options:
+        check_reset_options(options, allowed=('reset_mask', 'goal'))
+        if not options or 'reset_mask' not in options:
             return np.ones(self.num_envs, dtype=bool)
         mask = options['reset_mask']
         if not isinstance(mask, np.ndarray) or mask.dtype != bool:

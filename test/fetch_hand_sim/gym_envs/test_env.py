@@ -184,7 +184,13 @@ def test_an_id_makes_its_own_task_only(make_one):
     ('arguments', 'error', 'message'),
     [
         ({'options': 3}, TypeError, 'a dictionary or None, not 3'),
-        ({'options': {'goal': [0, 0, 0]}}, ValueError, "option 'goal' is not known; allowed: none"),
+        ({'options': {'start': 0}}, ValueError, "option 'start' is not known; allowed: goal"),
+        (
+            {'options': {'goal': [0, 0]}},
+            ValueError,
+            r'a goal of FetchPush has shape \(3,\) or \(1, 3\), not \(2,\)',
+        ),
+        ({'options': {'goal': [0, 0, np.nan]}}, ValueError, 'goals must be finite'),
         ({'seed': -1}, gymnasium.error.Error, 'greater or equal to zero'),
         ({'seed': 'one'}, gymnasium.error.Error, 'must be a python integer'),
     ],
@@ -263,6 +269,31 @@ def test_looking_at_the_data_starts_no_episode():
         copy.deepcopy(env).step(np.zeros(4))
     env.reset(seed=0)
     env.step(np.zeros(4))
+
+
+def test_an_episode_has_the_goal_that_its_reset_was_given():
+    env, other = make('FetchPush').unwrapped, make('FetchPush').unwrapped
+    drawn, _ = other.reset(seed=4)
+    asked, _ = env.reset(seed=4, options={'goal': [1.3, 0.7, 0.5]})
+    assert asked['desired_goal'].tolist() == [1.3, 0.7, 0.5]
+    assert asked['observation'].tobytes() == drawn['observation'].tobytes()
+    assert env.step(np.zeros(4))[0]['desired_goal'].tolist() == [1.3, 0.7, 0.5]
+    # The next one draws what it would have drawn.
+    assert np.array_equal(env.reset()[0]['desired_goal'], other.reset()[0]['desired_goal'])
+
+
+def test_quaternions_of_given_goals_are_normalised_or_refused():
+    env = make('HandManipulateBlockRotateXYZ').unwrapped
+    goal = np.array([1.0, 0.9, 0.2, -2.0, 0.0, 0.0, 0.0])
+    observation, _ = env.reset(seed=0, options={'goal': goal})
+    quaternion = observation['desired_goal'][3:]
+    assert np.abs(quaternion).tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert quaternion @ observation['achieved_goal'][3:] >= 0.0
+    before = state_of(env)
+    goal[3:] = 0.0
+    with pytest.raises(ValueError, match='a goal quaternion must not be zero'):
+        env.reset(options={'goal': goal})
+    assert state_of(env) == before
 
 
 def test_the_flat_view_is_the_concatenation():

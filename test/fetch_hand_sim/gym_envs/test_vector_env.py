@@ -258,6 +258,22 @@ def test_a_masked_reset_starts_only_the_masked():
     ]
 
 
+def test_episodes_have_the_goals_that_their_reset_was_given():
+    env = make_vec('FetchReach', 3)
+    members = [lambda: gymnasium.make(environment_id('FetchReach'))] * 3
+    reference = gymnasium.vector.SyncVectorEnv(members)
+    one = {'goal': np.array([1.3, 0.7, 0.6])}
+    assert_same(env.reset(seed=0, options=one)[0], reference.reset(seed=0, options=one)[0])
+    mask, goals = np.array([False, True, True]), np.arange(9.0).reshape(3, 3)
+    goals[0] = np.nan
+    observation, _ = env.reset(options={'reset_mask': mask, 'goal': goals})
+    assert observation['desired_goal'].tolist() == [[1.3, 0.7, 0.6], [3, 4, 5], [6, 7, 8]]
+    before = state_of(env)
+    with pytest.raises(ValueError, match=r'shape \(3,\) or \(3, 3\), not \(2, 3\)'):
+        env.reset(options={'reset_mask': mask, 'goal': goals[1:]})
+    assert state_of(env) == before
+
+
 def test_seeds_are_told_as_gymnasiums_vectorisation_tells_them():
     env = make_vec('FetchReach', 3)
     members = [lambda: gymnasium.make(environment_id('FetchReach'))] * 3
