@@ -8,9 +8,11 @@ endings are there; `docs/gymnasium_robotics.md` lists what is equal and what dif
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -164,6 +166,18 @@ class RobotEnv(FetchHandEnv, GoalEnv):
                 self.model, self.data, self._camera, width=self.width, height=self.height
             )
         return self._mujoco_renderer
+
+    @property
+    def _mujoco(self) -> Any:
+        return mujoco
+
+    @property
+    def _utils(self) -> Any:
+        return import_module('gymnasium_robotics.utils.mujoco_utils')
+
+    @property
+    def _model_names(self) -> Any:
+        return self._utils.MujocoModelNames(self.model)
 
     def close(self) -> None:
         """Frees renderers and window."""

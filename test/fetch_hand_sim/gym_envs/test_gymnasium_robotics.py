@@ -36,14 +36,11 @@ LEFT_OUT = {
     '_ezpickle_args',
     '_ezpickle_kwargs',
     '_initialize_simulation',
-    '_model_names',
-    '_mujoco',
     '_mujoco_step',
     '_render_callback',
     '_reset_sim',
     '_set_action',
     '_step_callback',
-    '_utils',
     'generate_mujoco_observations',
 }
 
@@ -302,6 +299,18 @@ def test_another_time_step_is_that_of_dt_and_of_observed_velocities(make):
     velocity = env.simulation.readings()['end_effector_twist'][0, :3]
     assert np.array_equal(observation[20:23], velocity * 0.02)
     assert copy.deepcopy(env).dt == 0.02
+
+
+def test_the_helpers_of_the_reference_work_on_model_and_data(make):
+    env = make('FetchPush-v4')
+    observation, _ = env.reset(seed=0)
+    grip = env._utils.get_site_xpos(env.model, env.data, 'robot0:grip')
+    assert np.array_equal(grip, observation['observation'][:3])
+    assert 'robot0:grip' in env._model_names.site_names
+    place = np.array([1.3, 0.7, 0.5, 1.0, 0.0, 0.0, 0.0])
+    env._utils.set_joint_qpos(env.model, env.data, 'object0:joint', place)
+    env._mujoco.mj_forward(env.model, env.data)
+    assert env._get_obs()['achieved_goal'] == pytest.approx(place[:3])
 
 
 def test_goals_are_drawn_where_the_object_was_put(make):
