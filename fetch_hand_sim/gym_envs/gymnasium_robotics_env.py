@@ -55,6 +55,25 @@ CAMERAS: dict[str, dict[str, Any]] = {
 }
 
 
+# Hooks of the reference that nothing here would ask.
+_NOT_ASKED = (
+    '_env_setup',
+    '_initialize_simulation',
+    '_mujoco_step',
+    '_render_callback',
+    '_reset_sim',
+    '_set_action',
+    '_step_callback',
+)
+
+
+def _refusal(hook: str) -> str:
+    return (
+        f'{hook} would have no effect here; what may be overridden: _sample_goal, _get_obs, '
+        '_is_success, compute_terminated, compute_truncated, compute_reward'
+    )
+
+
 def as_reference(reward: Any, reward_type: str) -> Any:
     """A reward, or an array of them, with the reference's type: float32 if it is sparse."""
     return reward.astype(np.float32) if reward_type == 'sparse' else reward
@@ -70,6 +89,9 @@ class RobotEnv(FetchHandEnv, GoalEnv):
             all arrays of facts.
         initial_qvel: Joint velocities likewise.
         fullpath: The MJCF file.
+
+    Raises:
+        TypeError: If a subclass has a hook of the reference that is not asked here.
     """
 
     metadata = {'render_modes': RENDER_MODES, 'render_fps': 25}  # noqa: RUF012
@@ -85,6 +107,9 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         **arguments: Any,
     ) -> None:
         """Compiles the model; arguments as `FetchHandEnv` has them."""
+        for name in _NOT_ASKED:
+            if hasattr(self, name):
+                raise TypeError(_refusal(name))
         self._camera = {**CAMERAS[task_spec(task).robot.name], **(default_camera_config or {})}
         self._mujoco_renderer: Any = None
         super().__init__(
@@ -108,6 +133,8 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuses to change what would have no effect."""
+        if name in _NOT_ASKED:
+            raise TypeError(_refusal(name))
         if name in self.__dict__.get('_stated', ()):
             raise AttributeError(
                 f'{name} of {self.spec_of_task.name} is fixed; for other values write a task of '

@@ -15,7 +15,7 @@ import pytest
 
 import fetch_hand_sim
 from fetch_hand_sim.gym_envs.goal_env import import_goal_env
-from fetch_hand_sim.gym_envs.gymnasium_robotics_env import ManipulateEnv
+from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv, ManipulateEnv
 from fetch_hand_sim.gym_envs.registration import reference_ids
 from msgs_spec.tasks import TASKS
 from support import SUPPORT
@@ -243,6 +243,14 @@ def test_what_is_fixed_cannot_be_changed_in_vain(make):
             with pytest.raises(ValueError, match='read-only'):
                 array[:] = 0.0
         assert len(arrays) == 3
+
+
+def test_hooks_that_nothing_asks_are_refused(make):
+    hook = {'_step_callback': lambda self: None}
+    with pytest.raises(TypeError, match='_step_callback would have no effect here; what may be'):
+        type('Mine', (FetchEnv,), hook)('FetchReach')
+    with pytest.raises(TypeError, match='_set_action would have no effect here'):
+        make('FetchReach-v4')._set_action = None
 
 
 @pytest.mark.parametrize('name', ['FetchPickAndPlace-v4', 'HandManipulateEggRotate-v1'])
