@@ -185,7 +185,7 @@ SIM_NODE = (
     ParameterSpec(
         'log_compiled_model',
         'bool',
-        False,
+        True,
         'Whether each log carries the compiled model, 3 MB, beside its MJCF text.',
     ),
 )

@@ -29,7 +29,7 @@ class RecordingContext:
         self,
         simulation: Simulation,
         *,
-        with_compiled_model: bool = False,
+        with_compiled_model: bool = True,
         perturb_limit: float = 0.0,
     ) -> None:
         self._simulation = simulation
