@@ -1,4 +1,4 @@
-"""The two robots: joints in order, the normalised action, and the command in ROS units."""
+"""Robots, and the two of Gymnasium-Robotics: joints in order, the normalised action, and the command in ROS units."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class RobotSpec:
     """A robot as the network sees it.
 
     Attributes:
-        name: `fetch` or `shadow_hand`.
+        name: `fetch`, `shadow_hand`, or that of a robot of somebody else's.
         joints: Scalar joints in the order of `joint_states`, by their names there.
         joint_units: 'm' or 'rad' for each joint.
         command: The parts of the command vector, in order. The normalised action has the same
             length and order.
-        has_gripper_command: True where commands are the four dimensionless gripper values, False
-            where they are absolute joint positions.
+        has_gripper_command: True where commands are dimensionless and move a gripper, as the four
+            of Fetch do; False where they are absolute joint positions.
     """
 
     name: str
@@ -51,7 +51,7 @@ class RobotSpec:
 
     @property
     def action_size(self) -> int:
-        """Length of the action and of the command vector: 4 or 20."""
+        """Length of the action and of the command vector: 4 of Fetch, 20 of the hand."""
         return len(self.command)
 
     def with_joint_prefix(self, prefix: str) -> RobotSpec:

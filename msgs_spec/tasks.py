@@ -52,7 +52,7 @@ class GoalKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class VectorPart:
-    """A named run of numbers in the observation vector.
+    """A named run of numbers in the vector of an observation, a topic or a command.
 
     Attributes:
         name: What the numbers are.

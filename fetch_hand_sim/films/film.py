@@ -66,7 +66,7 @@ def write_film(
 
     Raises:
         UsageError: If there is no ffmpeg.
-        CommandError: If it fails.
+        CommandError: If it fails, or the file cannot be written.
     """
     # Pillow is slow to import, and checks come before.
     from fetch_hand_sim.films.animation import write_animation
@@ -79,7 +79,11 @@ def write_film(
 
 
 def write_picture(path: Path, picture: Picture) -> None:
-    """Writes one picture (height, width, 3) as .png or .jpg."""
+    """Writes one picture (height, width, 3) as .png or .jpg; the file appears when it is complete.
+
+    Raises:
+        CommandError: If it cannot be written.
+    """
     from PIL import Image
 
     with _appearing(path) as hidden:

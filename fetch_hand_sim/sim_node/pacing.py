@@ -14,6 +14,10 @@ class RealTimePacer:
         tick_duration: Simulated seconds per tick.
         real_time_factor: Simulated seconds per second; 0 is as fast as possible.
         now: The time now.
+
+    Attributes:
+        real_time_factor: As given; may be set at any time.
+        missed_ticks: Deadlines that passed without a tick.
     """
 
     def __init__(self, tick_duration: float, real_time_factor: float, now: float) -> None:

@@ -73,8 +73,9 @@ def train(
     """Trains an actor with DDPG and hindsight experience replay, in this process.
 
     Ctrl-C (or "interrupt" of a notebook) ends it after the cycle with all saved, and raises
-    KeyboardInterrupt; `resume=True` goes on from there. A second one raises at once. In a thread
-    other than the main one signals do nothing.
+    KeyboardInterrupt; `resume=True` goes on from there. A second one raises at once. SIGTERM and
+    SIGHUP end it in the same way and raise SystemExit; a second SIGTERM ends the process. In a
+    thread other than the main one signals do nothing.
 
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
@@ -90,6 +91,8 @@ def train(
         ValueError: If something is not allowed, or the folder cannot be used; nothing was trained.
         RuntimeError: If training failed, or another process trains in the folder.
         ModuleNotFoundError: If what the extra `train` brings is missing.
+        KeyboardInterrupt: After Ctrl-C.
+        SystemExit: After SIGTERM or SIGHUP, with code 143 or 129.
     """
     if resume:
         if output is None:

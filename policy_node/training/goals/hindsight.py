@@ -44,6 +44,9 @@ def goal_mixture(strategy: str, k: int = 4) -> dict[str, float]:
         strategy: `none`, `final`, `future`, `episode`, `random`: k relabelled to 1 real goal;
             `futureactual`: k/2 future, k/2 desired goals of other episodes, 1 real.
         k: Relabelled goals for each real one.
+
+    Raises:
+        ValueError: If the strategy is unknown.
     """
     if strategy == 'none':
         return {'real': 1.0}

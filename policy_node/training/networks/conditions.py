@@ -23,19 +23,21 @@ from policy_node.policies.network_shape import NetworkShape
 Goals = NDArray[np.float64]
 # Of the layer that takes the inputs, in actors and critics alike.
 _WEIGHT, _BIAS = 'hidden.0.weight', 'hidden.0.bias'
-# Smallest threshold drawn, as a share of the task's own.
+# Smallest threshold drawn, as a share of the one that is trained for.
 SMALLEST_THRESHOLD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """The success threshold, a multiple of the task's own, log-uniform.
+    """The success threshold, a multiple of the one that is trained for, log-uniform.
+
+    That is the task's own, times `reward_distance` and `reward_rotation` of the configuration.
 
     From coarse goals, which are reached often, the value of fine ones can be generalised. Where the
     widest is narrower than the way that an episode begins with, nothing leads there.
 
     Attributes:
-        metric: Distances and thresholds of the task.
+        metric: Distances of the task, and the thresholds that are trained for.
         widest: The largest multiple.
     """
 
@@ -106,7 +108,7 @@ class Horizon:
 Condition = Threshold | Horizon
 """What a value is conditioned on, beside state, action and goal."""
 
-# The input at which an actor acts: the threshold of the task itself; a whole episode left.
+# The input at which an actor acts: the threshold that is trained for; a whole episode left.
 ACTING_INPUT = {'threshold': 0.0, 'horizon': 1.0}
 
 
