@@ -1,4 +1,4 @@
-"""Robots, and the two of Gymnasium-Robotics: joints in order, the normalised action, and the command in ROS units."""
+"""Robots, and the two of this project: joints in order, normalised action, command in ROS units."""
 
 from __future__ import annotations
 

@@ -72,5 +72,12 @@ def view_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
 
 
 def view_topic(task: TaskSpec, name: str) -> TopicSpec:
-    """Returns a topic by name; KeyError where the task has no such topic."""
-    return {spec.name: spec for spec in view_topics(task)}[name]
+    """Returns a topic by name.
+
+    Raises:
+        ValueError: If the node has no such topic for the task; the message lists those it has.
+    """
+    found = {spec.name: spec for spec in view_topics(task)}
+    if name not in found:
+        raise ValueError(f'{task.name} has no topic {name!r} to view; allowed: {", ".join(found)}')
+    return found[name]

@@ -100,11 +100,8 @@ class BagFile:
                 f'log time {log_time_ns} ns of {spec.topic} is not later than the one before it, '
                 f'{self._end_ns} ns'
             )
-        if not self.takes(len(data)):
-            raise ValueError(
-                f'{spec.topic}: no reader takes {self._messages + 1} messages of '
-                f'{self._bytes + len(data)} bytes in {self._chunks} chunks'
-            )
+        if exceeded := self._exceeded(len(data)):
+            raise ValueError(f'{spec.topic}: no reader takes {exceeded}')
         channel = self._channels.get(spec.topic) or self._add_channel(spec)
         self._writer.add_message(
             channel_id=channel.id,
@@ -128,12 +125,24 @@ class BagFile:
 
     def takes(self, size: int) -> bool:
         """Whether readers take the file with one more message of `size` bytes."""
-        return (
-            size <= MAX_MESSAGE_BYTES
-            and self._messages < MAX_MESSAGES
-            and self._bytes + _TOPIC_BYTES + _MESSAGE_BYTES + size <= MAX_UNPACKED_BYTES
-            and self.chunks < MAX_CHUNKS
+        return not self._exceeded(size)
+
+    def _exceeded(self, size: int) -> str:
+        """What would be too much with one more message of `size` bytes; empty if nothing."""
+        counts = (
+            (size, MAX_MESSAGE_BYTES, 'bytes in a message'),
+            (self._messages + 1, MAX_MESSAGES, 'messages in a file'),
+            (
+                self._bytes + _TOPIC_BYTES + _MESSAGE_BYTES + size,
+                MAX_UNPACKED_BYTES,
+                'bytes of messages in a file',
+            ),
+            (self.chunks + 1, MAX_CHUNKS, 'chunks in a file'),
         )
+        for count, limit, what in counts:
+            if count > limit:
+                return f'{count} {what}; allowed: up to {limit}'
+        return ''
 
     def _count_bytes(self, size: int) -> None:
         self._bytes += size
@@ -146,8 +155,12 @@ class BagFile:
         self._chunk_bytes = 0
 
     def _add_channel(self, spec: ChannelSpec) -> _Channel:
-        if len(self._channels) >= MAX_TOPICS or _topic_bytes(spec) > _TOPIC_BYTES:
-            raise ValueError(f'{spec.topic}: no reader takes more topics, or one of many words')
+        if len(self._channels) >= MAX_TOPICS:
+            raise ValueError(f'{spec.topic}: no reader takes more than {MAX_TOPICS} topics')
+        if (size := _topic_bytes(spec)) > _TOPIC_BYTES:
+            raise ValueError(
+                f'{spec.topic}: schema and channel of {size} bytes; allowed: up to {_TOPIC_BYTES}'
+            )
         if spec.type_name not in self._schemas:
             self._schemas[spec.type_name] = self._writer.register_schema(
                 name=spec.type_name, encoding='ros2msg', data=spec.schema_text.encode()

@@ -243,8 +243,10 @@ class _ChunkContents:
     def _other(self, opcode: int, content: bytes) -> Iterator[McapRecord]:
         """Schemas and channels, once for each topic."""
         self._others += 1
-        if self._others > 2 * MAX_TOPICS or len(content) > MAX_RECORD_BYTES:
-            raise ValueError(f'more than {MAX_TOPICS} topics, or one of many words')
+        if self._others > 2 * MAX_TOPICS:
+            raise ValueError(f'more than {2 * MAX_TOPICS} schemas and channels in chunks')
+        if len(content) > MAX_RECORD_BYTES:
+            raise ValueError(f'record of {len(content)} bytes; allowed: up to {MAX_RECORD_BYTES}')
         if opcode == Opcode.CHANNEL:
             yield Channel.read(ReadDataStream(BytesIO(content)))
         elif opcode == Opcode.SCHEMA:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 import resource
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -141,8 +142,16 @@ def _try_out(data: bytes, path: Path) -> None:
     if trial.returncode != 0:
         raise ValueError(
             f'{path} needs more than {_TRIAL_MEMORY >> 20} MiB or {_TRIAL_CPU_SECONDS} s to answer '
-            'one observation, which is the most allowed'
+            f'one observation, which is the most allowed; its trial {_ending(trial.returncode)}'
         )
+
+
+def _ending(code: int) -> str:
+    """How a process ended, by its return code as `subprocess` has it."""
+    try:
+        return f'was ended by {signal.Signals(-code).name}'
+    except ValueError:
+        return f'ended with code {code}'
 
 
 def _trial(path: Path) -> int:

@@ -26,10 +26,9 @@ SuccessFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[n
 # this very step achieved; what one of the next ten achieved; what the state before it achieved,
 # displaced; of whole episodes, what another one brought about (`outcomes.py`).
 OUTCOME = 'outcome'
-SOURCES = (
-    *('real', 'future', 'final', 'episode', 'random', 'actual', 'next', 'near', 'displaced'),
-    OUTCOME,
-)
+# Those that are a strategy by themselves.
+_STRATEGIES = ('future', 'final', 'episode', 'random')
+SOURCES = ('real', *_STRATEGIES, 'actual', 'next', 'near', 'displaced', OUTCOME)
 # Those that a transition may itself have led to.
 FROM_THE_EPISODE = ('future', 'final', 'episode', 'next', 'near')
 _NEAR_TICKS = 10
@@ -53,8 +52,9 @@ def goal_mixture(strategy: str, k: int = 4) -> dict[str, float]:
     share = k / (k + 1)
     if strategy == 'futureactual':
         return {'future': share / 2, 'actual': share / 2, 'real': 1.0 - share}
-    if strategy not in SOURCES[1:5]:
-        raise ValueError(f'strategy {strategy!r}; allowed: none, futureactual, {SOURCES[1:5]}')
+    if strategy not in _STRATEGIES:
+        allowed = ', '.join(('none', 'futureactual', *_STRATEGIES))
+        raise ValueError(f'strategy {strategy!r}; allowed: {allowed}')
     return {strategy: share, 'real': 1.0 - share}
 
 
@@ -68,7 +68,8 @@ def parse_mixture(text: str) -> dict[str, float]:
     for part in text.split(','):
         source, _, share = part.strip().partition('=')
         if source not in SOURCES or source in mixture:
-            raise ValueError(f'goals {text!r}: {source!r}; allowed, once each: {SOURCES}')
+            allowed = ', '.join(SOURCES)
+            raise ValueError(f'goals {text!r}: {source!r}; allowed, once each: {allowed}')
         try:
             mixture[source] = float(share)
         except ValueError:

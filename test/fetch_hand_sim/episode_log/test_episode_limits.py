@@ -148,7 +148,7 @@ def test_what_a_program_gives_is_refused_at_once(tmp_path, recorder, ticks):
     with pytest.raises(ValueError, match='chunk_size'):
         LogSettings(chunk_size=limits.MAX_CHUNK_BYTES)
     writer = EpisodeWriter(tmp_path, 'episode', {})
-    with pytest.raises(ValueError, match='no reader takes'):
+    with pytest.raises(ValueError, match='no reader takes 65537 bytes in a message'):
         writer.write(ticks[0].messages[0][0], bytes(limits.MAX_MESSAGE_BYTES + 1), 1)
     with pytest.raises(ValueError, match='bytes of episode metadata'):
         writer.finish(long)

@@ -29,6 +29,7 @@ from fetch_hand_sim.visualization_node.messages import (
 from fetch_hand_sim.visualization_node.transforms import Transforms, frame_prefix, view_transform
 from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TASKS
+from msgs_spec.view_topics import view_topic
 from support.frames import tree
 
 STAMP = 3_000_000_007
@@ -161,3 +162,8 @@ def test_the_camera_has_a_rate_of_its_own(hz, due, monkeypatch):
         if camera.is_due:
             camera.render(None, None)
     assert seen == due
+
+
+def test_an_unknown_topic_is_refused_with_those_there_are():
+    with pytest.raises(ValueError, match="FetchReach has no topic 'tf' to view; allowed: robot_d"):
+        view_topic(TASKS['FetchReach'], 'tf')

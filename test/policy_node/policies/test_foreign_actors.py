@@ -157,8 +157,9 @@ def test_onnx_that_computes_for_ever_is_refused(onnx_file, tmp_path):
         helper.make_node('Loop', ['count', 'go', 'head'], ['action'], body=body),
     ]
     path = crafted_onnx(tmp_path / 'loop.onnx', nodes, metadata, numbers)
-    with pytest.raises(ValueError, match=r'loop.onnx needs more than 400 MiB or 2 s to answer'):
+    with pytest.raises(ValueError, match=r'loop\.onnx needs more than 400 MiB or 2 s') as error:
         load_policy(path)
+    assert str(error.value).endswith(('was ended by SIGKILL', 'was ended by SIGXCPU'))
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,8 @@ def test_mixtures(strategy: str, k: int, mixture: dict[str, float]) -> None:
 
 
 def test_an_unknown_strategy_is_refused() -> None:
-    with pytest.raises(ValueError, match="strategy 'real'; allowed: none, futureactual"):
+    message = "strategy 'real'; allowed: none, futureactual, future, final, episode, random$"
+    with pytest.raises(ValueError, match=message):
         goal_mixture('real')
 
 
