@@ -112,7 +112,7 @@ def _render(options: argparse.Namespace) -> None:
             write_picture(options.out, tile(stills, columns))
             return
         # Of several rates the fastest: none loses a frame.
-        hz = max(float(recording.arrays.metadata['control_hz']) for recording in recordings)
+        hz = max(recording.arrays.record.control_hz for recording in recordings)
         pictures: Iterator[Picture] = studio.pictures(recordings[0])
         count = len(recordings[0].frames)
         if options.grid:

@@ -68,8 +68,7 @@ class Film:
         (recording,) = load_recordings(Path(path), count=1)
         studio = Studio(width, height, camera)
         try:
-            hz = float(recording.arrays.metadata['control_hz'])
-            return cls(studio.pictures(recording), hz)
+            return cls(studio.pictures(recording), recording.arrays.record.control_hz)
         finally:
             studio.close()
 

@@ -44,8 +44,7 @@ class Recording:
     @property
     def metric(self) -> GoalMetric:
         """Distances by the rule the episode was logged with."""
-        rule = self.arrays.metadata.get('success_rule', 'gymnasium')
-        return GoalMetric(self.spec, success_rule='paper' if rule == 'paper' else 'gymnasium')
+        return GoalMetric(self.spec, success_rule=self.arrays.record.success_rule)
 
 
 def load_recording(path: Path) -> Recording:

@@ -180,20 +180,13 @@ class Player:
         return Facts(
             source='file',
             phase='finished' if index == len(arrays) else 'running',
-            episode=_number(arrays.metadata.get('episode')),
-            seed=_number(arrays.metadata.get('seed')),
+            episode=arrays.record.episode,
+            seed=arrays.record.seed,
             tick=index,
             ticks=len(arrays),
             episode_return=float(arrays.rewards[:index].sum()),
-            commander=arrays.metadata.get('commander', 'as logged'),
+            commander='as logged',
             is_paused=self._is_paused,
             speed=self._speed,
             notice=self._notice,
         )
-
-
-def _number(text: str | None) -> int:
-    try:
-        return int(text or 0)
-    except ValueError:
-        return 0
