@@ -27,9 +27,9 @@ SuccessRule = Literal['gymnasium', 'paper']
 # What an action frequency other than 25 Hz leaves as it is: the seconds of an episode and the speed
 # of a gripper, or the ticks of an episode and the step of a gripper, as robots had it up to 1.0.
 Timing = Literal['seconds', 'ticks']
-REWARD_TYPES: tuple[str, ...] = get_args(RewardType)
-SUCCESS_RULES: tuple[str, ...] = get_args(SuccessRule)
-TIMINGS: tuple[str, ...] = get_args(Timing)
+REWARD_TYPES: tuple[RewardType, ...] = get_args(RewardType)
+SUCCESS_RULES: tuple[SuccessRule, ...] = get_args(SuccessRule)
+TIMINGS: tuple[Timing, ...] = get_args(Timing)
 
 
 class GoalKind(Enum):

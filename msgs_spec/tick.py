@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 from numpy.typing import ArrayLike
 
@@ -15,9 +15,17 @@ from msgs_spec.codecs import build_status
 from msgs_spec.observations import Readings
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.schemas import serialize
-from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, TaskSpec, substeps_per_tick
+from msgs_spec.tasks import (
+    REWARD_TYPES,
+    SUCCESS_RULES,
+    RewardType,
+    SuccessRule,
+    TaskSpec,
+    substeps_per_tick,
+)
 from msgs_spec.topics import TopicSpec, topics
 
+Word = TypeVar('Word', bound=str)
 Phase = Literal['waiting', 'reset', 'running', 'finished']
 # What each says of the tick it comes with. An episode that is given up ends without `finished`.
 PHASES: dict[Phase, str] = {
@@ -52,8 +60,8 @@ class EpisodeStatus:
     tick: int
     phase: Phase
     control_hz: float
-    reward_type: str
-    success_rule: str
+    reward_type: RewardType
+    success_rule: SuccessRule
     episode_return: float
     is_success: bool
     joint_prefix: str = JOINT_PREFIX
@@ -86,6 +94,8 @@ class EpisodeStatus:
         phases: dict[str, Phase] = {phase: phase for phase in PHASES}
         # As Python writes them, and as C++ and YAML do.
         flags = {'True': True, 'true': True, '1': True, 'False': False, 'false': False, '0': False}
+        reward_type = _known(values, 'reward_type', REWARD_TYPES)
+        success_rule = _known(values, 'success_rule', SUCCESS_RULES)
         try:
             status = cls(
                 task=values['task'],
@@ -94,8 +104,8 @@ class EpisodeStatus:
                 tick=int(values['tick']),
                 phase=phases[values['phase']],
                 control_hz=float(values['control_hz']),
-                reward_type=values['reward_type'],
-                success_rule=values['success_rule'],
+                reward_type=reward_type,
+                success_rule=success_rule,
                 episode_return=float(values['episode_return']),
                 is_success=flags[values['is_success']],
                 joint_prefix=values['joint_prefix'],
@@ -111,13 +121,18 @@ class EpisodeStatus:
             substeps_per_tick(self.control_hz)
         except ValueError as error:
             raise ValueError(f'episode_status with {error}') from None
-        for name, allowed in (('reward_type', REWARD_TYPES), ('success_rule', SUCCESS_RULES)):
-            if getattr(self, name) not in allowed:
-                raise ValueError(f'episode_status with {name} {getattr(self, name)[:40]!r}')
         if len(self.joint_prefix) > LONGEST_JOINT_PREFIX:
             raise ValueError(
                 f'episode_status with joint_prefix of {len(self.joint_prefix)} characters'
             )
+
+
+def _known(values: Mapping[str, str], name: str, allowed: tuple[Word, ...]) -> Word:
+    """The word of a pair; ValueError if it is not one of those allowed."""
+    for word in allowed:
+        if values[name] == word:
+            return word
+    raise ValueError(f'episode_status with {name} {values[name][:40]!r}')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

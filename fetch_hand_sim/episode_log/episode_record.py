@@ -17,13 +17,17 @@ from msgs_spec.tasks import (
     REWARD_TYPES,
     SUCCESS_RULES,
     TIMINGS,
+    RewardType,
+    SuccessRule,
     TaskSpec,
+    Timing,
     substeps_per_tick,
     task_spec,
 )
 
 Strings = Mapping[str, str]
 Number = TypeVar('Number', int, float)
+Word = TypeVar('Word', bound=str)
 
 # Seeds and numbers of episodes are parameters of a node and columns of a table: int64.
 _LARGEST = 2**63 - 1
@@ -50,13 +54,13 @@ class EpisodeRecord:
     task: TaskSpec
     episode: int
     seed: int
-    reward_type: str
-    success_rule: str
+    reward_type: RewardType
+    success_rule: SuccessRule
     control_hz: float
     joint_prefix: str
     interface_version: int
     perturb_limit: float = 0.0
-    timing: str = 'seconds'
+    timing: Timing = 'seconds'
 
     @classmethod
     def parse(cls, metadata: Strings) -> EpisodeRecord:
@@ -217,11 +221,12 @@ def _perturb_limit(metadata: Strings) -> float:
     return value
 
 
-def _word(content: Strings, name: str, allowed: tuple[str, ...]) -> str:
+def _word(content: Strings, name: str, allowed: tuple[Word, ...]) -> Word:
     text = _text(content, name)
-    if text not in allowed:
-        raise ValueError(f'{name} {text[:_SHOWN]!r}; allowed: {", ".join(allowed)}')
-    return text
+    for word in allowed:
+        if text == word:
+            return word
+    raise ValueError(f'{name} {text[:_SHOWN]!r}; allowed: {", ".join(allowed)}')
 
 
 def _counts(text: str) -> dict[str, int]:

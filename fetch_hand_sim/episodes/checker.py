@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from msgs_spec.codecs import decode
 from msgs_spec.command_line import printable
 from msgs_spec.schemas import deserialize
 from msgs_spec.source_revision import source_revision
-from msgs_spec.tasks import RewardType, SuccessRule, Timing
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import TopicSpec
 
@@ -130,10 +129,10 @@ class EpisodeChecker:
             self._simulation = Simulation(
                 record.task.name,
                 num_threads=1,
-                reward_type=cast(RewardType, record.reward_type),
-                success_rule=cast(SuccessRule, record.success_rule),
+                reward_type=record.reward_type,
+                success_rule=record.success_rule,
                 control_hz=record.control_hz,
-                timing=cast(Timing, record.timing),
+                timing=record.timing,
             )
             self._key = key
             model = self._simulation.model

@@ -23,7 +23,7 @@ from fetch_hand_sim.view.robot_requests import RobotRequests
 from fetch_hand_sim.view.robot_watch import ANY_TASK, WATCHING, RobotWatch, SeenTick
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode_status
-from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.tasks import SuccessRule, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic
 
@@ -56,7 +56,7 @@ class LiveRobot:
         self._unread: set[str] = set()
         self._trail: deque[Array] = deque(maxlen=TRAIL_TICKS)
         self._curves: Curves | None = None
-        self._rule = ''
+        self._rule: SuccessRule | None = None
         self._episode: tuple[int, int] | None = None
         self._picture: Picture | None = None
         self._is_new = False
@@ -110,9 +110,8 @@ class LiveRobot:
         if self._picture is None or self._picture.task != spec.name:
             self._picture, self._curves = Picture(spec.name), None
         if self._curves is None or self._rule != status.success_rule:
-            rule: Any = status.success_rule
-            self._rule = rule
-            self._curves = Curves(spec, GoalMetric(spec, success_rule=rule))
+            self._rule = status.success_rule
+            self._curves = Curves(spec, GoalMetric(spec, success_rule=status.success_rule))
         self._requests.take_task(spec)
         self._phase = status.phase
         # Of a fast robot the reset itself may not have been among the ticks that came.

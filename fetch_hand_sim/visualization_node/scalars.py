@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.view.robot_watch import SeenTick
 from msgs_spec.cdr import TopicCodec
@@ -19,8 +17,8 @@ class Scalars:
         success_rule: `gymnasium` or `paper`.
     """
 
-    def __init__(self, spec: TaskSpec, success_rule: str) -> None:
-        self._metric = GoalMetric(spec, success_rule=cast('SuccessRule', success_rule))
+    def __init__(self, spec: TaskSpec, success_rule: SuccessRule) -> None:
+        self._metric = GoalMetric(spec, success_rule=success_rule)
         self._codecs = {source.name: TopicCodec(source) for source in scalar_topics(spec)}
 
     def messages(self, tick: SeenTick) -> dict[str, bytes]:

@@ -68,9 +68,9 @@ class NumpyActor:
         del state, episode_start, deterministic
         shape = self.shape
         # Rounded to float32 first, as in training.
-        state = observation_part(observation, 'observation', shape.observation_size)
+        seen = observation_part(observation, 'observation', shape.observation_size)
         goal = observation_part(observation, 'desired_goal', shape.goal_size)
-        features = self._features(state.astype(np.float64), goal.astype(np.float64))
+        features = self._features(seen.astype(np.float64), goal.astype(np.float64))
         with _ONE_AT_A_TIME, _blas().limit(limits=1):
             return np.tanh(self._forward(features)).astype(np.float32), None
 
