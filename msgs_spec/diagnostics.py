@@ -101,14 +101,10 @@ def encode_reports(*reports: Report) -> bytes:
 
 
 class Durations:
-    """The latest durations of something that happens again and again.
+    """The latest thousand durations of something that happens again and again."""
 
-    Args:
-        size: How many are kept.
-    """
-
-    def __init__(self, size: int = 1000) -> None:
-        self._values: deque[float] = deque(maxlen=size)
+    def __init__(self) -> None:
+        self._values: deque[float] = deque(maxlen=1000)
 
     def add(self, seconds: float) -> None:
         """Notes one."""

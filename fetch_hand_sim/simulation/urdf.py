@@ -104,11 +104,6 @@ class RobotDescription:
         self._bodies = [body for body in bodies if self._belongs(body)]
         self.joints = [joint for body in self._bodies for joint in self._joints_of(body)]
 
-    @property
-    def links(self) -> list[str]:
-        """Names of all links, the root first."""
-        return [ROOT, *(joint.child for joint in self.joints)]
-
     def poses(self, positions: Mapping[str, float]) -> dict[str, Pose]:
         """Forward kinematics: where every link is in the root.
 

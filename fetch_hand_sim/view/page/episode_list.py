@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -32,12 +31,9 @@ class EpisodeList:
     Args:
         paths: Episodes.
         send: Gets what people choose.
-        describe: Says what an episode is.
     """
 
-    def __init__(
-        self, paths: tuple[Path, ...], send: Send, describe: Callable[[Path], str] = describe
-    ) -> None:
+    def __init__(self, paths: tuple[Path, ...], send: Send) -> None:
         self._paths = paths
         self._send = send
         self._describe = cache(describe)

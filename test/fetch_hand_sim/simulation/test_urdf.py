@@ -43,7 +43,7 @@ def configurations(scene):
 
 def bodies(description, scene):
     names = {scene.model.body(index).name for index in range(scene.model.nbody)}
-    return [link for link in description.links if link in names and link != ROOT]
+    return [joint.child for joint in description.joints if joint.child in names]
 
 
 def test_a_library_finds_every_body_where_mujoco_has_it(robot):
