@@ -107,6 +107,19 @@ def printable(text: str) -> str:
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
+def one_line(text: object, longest: int = 200) -> str:
+    """Returns what an error, a file or a library says, as one line that is safe to print.
+
+    Args:
+        text: An error without words is called by its type.
+        longest: Characters of the line, at most.
+    """
+    words = ' '.join(str(text).split())
+    if not words and isinstance(text, BaseException):
+        words = type(text).__name__
+    return printable(words[:longest])[:longest]
+
+
 def complain(name: str, text: object) -> None:
     """Prints one line on stderr.
 

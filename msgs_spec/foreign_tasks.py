@@ -12,6 +12,8 @@ from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
+from msgs_spec.command_line import one_line
+
 SPECS = 'fetch_hand_sim_tasks.specification'
 SIMULATIONS = 'fetch_hand_sim_tasks.simulation'
 
@@ -57,4 +59,4 @@ def foreign_simulation(name: str) -> Any:
 
 def _what_failed(entry_point: EntryPoint, error: Exception) -> str:
     package = entry_point.dist.name if entry_point.dist is not None else 'a package'
-    return f'{package}: {entry_point.value}: {" ".join(str(error).split()) or type(error).__name__}'
+    return f'{package}: {entry_point.value}: {one_line(error, longest=1000)}'

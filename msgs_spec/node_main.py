@@ -19,6 +19,7 @@ from msgs_spec.command_line import (
     UsageError,
     complain,
     heard,
+    one_line,
     require_extra,
 )
 from msgs_spec.last_resort import ends_within
@@ -198,7 +199,7 @@ def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any
         init(args=args, signal_handler_options=handlers)
     except Exception as error:
         # rclpy raises several unrelated types for malformed `--ros-args`.
-        raise UsageError(' '.join(str(error).split())) from None
+        raise UsageError(one_line(error, longest=1000)) from None
 
 
 def _refuse_arguments(args: Sequence[str]) -> None:

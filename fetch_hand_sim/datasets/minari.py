@@ -30,7 +30,7 @@ from fetch_hand_sim.datasets.writing import (
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
 from fetch_hand_sim.gym_envs.spaces import observation_space
-from msgs_spec.command_line import UsageError
+from msgs_spec.command_line import UsageError, one_line
 
 # Parts of a dataset's id become directories.
 _DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
@@ -74,7 +74,7 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
     except ImportError as error:
         raise ExportError(f"{error}; install with pip install 'fetch_hand_sim[data]'") from error
     except (OSError, ValueError, AssertionError) as error:
-        raise ExportError(f'{directory}: {" ".join(str(error).split())}') from error
+        raise ExportError(f'{directory}: {one_line(error, longest=1000)}') from error
     return ids
 
 

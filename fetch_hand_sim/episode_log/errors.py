@@ -4,13 +4,6 @@ from __future__ import annotations
 
 from msgs_spec.command_line import printable
 
-_LONGEST_REASON = 200
-
-
-def one_line(error: BaseException) -> str:
-    """Returns what an error says in one line of bounded length."""
-    return printable(' '.join(str(error).split()) or type(error).__name__)[:_LONGEST_REASON]
-
 
 class EpisodeLogError(RuntimeError):
     """An episode cannot be written; the message is one line with path and reason."""

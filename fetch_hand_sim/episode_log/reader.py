@@ -18,9 +18,10 @@ from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metad
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.episode_record import HasOutcome
-from fetch_hand_sim.episode_log.errors import EpisodeReadError, one_line
+from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.limits import MAX_SUMMARY_BYTES
 from fetch_hand_sim.episode_log.untrusted import read_records, require_size
+from msgs_spec.command_line import one_line
 
 # CRC of the summary and magic, bytes.
 FILE_END = 4 + 8

@@ -25,13 +25,14 @@ from fetch_hand_sim.episode_log.episode_bag import (
     store_bag,
 )
 from fetch_hand_sim.episode_log.episode_record import EpisodeOutcome
-from fetch_hand_sim.episode_log.errors import EpisodeInUseError, EpisodeLogError, one_line
+from fetch_hand_sim.episode_log.errors import EpisodeInUseError, EpisodeLogError
 from fetch_hand_sim.episode_log.leftovers import inspect_leftover
 from fetch_hand_sim.episode_log.limits import ReceivedAllowance
 from fetch_hand_sim.episode_log.offered_qos import parse_offered_qos
 from fetch_hand_sim.episode_log.reader import DAMAGED, read_episode
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from fetch_hand_sim.episode_log.untrusted import RECOVERY_LIMITS, read_records
+from msgs_spec.command_line import one_line
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.topics import topics

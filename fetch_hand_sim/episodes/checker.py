@@ -13,7 +13,6 @@ import numpy as np
 
 from fetch_hand_sim.episode_log import Episode, EpisodeReadError, episode_metadata, read_episode
 from fetch_hand_sim.episode_log.episode_record import EpisodeRecord
-from fetch_hand_sim.episode_log.errors import one_line
 from fetch_hand_sim.episode_log.model import former_model_sha256, model_sha256
 from fetch_hand_sim.episode_log.reader import DAMAGED
 from fetch_hand_sim.episode_log.ticks import LoggedTick, split_ticks
@@ -24,7 +23,7 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode
-from msgs_spec.command_line import printable
+from msgs_spec.command_line import one_line, printable
 from msgs_spec.schemas import deserialize
 from msgs_spec.source_revision import source_revision
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs_spec.command_line import one_line
 from msgs_spec.tasks import TASKS, TaskSpec, substeps_per_tick, task_spec
-from policy_node.policies.files import one_line, read_file, sha256
+from policy_node.policies.files import read_file, sha256
 from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.policy import LoadedPolicy, Policy

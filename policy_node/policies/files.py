@@ -10,6 +10,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+# Under this name as well, for nodes that say what is wrong with a policy.
+from msgs_spec.command_line import one_line as one_line
+
 # The largest actor of the paper's size has 0.7 MB.
 LARGEST_POLICY = 64 * 2**20
 
@@ -96,9 +99,3 @@ def to_json(values: Mapping[str, Any]) -> bytes:
 def sha256(data: bytes) -> str:
     """Fingerprint of a policy's file, hexadecimal."""
     return hashlib.sha256(data).hexdigest()
-
-
-def one_line(text: object, longest: int = 200) -> str:
-    """What a file or a library says, as one line that is safe to print."""
-    words = ' '.join(str(text).split())[:longest]
-    return ''.join(c if c.isprintable() else '?' for c in words)

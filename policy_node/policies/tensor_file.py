@@ -14,7 +14,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as from_bytes
 from safetensors.numpy import save as to_bytes
 
-from policy_node.policies.files import one_line, read_file, write_file
+from msgs_spec.command_line import one_line
+from policy_node.policies.files import read_file, write_file
 
 # A training state with its optimisers has a few megabytes.
 LARGEST_TENSOR_FILE = 2**30

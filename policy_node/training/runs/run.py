@@ -18,10 +18,10 @@ from msgs_spec.command_line import (
     complain,
     complain_from_handler,
     on_stop_signals,
+    one_line,
     require_extra,
 )
 from msgs_spec.source_revision import source_revision
-from policy_node.policies.files import one_line
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import is_first_worker, join_workers, leave_workers
