@@ -14,6 +14,7 @@ import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata
+from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
@@ -25,14 +26,13 @@ from fetch_hand_sim.episode_log.limits import (
     MAX_UNPACKED_BYTES,
 )
 from fetch_hand_sim.episode_log.reader import mcap_file, one_line_errors
-from fetch_hand_sim.episode_log.untrusted import RECORD, require_size, unpack
+from fetch_hand_sim.episode_log.untrusted import MESSAGE, RECORD, require_size, unpack
 
-_MAGIC = bytes([137, 77, 67, 65, 80, 48, 13, 10])
 # Opcode, length and, of a message, its channel.
 _MESSAGE = struct.Struct('<BQH')
 # Opcode and length; then channel, sequence, log time and publish time.
 _PREFIX = RECORD.size
-_HEADER = 2 + 4 + 8 + 8
+_HEADER = MESSAGE.size
 _LOG_TIME = slice(_PREFIX + 6, _PREFIX + 14)
 
 
@@ -165,9 +165,10 @@ class _Scan:
 
 def _data_section(buffer: mmap.mmap) -> Iterator[tuple[int, bytes]]:
     """Yields opcode and content of chunks and metadata records; others are passed over."""
-    if buffer[: len(_MAGIC)] != _MAGIC or buffer[-len(_MAGIC) :] != _MAGIC:
+    magic = len(MCAP0_MAGIC)
+    if buffer[:magic] != MCAP0_MAGIC or buffer[-magic:] != MCAP0_MAGIC:
         raise ValueError('it does not begin and end as an MCAP file')
-    position, end = len(_MAGIC), len(buffer) - len(_MAGIC)
+    position, end = magic, len(buffer) - magic
     for _ in range(MAX_RECORDS):
         if position >= end:
             break

@@ -16,6 +16,7 @@ from mcap.stream_reader import read_magic
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.episode_record import HasOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
+from fetch_hand_sim.episode_log.limits import MAX_METADATA_RECORDS
 from fetch_hand_sim.episode_log.reader import (
     check_summary,
     episode_records,
@@ -28,7 +29,6 @@ from fetch_hand_sim.episode_log.untrusted import BoundedStream, Records
 _MAGIC_BYTES = 8
 # Opcode, length, two offsets and a CRC.
 _FOOTER_BYTES = 1 + 8 + 8 + 8 + 4
-_MAX_METADATA_RECORDS = 16
 _AT_THE_END = frozenset({Opcode.FOOTER, Opcode.STATISTICS, Opcode.METADATA_INDEX})
 
 
@@ -70,7 +70,7 @@ def read_summary(path: Path | str) -> EpisodeSummary:
         statistics = next((r for r in records if isinstance(r, Statistics)), None)
         if statistics is None:
             raise ValueError('no statistics')
-        indexes = [r for r in records if isinstance(r, MetadataIndex)][:_MAX_METADATA_RECORDS]
+        indexes = [r for r in records if isinstance(r, MetadataIndex)][:MAX_METADATA_RECORDS]
         found = {index.name: _metadata_at(stream, index) for index in indexes}
         size = file.stat().st_size
     metadata, result = episode_records(file, found)
