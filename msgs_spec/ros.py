@@ -66,6 +66,11 @@ def rclpy_profile(spec: QosSpec) -> QoSProfile:
     )
 
 
+def full_name(namespace: str, name: str) -> str:
+    """Returns the full name of a node in a namespace, such as `/left/sim_node`."""
+    return f'{namespace.rstrip("/")}/{name}'
+
+
 def count_publishers(node: Node, topic: str) -> int:
     """Returns how many publish a topic, under the name to which this node's is remapped."""
     return int(node.count_publishers(node.resolve_topic_name(topic)))

@@ -10,10 +10,9 @@ import numpy as np
 
 from fetch_hand_sim.films.recording import Recording
 from fetch_hand_sim.simulation.rendering import SceneRenderer
-from fetch_hand_sim.simulation.scene import Scene, tracked_position
+from fetch_hand_sim.simulation.scene import Scene, trail_of
 from msgs_spec.arrays import Picture
 
-_TRAIL_TICKS = 40
 _GAP = 2
 # Around a tile whose episode has reached its goal.
 _REACHED = np.array([40, 170, 70], dtype=np.uint8)
@@ -54,8 +53,8 @@ class Studio:
             RuntimeError: If there is no OpenGL.
         """
         frames, index = recording.frames, self._index(recording, index)
-        trail = [tracked_position(f) for f in frames[max(0, index - _TRAIL_TICKS) : index + 1]]
-        return self._renderer(recording.spec.name).render(frames[index], trail)
+        renderer = self._renderer(recording.spec.name)
+        return renderer.render(frames[index], trail_of(frames, index))
 
     def plain(self, recording: Recording, index: int) -> Picture:
         """Returns the same as a camera would see it: no way of the object, a goal of one colour.

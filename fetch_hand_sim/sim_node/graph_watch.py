@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from fetch_hand_sim.sim_node.commanders import CommanderWatch, Endpoint
 from msgs_spec.listeners import Listeners
-from msgs_spec.ros import count_publishers
+from msgs_spec.ros import count_publishers, full_name
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topics
 
@@ -66,7 +66,7 @@ class GraphWatch:
     def waiting_elsewhere(self) -> list[str]:
         """Policies that wait for a robot in another namespace than this one's."""
         return [
-            f'{info.node_namespace.rstrip("/")}/{info.node_name} waits for a robot on {name}'
+            f'{full_name(info.node_namespace, info.node_name)} waits for a robot on {name}'
             for name, _ in self._node.get_topic_names_and_types()
             if name.endswith('/episode_status') and name != self._status
             if not self._node.count_publishers(name)
@@ -80,7 +80,7 @@ class GraphWatch:
     def _found(self, topic_name: str) -> list[Endpoint]:
         return [
             Endpoint(
-                node=f'{info.node_namespace.rstrip("/")}/{info.node_name}',
+                node=full_name(info.node_namespace, info.node_name),
                 topic=topic_name,
                 type_name=info.topic_type,
                 is_reliable=info.qos_profile.reliability.name != 'BEST_EFFORT',

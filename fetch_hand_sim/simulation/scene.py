@@ -21,6 +21,8 @@ from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
 
 Color = tuple[float, float, float, float]
 
+# How much of the way of an object or gripper is drawn.
+TRAIL_TICKS = 40
 REACHED: Color = (0.15, 0.75, 0.25, 0.65)
 MISSED: Color = (0.9, 0.2, 0.15, 0.65)
 _ACHIEVED: Color = (0.15, 0.4, 0.9, 0.8)
@@ -236,6 +238,11 @@ def tracked_position(frame: Frame) -> Array:
     if frame.object_pose is not None:
         return frame.object_pose[:3].copy()
     return frame.achieved_goal[:3].copy()
+
+
+def trail_of(frames: Sequence[Frame], index: int) -> list[Array]:
+    """The way (n, 3) of that point up to a frame, as much of it as is drawn."""
+    return [tracked_position(frame) for frame in frames[max(0, index - TRAIL_TICKS) : index + 1]]
 
 
 def _sphere(position: Array, radius: float, color: Color) -> Marker:

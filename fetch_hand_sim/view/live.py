@@ -13,16 +13,17 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
-from fetch_hand_sim.simulation.scene import tracked_position
+from fetch_hand_sim.simulation.scene import TRAIL_TICKS, tracked_position
 from fetch_hand_sim.view.curves import Curves
 from fetch_hand_sim.view.frame_rate import FOLLOWING, OVERLOOKING
-from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Graphs, Picture
+from fetch_hand_sim.view.picture import Facts, Graphs, Picture
 from fetch_hand_sim.view.replay_watch import ReplayWatch
 from fetch_hand_sim.view.requests import LatestRequest, Request, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RobotRequests
 from fetch_hand_sim.view.robot_watch import ANY_TASK, WATCHING, RobotWatch, SeenTick
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode_status
+from msgs_spec.ros import full_name
 from msgs_spec.tasks import SuccessRule, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic
@@ -46,7 +47,7 @@ class LiveRobot:
     def __init__(self, node: Node, may_command: bool) -> None:
         self._may_command = may_command
         self._name = node.get_fully_qualified_name()
-        self._sim_name = f'{node.get_namespace().rstrip("/")}/sim_node'
+        self._sim_name = full_name(node.get_namespace(), 'sim_node')
         self._facts = Facts(may_command=may_command)
         self._commander = ''
         self._phase = ''

@@ -12,9 +12,6 @@ from mujoco.studio import messages
 from fetch_hand_sim.simulation.scene import Frame, Scene
 from msgs_spec.arrays import Array
 
-# How much of the way of an object is drawn.
-TRAIL_TICKS = 40
-
 
 @dataclass(frozen=True, slots=True)
 class Facts:

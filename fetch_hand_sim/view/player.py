@@ -10,9 +10,9 @@ import numpy as np
 
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.films.recording import load_recording, none_readable
-from fetch_hand_sim.simulation.scene import tracked_position
+from fetch_hand_sim.simulation.scene import trail_of
 from fetch_hand_sim.view.curves import Curves
-from fetch_hand_sim.view.picture import TRAIL_TICKS, Facts, Picture, Timeline
+from fetch_hand_sim.view.picture import Facts, Picture, Timeline
 from fetch_hand_sim.view.requests import (
     ChangeEpisode,
     LatestRequest,
@@ -156,12 +156,11 @@ class Player:
     def _make_picture(self) -> Picture:
         recording, index = self._recording, self.index
         frames, arrays = recording.frames, recording.arrays
-        trail = [tracked_position(f) for f in frames[max(0, index - TRAIL_TICKS) : index + 1]]
         time = float(recording.times[index])
         return Picture(
             task=recording.spec.name,
             frame=frames[index],
-            trail=tuple(trail),
+            trail=tuple(trail_of(frames, index)),
             facts=self._facts(index),
             graphs=self._graphs.until(time),
             command=arrays.commands[index - 1] if index else None,

@@ -8,6 +8,7 @@ from typing import Any
 
 from rclpy.node import Node, NodeNameNonExistentError
 
+from msgs_spec.ros import full_name
 from msgs_spec.services import PAUSE, RESET
 
 # Seconds over which ticks are counted.
@@ -99,4 +100,4 @@ def _as_replay(node: Node, info: Any) -> Replay | None:
     if any(RESET.type_name in types for _, types in services):
         return None
     pauses = [service for service, types in services if PAUSE.type_name in types]
-    return Replay(f'{namespace.rstrip("/")}/{name}', pauses[0]) if pauses else None
+    return Replay(full_name(namespace, name), pauses[0]) if pauses else None
