@@ -16,7 +16,6 @@ import importlib.util
 import itertools
 import json
 import os
-import platform
 import subprocess
 import sys
 import threading
@@ -28,6 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from msgs_spec.tasks import TASKS  # noqa: E402
+from policy_node.training.benchmark.machines import processor  # noqa: E402
 
 RESULTS = ROOT / 'bench' / 'results'
 OURS = 'this_project'
@@ -196,15 +196,10 @@ def plot(rows: Sequence[Row], path: Path, title: str) -> None:
 
 def describe_machine(options: argparse.Namespace) -> str:
     """What was measured on what, one line."""
-    models = [
-        line.split(':')[1].strip()
-        for line in Path('/proc/cpuinfo').read_text().splitlines()
-        if line.startswith('model name')
-    ]
     tqc = ['sb3_contrib'] if 'sb3_tqc' in options.competitors else []
     versions = ('mujoco', 'torch', 'stable_baselines3', *tqc)
     parts = [
-        models[0] if models else platform.machine(),
+        processor(),
         f'{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start',
         'side by side' if options.side_by_side else 'in turn',
         f'{options.threads} threads each' if options.threads > 1 else '1 thread each',

@@ -15,7 +15,6 @@ import datetime
 import importlib.metadata
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -30,6 +29,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from msgs_spec.tasks import TASKS  # noqa: E402
+from policy_node.training.benchmark.machines import processor  # noqa: E402
 
 PEERS = ROOT / '.venv-bench'
 RESULTS = ROOT / 'bench' / 'results'
@@ -148,13 +148,8 @@ def _median_ratio(ours: list[float], theirs: list[float]) -> float:
 
 def describe_machine() -> str:
     """What the numbers were measured on, one line."""
-    models = [
-        line.split(':')[1].strip()
-        for line in Path('/proc/cpuinfo').read_text().splitlines()
-        if line.startswith('model name')
-    ]
     parts = [
-        models[0] if models else platform.machine(),
+        processor(),
         f'{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start',
         *(f'{name} {importlib.metadata.version(name)}' for name in ('mujoco', 'numpy')),
         'EnvPool 1.2.5, Gymnasium-Robotics 1.4.2',

@@ -9,5 +9,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 # What replays and networks hold.
 Array32 = NDArray[np.float32]
+# Whether, for each of many.
+Flags = NDArray[np.bool_]
 # Rows, columns, RGB.
 Picture = NDArray[np.uint8]

@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msgs_spec.arrays import Array
-from msgs_spec.rotations import wxyz_to_xyzw, xyzw_to_wxyz
+from msgs_spec.rotations import IDENTITY, wxyz_to_xyzw, xyzw_to_wxyz
 from msgs_spec.schemas import message_class
 from msgs_spec.topics import TopicSpec
 
 _NANOSECONDS = 10**9
-_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def message_stamp(message: Any) -> int:
@@ -193,7 +192,7 @@ def _read_free_joint(topic: TopicSpec, message: Any) -> Array:
 def _build_pose_array(topic: TopicSpec, values: Array) -> dict[str, Any]:
     rows = values.reshape(len(topic.layout), -1)
     # Goals are positions alone.
-    return {'poses': [_pose(row[:3], row[3:] if row.size == 7 else _IDENTITY) for row in rows]}
+    return {'poses': [_pose(row[:3], row[3:] if row.size == 7 else IDENTITY) for row in rows]}
 
 
 def _read_pose_array(topic: TopicSpec, message: Any) -> Array:

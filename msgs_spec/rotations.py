@@ -15,6 +15,9 @@ from numpy.typing import ArrayLike
 
 from msgs_spec.arrays import Array
 
+# The quaternion of no rotation.
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+IDENTITY.flags.writeable = False
 _SINGULAR = 4.0 * np.finfo(np.float64).eps
 
 

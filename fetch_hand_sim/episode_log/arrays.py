@@ -16,13 +16,11 @@ from fetch_hand_sim.episode_log.messages import MessageFile, MessageRows, read_m
 from fetch_hand_sim.episode_log.reader import episode_records
 from fetch_hand_sim.episode_log.summary import expand_episodes
 from msgs_spec.actions import action_from_command
-from msgs_spec.arrays import Array
+from msgs_spec.arrays import Array, Flags
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
-
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from fetch_hand_sim.simulation.urdf_shapes import add_origin, add_shapes, number
 from msgs_spec.arrays import Array
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.rotations import (
+    IDENTITY,
     quaternion_from_axis_angle,
     quaternion_multiply,
     quaternion_to_matrix,
@@ -29,7 +30,6 @@ from msgs_spec.tasks import task_spec
 JointType = Literal['fixed', 'revolute', 'continuous', 'prismatic']
 
 ROOT = 'world'
-_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 # URDF demands limits of what MuJoCo leaves unlimited: m or rad, N or N m, and per second.
 _FAR, _STRONG, _FAST = 1000.0, 1000.0, 100.0
 
@@ -81,7 +81,7 @@ class UrdfJoint:
         if self.kind == 'fixed':
             return self.origin
         if self.kind == 'prismatic':
-            return self.origin @ Pose(position * self.axis, _IDENTITY)
+            return self.origin @ Pose(position * self.axis, IDENTITY)
         turn = quaternion_from_axis_angle(self.axis, position)
         return self.origin @ Pose(np.zeros(3), turn)
 
@@ -110,7 +110,7 @@ class RobotDescription:
         Args:
             positions: By name of the joint, rad or m.
         """
-        found = {ROOT: Pose(np.zeros(3), _IDENTITY)}
+        found = {ROOT: Pose(np.zeros(3), IDENTITY)}
         for joint in self.joints:
             found[joint.child] = found[joint.parent] @ joint.pose(positions.get(joint.name, 0.0))
         return found
@@ -154,14 +154,14 @@ class RobotDescription:
             # Only a hinge turns about its anchor; what slides may as well start from the origin.
             is_hinge = int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_HINGE.value
             anchor = model.jnt_pos[index] if is_hinge else np.zeros(3)
-            start = origin @ Pose(anchor, _IDENTITY)
+            start = origin @ Pose(anchor, IDENTITY)
             is_last = index == moving[-1] and not anchor.any()
             child = name if is_last else f'{model.joint(index).name}/moved'
             yield self._moving_joint(index, parent, child, start)
             if is_last:
                 return
             parent = child
-            origin = Pose(-anchor, _IDENTITY)
+            origin = Pose(-anchor, IDENTITY)
         yield UrdfJoint(f'{name}/fixed', 'fixed', parent, name, origin, np.zeros(3))
 
     def _moving_joint(self, index: int, parent: str, child: str, start: Pose) -> UrdfJoint:

@@ -11,9 +11,8 @@ from fetch_hand_sim.simulation.scene import Frame, View
 from fetch_hand_sim.simulation.urdf import ROOT, Pose, RobotDescription
 from msgs_spec.arrays import Array
 from msgs_spec.robots import FINGERTIPS
+from msgs_spec.rotations import IDENTITY
 from msgs_spec.tasks import GoalKind, task_spec
-
-_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,7 @@ class Transforms:
         is_point = self._spec.goal is GoalKind.POINT
         names = ['goal'] if is_point else [f'goal_{name}' for name in FINGERTIPS]
         points = zip(names, goal.reshape(-1, 3), strict=True)
-        return [self._pose(name, np.concatenate([point, _IDENTITY])) for name, point in points]
+        return [self._pose(name, np.concatenate([point, IDENTITY])) for name, point in points]
 
     def _pose(self, name: str, pose: Array) -> Transform:
         return self._between(ROOT, name, Pose(pose[:3], pose[3:]))

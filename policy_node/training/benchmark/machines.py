@@ -9,7 +9,12 @@ from pathlib import Path
 
 def machine() -> str:
     """Processor and number of cores."""
+    return f'{processor()}, {os.cpu_count()} cores'
+
+
+def processor() -> str:
+    """Model of the processor; where Linux names none, its architecture."""
     info = Path('/proc/cpuinfo')
     lines = info.read_text().splitlines() if info.is_file() else []
     models = [line.split(':')[1].strip() for line in lines if line.startswith('model name')]
-    return f'{models[0] if models else platform.machine()}, {os.cpu_count()} cores'
+    return models[0] if models else platform.machine()
