@@ -27,6 +27,7 @@ import numpy as np  # noqa: E402
 import rclpy  # noqa: E402
 
 from msgs_spec.codecs import decode_status  # noqa: E402
+from msgs_spec.diagnostics import MISSED_TICKS  # noqa: E402
 from msgs_spec.event_loop import EventLoop  # noqa: E402
 from msgs_spec.ros import rclpy_profile, ros_message_class  # noqa: E402
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
@@ -69,7 +70,7 @@ class Watcher:
         self.times.append(time.perf_counter())
 
     def _on_report(self, message: Any) -> None:
-        self.missed = int(decode_status(message).get('missed ticks', self.missed))
+        self.missed = int(decode_status(message).get(MISSED_TICKS, self.missed))
 
 
 def report(label: str, times: list[float], missed: int, factor: float) -> None:

@@ -19,6 +19,14 @@ from msgs_spec.schemas import serialize
 from msgs_spec.topics import DIAGNOSTICS
 
 REPORT_PERIOD = 1.0
+# Keys of what a robot reports that pages, policies and benchmarks read.
+MODE = 'mode'
+PAUSED = 'paused'
+RATE = 'rate (Hz)'
+ASKED_RATE = 'rate asked (Hz)'
+MISSED_TICKS = 'missed ticks'
+PERTURB_LIMIT = 'perturb limit (N)'
+COMMANDERS = 'commanders'
 # What a stamp can say, whose seconds are an int32: a machine may believe that it is 2038.
 _LATEST = (2**31 - 1) * 10**9
 

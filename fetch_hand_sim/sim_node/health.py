@@ -7,7 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fetch_hand_sim.sim_node.robot import Robot
-from msgs_spec.diagnostics import Increase, Level, Report
+from msgs_spec.diagnostics import (
+    ASKED_RATE,
+    COMMANDERS,
+    MISSED_TICKS,
+    MODE,
+    PAUSED,
+    PERTURB_LIMIT,
+    RATE,
+    Increase,
+    Level,
+    Report,
+)
 
 # Where a robot is asked for more than it does by this share, the report warns.
 _RATE_TOLERANCE = 0.05
@@ -99,14 +110,14 @@ class Health:
         age = buffer.age()
         tick_time = counters.tick_time.milliseconds()
         return {
-            'mode': schedule.mode,
-            'paused': str(schedule.is_paused),
+            MODE: schedule.mode,
+            PAUSED: str(schedule.is_paused),
             'simulated time (s)': f'{robot.runner.stamp_ns * 1e-9:.3f}',
-            'rate (Hz)': f'{rate:.2f}',
-            'rate asked (Hz)': f'{schedule.asked_rate:.2f}' if schedule.asked_rate else '-',
+            RATE: f'{rate:.2f}',
+            ASKED_RATE: f'{schedule.asked_rate:.2f}' if schedule.asked_rate else '-',
             'real time factor': f'{self.real_time_factor:.3f}',
             'ticks': str(counters.ticks),
-            'missed ticks': str(schedule.pacer.missed_ticks),
+            MISSED_TICKS: str(schedule.pacer.missed_ticks),
             **{f'tick time {name} (ms)': value for name, value in tick_time.items()},
             'command age (s)': '-' if age is None else f'{age:.3f}',
             'commands accepted': str(buffer.accepted),
@@ -121,10 +132,10 @@ class Health:
             'episodes finished': str(counters.episodes),
             'episodes successful': str(counters.successes),
             'episodes given up': str(counters.given_up),
-            'perturb limit (N)': f'{robot.perturb_limit:g}',
+            PERTURB_LIMIT: f'{robot.perturb_limit:g}',
             'divergences': str(robot.runner.simulation.divergences),
             'log': surroundings.log,
-            'commanders': ', '.join(surroundings.commanders) or '-',
+            COMMANDERS: ', '.join(surroundings.commanders) or '-',
             'clock publishers': ', '.join(self._clock_publishers(surroundings)) or '-',
         }
 

@@ -23,6 +23,15 @@ from fetch_hand_sim.view.robot_requests import RobotRequests
 from fetch_hand_sim.view.robot_watch import ANY_TASK, WATCHING, RobotWatch, SeenTick
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode_status
+from msgs_spec.diagnostics import (
+    ASKED_RATE,
+    COMMANDERS,
+    MISSED_TICKS,
+    MODE,
+    PAUSED,
+    PERTURB_LIMIT,
+    RATE,
+)
 from msgs_spec.ros import full_name
 from msgs_spec.tasks import SuccessRule, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
@@ -219,19 +228,19 @@ class LiveRobot:
 
     def _take_report(self, values: dict[str, str]) -> None:
         self._hear()
-        asked = values.get('rate asked (Hz)')
+        asked = values.get(ASKED_RATE)
         if asked != self._asked_rate:
             # Rounded, and of a robot that is paused or in lockstep not there: the robot knows.
             self._asked_rate = asked
             self._unread.add('speed')
-        self._requests.push_limit = _number(values.get('perturb limit (N)'))
+        self._requests.push_limit = _number(values.get(PERTURB_LIMIT))
         self._update_facts(
-            is_paused=values.get('paused') == 'True',
-            rate=_number(values.get('rate (Hz)')),
-            missed_ticks=int(_number(values.get('missed ticks'))),
-            commander=values.get('commanders', '-'),
+            is_paused=values.get(PAUSED) == 'True',
+            rate=_number(values.get(RATE)),
+            missed_ticks=int(_number(values.get(MISSED_TICKS))),
+            commander=values.get(COMMANDERS, '-'),
             push_limit=self._requests.push_limit,
-            has_speed=values.get('mode') != 'lockstep',
+            has_speed=values.get(MODE) != 'lockstep',
         )
         self._yield_to_others()
 
