@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from msgs_spec.command_line import one_line
 from msgs_spec.tasks import TASKS, TaskSpec, substeps_per_tick, task_spec
-from policy_node.policies.files import read_file, sha256
+from policy_node.policies.files import read_file, sha256, write_file
 from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.policy import LoadedPolicy, Policy
@@ -26,7 +26,7 @@ from policy_node.policies.tensor_file import (
     TensorHeader,
     parse_header,
     parse_tensors,
-    write_tensors,
+    tensor_bytes,
 )
 
 if TYPE_CHECKING:
@@ -110,10 +110,19 @@ def observation_layout(spec: TaskSpec) -> tuple[tuple[str, int], ...]:
 
 def save(path: str | Path, actor: Actor, info: ActorInfo) -> None:
     """Writes weights, normaliser and metadata to `path`; the file is complete or not there."""
+    write_file(Path(path), to_bytes(actor, info))
+
+
+def to_bytes(actor: Actor, info: ActorInfo) -> bytes:
+    """Returns what `save` writes.
+
+    Raises:
+        ValueError: If the metadata are of an actor of another shape.
+    """
     if actor.shape != info.shape:
         raise ValueError(f'actor has shape {actor.shape}, its metadata say {info.shape}')
     tensors = {name: value.detach().cpu() for name, value in actor.state_dict().items()}
-    write_tensors(path, tensors, to_metadata(info))
+    return tensor_bytes(tensors, to_metadata(info))
 
 
 def to_metadata(info: ActorInfo) -> dict[str, str]:

@@ -42,8 +42,13 @@ def write_tensors(
     path: str | Path, tensors: Mapping[str, ArrayLike], metadata: dict[str, str]
 ) -> None:
     """Writes arrays, or torch tensors on the CPU; the file is complete or not there."""
+    write_file(Path(path), tensor_bytes(tensors, metadata))
+
+
+def tensor_bytes(tensors: Mapping[str, ArrayLike], metadata: dict[str, str]) -> bytes:
+    """Returns what `write_tensors` writes."""
     arrays = {name: np.asarray(value, order='C') for name, value in tensors.items()}
-    write_file(Path(path), to_bytes(arrays, metadata))
+    return to_bytes(arrays, metadata)
 
 
 def read_tensors(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:

@@ -194,7 +194,7 @@ def read_progress(path: str | Path) -> list[dict[str, float]]:
     return [numbers for _, numbers in _whole_rows(path)]
 
 
-def draw_curve(rows: Sequence[dict[str, float]], title: str, path: str | Path) -> None:
+def draw_curve(rows: Sequence[dict[str, float]], title: str, file: str | Path | IO[bytes]) -> None:
     """Draws success against environment steps as PNG."""
     from matplotlib.figure import Figure
 
@@ -219,4 +219,4 @@ def draw_curve(rows: Sequence[dict[str, float]], title: str, path: str | Path) -
     axes.set_title(title)
     axes.grid(alpha=0.3)
     axes.legend(loc='lower right')
-    figure.savefig(path, dpi=120)
+    figure.savefig(file, dpi=120, format='png')

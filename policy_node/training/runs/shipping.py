@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.command_line import discard_unread_output
 from policy_node.policies import checkpoint
-from policy_node.policies.files import to_json, write_file
+from policy_node.policies.actor import Actor
+from policy_node.policies.checkpoint import ActorInfo
+from policy_node.policies.files import sha256, to_json, write_files
 from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, summarize
 from policy_node.training.evaluation.table import print_table
 from policy_node.training.policy_options import require_writable
@@ -22,7 +25,7 @@ from policy_node.training.runs.run_folder import (
 )
 from policy_node.training.runs.run_log import draw_curve, read_progress
 from policy_node.training.runs.state_checks import is_finite
-from policy_node.training.runs.training_state import TrainingState, read_state, write_state
+from policy_node.training.runs.training_state import TrainingState, read_state, state_bytes
 
 # What decides which of two actors is better, the first first.
 _BETTER = ('success_gymnasium', 'mean_return')
@@ -58,14 +61,11 @@ def ship(
             all succeed by chance.
         UsageError: If the folder takes no file.
     """
-    actor, info = checkpoint.load(run / name)
-    progress, has_state = _progress_of(run), (run / STATE_FILE).is_file()
-    state = read_state(run / STATE_FILE) if has_state else None
-    shipped, digest = actors / f'{info.task}.json', checkpoint.checkpoint_hash(run / name)
-    target = actors / f'{info.task}.safetensors'
-    _require_rate(target, info.control_hz)
-    old = _evaluation_in(shipped)
-    if (old.get('run_sha256'), old.get('episodes')) == (digest, episodes):
+    candidate = _read_candidate(run, name)
+    target = actors / f'{candidate.info.task}.safetensors'
+    _require_rate(target, candidate.info.control_hz)
+    old = _evaluation_in(_evaluation_file(target))
+    if (old.get('run_sha256'), old.get('episodes')) == (candidate.sha256, episodes):
         print(f'ship_actor: the actor in {actors} is this one; nothing changed')
         return True
     if old and old['episodes'] > episodes:
@@ -74,45 +74,119 @@ def ship(
             f'on {episodes}: give --episodes {old["episodes"]} or more'
         )
     require_writable(target)
+    summary = _evaluate(candidate, episodes, num_envs, threads)
+    if old and not is_better(summary, old):
+        print(f'ship_actor: the actor in {actors} is at least as good; nothing changed')
+        return False
+    _write(candidate, target, summary)
+    print(f'ship_actor: {target} is the actor of {run} now')
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """An actor of a run, and what the folder holds beside it.
+
+    Attributes:
+        run: Folder of the run.
+        actor: The actor.
+        info: What its file says about it.
+        sha256: Fingerprint of its file.
+        progress: Log of the run, one row at least.
+        state: State of the run; None where it left none.
+    """
+
+    run: Path
+    actor: Actor
+    info: ActorInfo
+    sha256: str
+    progress: list[dict[str, float]]
+    state: TrainingState | None
+
+    @property
+    def command(self) -> str:
+        """What it was trained with."""
+        return commands_of(self.run) or self.info.command
+
+
+def _read_candidate(run: Path, name: str) -> _Candidate:
+    """Reads all that may be shipped, before anything is evaluated or replaced.
+
+    Raises:
+        ValueError: If there is no such actor, no log beside it, or a file is damaged.
+    """
+    actor, info = checkpoint.load(run / name)
+    progress, has_state = _progress_of(run), (run / STATE_FILE).is_file()
+    state = read_state(run / STATE_FILE) if has_state else None
+    return _Candidate(run, actor, info, checkpoint.checkpoint_hash(run / name), progress, state)
+
+
+def _evaluate(candidate: _Candidate, episodes: int, num_envs: int, threads: int) -> dict[str, Any]:
+    """Evaluates on fresh episodes and shows the table."""
+    info = candidate.info
     simulation = Simulation(
         info.task,
         num_envs=min(num_envs, episodes),
         num_threads=threads,
         control_hz=info.control_hz,
     )
-    summary = summarize(evaluate(simulation, actor, episodes, FIRST_SEED))
+    summary = summarize(evaluate(simulation, candidate.actor, episodes, FIRST_SEED))
     # After an hour of episodes nobody may read the table any more; the actor is saved all the same.
     discard_unread_output()
-    print_table({'policy': str(run), 'task': info.task, **summary})
-    if old and not is_better(summary, old):
-        print(f'ship_actor: the actor in {actors} is at least as good; nothing changed')
-        return False
-    recipe = info.config.get('recipe', 'an unknown')
-    title = f'{info.task}, {recipe} recipe, seed {info.seed}'
-    command = commands_of(run) or info.command
-    checkpoint.save(target, actor, replace(info, success=summary, command=command))
+    print_table({'policy': str(candidate.run), 'task': info.task, **summary})
+    return summary
+
+
+def _write(candidate: _Candidate, target: Path, summary: dict[str, Any]) -> None:
+    """Writes the actor, and beside it critic, curve and evaluation: all, or none is replaced."""
+    info = replace(candidate.info, success=summary, command=candidate.command)
+    actor = checkpoint.to_bytes(candidate.actor, info)
+    files = {target: actor}
+    if candidate.state is not None:
+        files[companion_file(target)] = _critic_bytes(candidate.state, sha256(actor))
+    curve = target.with_suffix('.png')
+    # A mean of networks, taken as it is, has no curve of its own: that of a part stays.
+    if candidate.progress[-1].get('updates') or not curve.is_file():
+        files[curve] = _curve_bytes(candidate)
     report = {
         'actor': info.task,
-        'sha256': checkpoint.checkpoint_hash(target),
-        'run_sha256': digest,
+        'sha256': sha256(actor),
+        'run_sha256': candidate.sha256,
         'env_steps': info.env_steps,
-        'command': command,
+        'command': info.command,
         'init_from': info.init_from,
         'source_revision': info.source_revision,
         **summary,
     }
-    if state is not None:
-        ship_critic(state, target)
-    else:
+    # The last: without it the actor is shipped again.
+    files[_evaluation_file(target)] = to_json(report)
+    # Links stay links.
+    write_files({path.resolve(): data for path, data in files.items()})
+    if candidate.state is None:
         # That of the actor before would be refused beside this one.
         companion_file(target).unlink(missing_ok=True)
-    curve = target.with_suffix('.png')
-    # A mean of networks, taken as it is, has no curve of its own: that of a part stays.
-    if progress[-1].get('updates') or not curve.is_file():
-        draw_curve(progress, title, curve)
-    write_file(shipped, to_json(report))
-    print(f'ship_actor: {target} is the actor of {run} now')
-    return True
+
+
+def _evaluation_file(target: Path) -> Path:
+    return target.with_suffix('.json')
+
+
+def _curve_bytes(candidate: _Candidate) -> bytes:
+    info = candidate.info
+    recipe = info.config.get('recipe', 'an unknown')
+    picture = BytesIO()
+    draw_curve(candidate.progress, f'{info.task}, {recipe} recipe, seed {info.seed}', picture)
+    return picture.getvalue()
+
+
+def _critic_bytes(state: TrainingState, actor_sha256: str) -> bytes:
+    """The critic of a run as it lies beside its shipped actor, so that training can go on there.
+
+    The actor holds its normalisers itself; optimisers start fresh.
+    """
+    tensors = {name: value for name, value in state.tensors.items() if name.startswith('critic.')}
+    extra = {'config': state.extra['config'], 'actor_sha256': actor_sha256}
+    return state_bytes(TrainingState(tensors, state.counters, extra))
 
 
 def _require_rate(target: Path, control_hz: float) -> None:
@@ -159,16 +233,6 @@ def _progress_of(run: Path) -> list[dict[str, float]]:
     if not progress:
         raise ValueError(f'{file} has no row')
     return progress
-
-
-def ship_critic(state: TrainingState, actor: Path) -> None:
-    """Puts the critic of a run beside its shipped actor, so that training can go on from there.
-
-    The actor holds its normalisers itself; optimisers start fresh.
-    """
-    tensors = {name: value for name, value in state.tensors.items() if name.startswith('critic.')}
-    extra = {'config': state.extra['config'], 'actor_sha256': checkpoint.checkpoint_hash(actor)}
-    write_state(companion_file(actor), TrainingState(tensors, state.counters, extra))
 
 
 def commands_of(run: Path) -> str:

@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from policy_node.policies.files import LARGEST_POLICY, read_file
+from policy_node.policies.files import LARGEST_POLICY, read_file, write_file
 from policy_node.policies.tensor_file import (
     LARGEST_HEADER,
     LARGEST_TENSOR_FILE,
     parse_header,
     read_tensors,
-    write_tensors,
+    tensor_bytes,
 )
 from policy_node.training.learners.actor_critic import HIGH_LEVEL, ActorCritic
 from policy_node.training.networks.normalizer import RunningStatistics
@@ -130,10 +130,15 @@ def require_readable(learner: ActorCritic) -> None:
 
 def write_state(path: Path, state: TrainingState) -> None:
     """Writes a state; the file is complete or not there."""
+    write_file(path, state_bytes(state))
+
+
+def state_bytes(state: TrainingState) -> bytes:
+    """Returns what `write_state` writes."""
     values = {name: getattr(state.counters, name) for name in Counters.__slots__}
     metadata = {'format': FORMAT, 'format_version': str(FORMAT_VERSION)}
     metadata |= {'counters': json.dumps(values), 'extra': json.dumps(state.extra)}
-    write_tensors(path, state.tensors, metadata)
+    return tensor_bytes(state.tensors, metadata)
 
 
 def read_counters(path: Path) -> Counters:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -162,3 +163,25 @@ def test_the_critic_of_another_actor_does_not_stay_beside_one_that_has_none(
     (run / 'training_state.safetensors').unlink()
     assert ship(run, actors, 2) == 0
     assert not critic.exists()
+
+
+def test_a_full_disk_leaves_the_actor_before_with_all_that_belongs_to_it(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    actors = tmp_path / 'actors'
+    assert ship(run, actors, 2) == 0
+    report = json.loads((actors / 'FetchReach.json').read_text())
+    worse = report | {'run_sha256': '', 'success_gymnasium': -1.0}
+    (actors / 'FetchReach.json').write_text(json.dumps(worse))
+    before = {file.name: file.read_bytes() for file in actors.iterdir()}
+    room = iter(range(3))
+
+    def sync(_: int) -> None:
+        if next(room, None) is None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, 'fsync', sync)
+    assert ship(run, actors, 2) == 2
+    error = capsys.readouterr().err
+    assert 'No space left on device' in error and 'FetchReach.json' in error
+    assert {file.name: file.read_bytes() for file in actors.iterdir()} == before
