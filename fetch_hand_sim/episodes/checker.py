@@ -90,7 +90,7 @@ class EpisodeChecker:
     def __init__(self) -> None:
         self._key: tuple[object, ...] = ()
         self._simulation: Simulation | None = None
-        self._fingerprints: tuple[str, ...] = ()
+        self._fingerprint = self._former_fingerprint = ''
 
     def check(self, path: Path) -> CheckResult:
         """Checks one episode.
@@ -135,12 +135,13 @@ class EpisodeChecker:
             )
             self._key = key
             model = self._simulation.model
-            self._fingerprints = (model_sha256(model), former_model_sha256(model))
+            self._fingerprint = model_sha256(model)
+            self._former_fingerprint = former_model_sha256(model)
         return self._simulation
 
     def _changes(self, episode: Episode, runner: EpisodeRunner) -> list[str]:
         recorded = episode.metadata
-        is_former = recorded.get('model_sha256') in self._fingerprints[1:]
+        is_former = recorded.get('model_sha256') == self._former_fingerprint
         here = episode_metadata(
             runner.spec,
             episode=runner.episode,
@@ -149,7 +150,7 @@ class EpisodeChecker:
             success_rule=runner.simulation.metric.success_rule,
             control_hz=runner.simulation.control_hz,
             timing=runner.simulation.timing,
-            model_sha256=self._fingerprints[is_former],
+            model_sha256=self._former_fingerprint if is_former else self._fingerprint,
             source_revision=source_revision(),
         )
         return [

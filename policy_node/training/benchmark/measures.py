@@ -160,7 +160,7 @@ def compared(
 
     Args:
         runs: Rows of `runs.csv`, each with its `area_in_time`.
-        baseline: Those of the first arm.
+        baseline: Those of the first arm; none for itself.
     """
     found: dict[str, float | str] = {}
     for name in COMPARED:
@@ -168,7 +168,7 @@ def compared(
             [float(run[name]) for run in group if run[name] is not None]
             for group in (runs, baseline)
         )
-        is_known = first and second and runs is not baseline
+        is_known = first and second
         found[f'{name}_p'] = float(f'{rank_sum_chance(first, second):.4g}') if is_known else ''
     return found
 

@@ -86,8 +86,10 @@ def sum_up_arms(study: Study, runs: Rows, curves: Rows) -> Rows:
             areas = (_area_in_time(by_run[run_of(run)], run, seconds) for run in group)
             pairs = zip(group, areas, strict=True)
             measured[arm] = [{**run, 'area_in_time': area} for run, area in pairs]
-        baseline = measured.get(study.arms[0].name, [])
-        arms += [sum_up(group) | compared(group, baseline) for group in measured.values()]
+        first = study.arms[0].name
+        baseline = measured.get(first, [])
+        for arm, group in measured.items():
+            arms.append(sum_up(group) | compared(group, [] if arm == first else baseline))
     return arms
 
 

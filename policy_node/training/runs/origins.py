@@ -35,4 +35,4 @@ def _run_of(part: dict[str, Any], steps: int) -> object:
         # A run by its folder has no file to tell the sum of.
         if 'sha256' not in part:
             return str(Path(name))
-    return part.get('sha256') or name, steps
+    return (part.get('sha256') or name, steps)
