@@ -1,4 +1,4 @@
-"""All messages of a tick in one, `latest_tick`, for who only looks and need not see every tick.
+"""All messages of a tick in one, `latest_tick`, for those who need not see every tick.
 
 Whoever follows a robot by its topics is woken for each message of each tick, which on a machine
 with few processors costs the robot more than sending them.

@@ -19,7 +19,7 @@ from msgs_spec.tasks import (
 )
 
 Value = str | int | float | bool
-# Of topics that are ROS's own.
+# What parameters begin with that set the quality of service of ROS's own topics.
 _ROS_QOS = tuple(f'qos_overrides./{name}.' for name in ('clock', 'parameter_events', 'rosout'))
 
 

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 
-# Of prctl(2).
+# The option of prctl(2), `PR_SET_PDEATHSIG`.
 _SET_PARENT_DEATH_SIGNAL = 1
 
 
@@ -18,7 +18,7 @@ def end_with_parent(parent: int) -> None:
     On other systems than Linux nothing happens.
 
     Args:
-        parent: Process id of who started this one.
+        parent: Id of the process that started this one.
     """
     if sys.platform != 'linux':
         return

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # Seconds for what was said last to be heard.
 _LAST_WORDS_SECONDS = 1.0
-# In which who is there is found for sure.
+# Seconds within which discovery has found all nodes that are there.
 DISCOVERY_TIME = 2.0
 # Seconds after which the graph has forgotten a process that was killed: until then it may stand
 # beside its successor. DDS implementations take 20 s or less.

@@ -229,14 +229,14 @@ LATEST_TICKS_PER_SECOND = 30
 LATEST_TICK = TopicSpec(
     'latest_tick',
     'std_msgs/msg/UInt8MultiArray',
-    'All messages of a tick in one, for who only looks: `layout` names topics and their bytes. The '
-    f'latest tick, at most {LATEST_TICKS_PER_SECOND} Hz wall time, while somebody subscribes; not '
-    'logged.',
+    'All messages of a tick in one, for those who only look: `layout` names topics and their '
+    f'bytes. The latest tick, at most {LATEST_TICKS_PER_SECOND} Hz wall time, while somebody '
+    'subscribes; not logged.',
 )
 MONITORING = (DIAGNOSTICS, REAL_TIME_FACTOR, LATEST_TICK)
 
 
-# Of any number of names of joints, which whoever publishes may choose.
+# Bounded: whoever publishes chooses names of joints, and so any number of tasks.
 @lru_cache(maxsize=256)
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Returns all topics of a task.

@@ -59,7 +59,7 @@ _NAME = 'demo'
 _START_TIMEOUT = 60.0
 # What shells add to the number of the signal that ended a command.
 _SIGNALLED = 128
-# Of an endpoint that is discovered before its node is, to rmw.
+# What rmw calls the node of an endpoint that is discovered before its node.
 _NAMELESS = '_NODE_NAME_UNKNOWN_'
 _COLUMNS = '{:>7}  {:>5}  {:>5}  {:>7}  {:<7}  {}'
 

@@ -41,7 +41,7 @@ def executable(name: str, parent: int | None = None) -> list[str]:
 
     Args:
         name: Of the executable.
-        parent: Process id of who starts it, if it is to end with that one.
+        parent: Id of the process that starts it, if it is to end with that one.
 
     Raises:
         UnknownExecutableError: If there is none of that name.

@@ -44,7 +44,7 @@ Row = dict[str, Any]
 def export_lerobot(
     by_task: ByTask, directory: Path, camera: Camera | None = None
 ) -> dict[str, Path]:
-    """Writes the episodes of each task as a dataset of N frames each, all of them or none.
+    """Writes the episodes of each task as a dataset, N frames an episode, all of them or none.
 
     A frame is `observation.state`, what is observed of the robot; `observation.environment_state`,
     what is observed of the object, then the desired goal; `action`; and what came of it,

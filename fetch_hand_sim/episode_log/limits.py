@@ -32,7 +32,7 @@ MAX_METADATA_RECORDS = 16
 MAX_ATTACHMENT_BYTES = 64 * 2**20
 MAX_FILE_BYTES = 128 * 2**20
 
-# Of what a robot receives on one topic in one episode; it listens to four.
+# What is logged of that a robot receives on one topic in one episode; it listens to four.
 MAX_RECEIVED_MESSAGES = MAX_MESSAGES // 10
 MAX_RECEIVED_BYTES = MAX_UNPACKED_BYTES // 8
 

@@ -21,7 +21,7 @@ import zstandard
 
 from fetch_hand_sim.episode_log.settings import Attachment
 
-# Of a compiled model, what follows from where its files lie, and what no file keeps.
+# Fields of a compiled model that follow from where its files lie, and those that no file keeps.
 _OF_PATHS = {'paths', 'npaths', 'hfield_pathadr', 'mesh_pathadr', 'skin_pathadr', 'tex_pathadr'}
 _LEFT_OUT = frozenset({*_OF_PATHS, 'nbuffer', 'signature'})
 

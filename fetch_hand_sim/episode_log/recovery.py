@@ -87,7 +87,7 @@ class _Remains:
     def _outcome(self) -> EpisodeOutcome:
         """Steps, return and success up to the last whole tick."""
         cut_off = EpisodeOutcome(is_complete=False, reason='cut off, recovered later')
-        # Of the topics with a number per tick, `applied_command` comes last.
+        # `applied_command` comes last among the topics with a number per tick.
         steps = len(self._values('applied_command'))
         rewards, successes = self._values('reward'), self._values('is_success')
         if len(rewards) < steps or len(successes) <= steps:
@@ -199,7 +199,7 @@ def _read(stream: BinaryIO) -> _Remains:
         for record in read_records(stream, RECOVERY_LIMITS):
             remains.take(record)
     except EndOfFile:
-        # Of a file that ends as it should, a length was damaged.
+        # Where the file ends as it should, the length of a record was damaged.
         stream.seek(max(0, stream.seek(0, os.SEEK_END) - len(MCAP0_MAGIC)))
         remains.is_torn = stream.read() != MCAP0_MAGIC
     except DAMAGED:

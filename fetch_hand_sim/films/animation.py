@@ -13,13 +13,13 @@ from PIL import Image
 
 from msgs_spec.arrays import Picture
 
-# Of GIF and WebP: every colour kept would make files several times as large.
+# Quality of WebP, and colours of GIF: all of them would make files several times as large.
 _QUALITY = 72
 _COLORS = 128
 _SAMPLES = 8
 # Milliseconds that a GIF and a WebP count in.
 _UNITS = {'.gif': 10, '.webp': 1}
-# Of a picture in either: browsers show what is shorter for 100.
+# The shortest a picture is shown, in either format: browsers make 100 ms of less.
 _SHORTEST_MS = 20
 # Fast, and a tenth is left of pictures of a robot.
 _COMPRESSION = 1

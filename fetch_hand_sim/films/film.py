@@ -62,7 +62,7 @@ def write_film(
         fps: Pictures per second. A GIF or WebP shows 50 at most: it takes every n-th picture where
             there are more, so that the film lasts as long.
         keyframe_every: Of an .mp4, how many pictures apart those are that need no other to be
-            shown, for who jumps about in it; 0 for as the encoder likes.
+            shown, for those who jump about in it; 0 for as the encoder likes.
 
     Raises:
         UsageError: If there is no ffmpeg.
@@ -137,7 +137,7 @@ def _appearing(path: Path) -> Iterator[Path]:
     """A hidden file beside the path that takes its name when all is written."""
     # A link stays one: what it leads to is written.
     target = path.resolve()
-    # Of this process: two that write one film at once leave that of the later, and it is whole.
+    # Named by process: of two that write one film at once the later one's stays, and it is whole.
     hidden = target.with_name(f'.{target.stem}.{os.getpid()}.active{path.suffix.lower()}')
     try:
         yield hidden

@@ -168,7 +168,7 @@ def _played(
 
 
 def _most_steps(env: gymnasium.Env[Any, Any]) -> int | None:
-    """Of an environment of this package that nothing limits, the ticks of an episode."""
+    """Ticks of an episode, where nothing limits an environment of this package; else None."""
     while isinstance(env, gymnasium.Wrapper):
         if isinstance(env, TimeLimit):
             return None

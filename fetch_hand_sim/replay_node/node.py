@@ -103,7 +103,7 @@ class ReplayNode(Node):
             executor.remove_node(self)
 
     def _description(self) -> str:
-        """What it is about to do, as a line for who started it."""
+        """What it is about to do, as a line for those who started it."""
         seconds = (self._schedule.end_ns - self._start_ns) / 1e9
         parts = [
             f'{self._settings["path"]}: {seconds:.2f} s, at {self._settings["rate"]:g} x real time',

@@ -1,4 +1,4 @@
-"""Says the latest tick to who only looks, as often as is worth looking at."""
+"""Says the latest tick to those who only look, as often as is worth looking at."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class LatestTick:
         self.say_when_due()
 
     def repeat(self) -> None:
-        """Has the tick said again, to who has come since."""
+        """Has the tick said again, to those who have come since."""
         self._is_said = False
 
     def say_when_due(self) -> None:

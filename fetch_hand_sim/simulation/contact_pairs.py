@@ -30,7 +30,7 @@ def mix(model: mujoco.MjModel, first: Geoms, second: Geoms) -> dict[str, NDArray
         second: Likewise.
     """
     priority = model.geom_priority
-    # Of two with different priorities the one that decides, mixed with itself.
+    # Where priorities differ, the geom with the higher one decides: it is mixed with itself.
     ahead = np.sign(priority[first] - priority[second])
     deciding = np.where(ahead < 0, second, first), np.where(ahead > 0, first, second)
     one, other = (

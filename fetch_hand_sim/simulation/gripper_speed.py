@@ -13,7 +13,7 @@ import math
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
-# Of the weld between mocap body and gripper (`fetch/shared.xml`), seconds.
+# Time constant of the weld between mocap body and gripper (`fetch/shared.xml`), seconds.
 _TIME_CONSTANT = 0.02
 
 

@@ -175,7 +175,7 @@ class Scene:
         return [*shapes, *_line(trail, width)]
 
     def object_markers(self, frame: Frame) -> list[Marker]:
-        """The object, for who draws neither it nor the model."""
+        """The object, for those who draw neither it nor the model."""
         if self._object is None or frame.object_pose is None:
             return []
         body = self.model.body(self.spec.object_name)

@@ -37,7 +37,7 @@ from msgs_spec.tasks import SuccessRule, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic
 
-# Of the ticks per second that a robot has in real time: one with more is faster.
+# A robot is fast that has more ticks per second than in real time by this factor.
 _HURRY = 1.5
 # Seconds between two looks at who is there and what nodes are set to.
 _LOOK_PERIOD = 0.5
@@ -76,7 +76,7 @@ class LiveRobot:
         introduction = topic(ANY_TASK, 'policy_status')
         self._watch.subscribe(introduction, introduction.qos, self._on_commander)
         self._replays = ReplayWatch(node)
-        # Of wall time: simulated time stands still with a robot that is paused.
+        # In wall time: simulated time stands still with a robot that is paused.
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_LOOK_PERIOD, self._look, clock=clock)
 
@@ -124,7 +124,7 @@ class LiveRobot:
             self._curves = Curves(spec, GoalMetric(spec, success_rule=status.success_rule))
         self._requests.take_task(spec)
         self._phase = status.phase
-        # Of a fast robot the reset itself may not have been among the ticks that came.
+        # The reset itself of a fast robot may not have been among the ticks that came.
         episode = status.episode, status.seed
         if status.phase == 'reset' or episode != self._episode or status.tick < self._facts.tick:
             self._trail.clear()

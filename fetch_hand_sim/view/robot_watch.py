@@ -28,7 +28,7 @@ from msgs_spec.topics import LATEST_TICK, QosSpec, TopicSpec, topic
 
 # Nothing is sent twice for a viewer.
 WATCHING = QosSpec(depth=5, reliability='best_effort', durability='volatile')
-# Of every tick: two seconds of a robot at 25 Hz while the viewer gets no processor.
+# For every tick: two seconds of a robot at 25 Hz, should the viewer get no processor so long.
 _FOLLOWING = replace(WATCHING, depth=50)
 ANY_TASK = next(iter(TASKS.values()))
 # What a tick consists of, as it is published. The first step leads to the first reward and command:
@@ -98,7 +98,7 @@ class RobotWatch:
         self._change: Any = None
         self._status_topic = status = topic(ANY_TASK, 'episode_status')
         self.subscribe(status, status.qos, self._hear_status)
-        # Of wall time: a node that follows simulated time has none of a robot that is gone.
+        # In wall time: simulated time stands still with a robot that is gone.
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         if not every_tick:
             node.create_timer(_CHOICE_PERIOD, self._choose, clock=self._clock)
@@ -212,11 +212,11 @@ class RobotWatch:
             except ValueError:
                 return
             if source.name == _FIRST:
-                # Of the tick before, where its last message was lost.
+                # The tick before ends here too, where its last message was lost.
                 self._finish_tick()
                 self._values, self._stamp_ns = {}, stamp
             elif stamp not in (_NO_STAMP, self._stamp_ns):
-                # Of a tick whose first message was lost, which must not pass for this one's.
+                # A tick whose first message was lost must not pass for this one.
                 self._finish_tick()
                 self._values = {}
             self._values[source.name] = values

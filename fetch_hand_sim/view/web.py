@@ -34,10 +34,10 @@ from msgs_spec.command_line import CommandError
 
 _LOOPBACK = '127.0.0.1'
 _EVERYWHERE = ('::', '0.0.0.0')
-# Of networks that exist in documents alone; nothing is sent there.
+# Addresses of networks that exist in documents alone; nothing is sent there.
 _SOMEBODY = ((socket.AF_INET, '203.0.113.1'), (socket.AF_INET6, '2001:db8::1'))
 _START_TIMEOUT = 10.0
-# Of prctl(2), and nanoseconds that a timer may be late: little beside a picture's 16 ms.
+# Option of prctl(2), and nanoseconds that a timer may be late: little beside a picture's 16 ms.
 _SET_TIMER_SLACK, _SLACK_NS = 29, 5_000_000
 _bind_public_socket = web_server.bind_public_socket
 
@@ -138,7 +138,7 @@ def _leads_outside(name: str) -> bool:
 def _outside_address() -> str | None:
     """The address from which this machine would send, if it could."""
     for family, other in _SOMEBODY:
-        # Of a datagram socket this chooses the route and sends nothing.
+        # `connect` of a datagram socket chooses the route and sends nothing.
         with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as route:
             route.connect((other, 9))
             own = str(route.getsockname()[0])

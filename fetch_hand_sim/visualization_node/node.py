@@ -192,7 +192,7 @@ class VisualizationNode(Node):
             self._take_photo(scene, tick, wanted)
 
     def _repeat_for_newcomers(self) -> None:
-        """Says the last tick again to who comes while the robot stands still."""
+        """Says the last tick again to those who come while the robot stands still."""
         if self._latest is None or time.monotonic() - self._ticked_at < _STILL:
             return
         self._has_newcomer |= self._listeners.update()

@@ -42,12 +42,12 @@ class Transforms:
         self._index = {name: number for number, name in enumerate(self._spec.robot.joints)}
 
     def fixed(self) -> list[Transform]:
-        """Those that never change."""
+        """The transforms that never change."""
         joints = (joint for joint in self.description.joints if joint.kind == 'fixed')
         return [self._between(joint.parent, joint.child, joint.pose()) for joint in joints]
 
     def moving(self, frame: Frame) -> list[Transform]:
-        """Those of one tick: joints, object, goal."""
+        """The transforms of one tick: joints, object, goal."""
         found = [
             self._between(
                 joint.parent,

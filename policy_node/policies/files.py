@@ -84,7 +84,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
 
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Of a full disk Python names no file, and of others the partial one."""
+    """Names the file in errors: Python names none for a full disk, and else the partial one."""
     try:
         yield
     except OSError as error:

@@ -31,7 +31,7 @@ from policy_node.policies.policy import LoadedPolicy, Observation, observation_p
 INPUTS = ('observation', 'desired_goal')
 OUTPUT = 'action'
 
-# Of the trial: 100 MiB and .1 s go to onnxruntime itself.
+# Limits of the trial: 100 MiB and .1 s go to onnxruntime itself.
 _TRIAL_MEMORY = 400 * 2**20
 _TRIAL_CPU_SECONDS = 2
 _TRIAL_TIMEOUT = 30.0

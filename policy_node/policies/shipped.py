@@ -41,7 +41,7 @@ def actor_path(name_or_path: str | Path, besides: Sequence[str] = ()) -> Path:
             return path
         is_run = (path / _BEST_OF_A_RUN).is_file()
     except OSError as error:
-        # Of a name that is too long, or a folder that may not be entered.
+        # Raised for a name that is too long, or a folder that may not be entered.
         is_run, reason = False, f' ({error.strerror})'
     if is_run:
         raise ValueError(f'no actor but a run: {path}; its best actor is {path / _BEST_OF_A_RUN}')

@@ -76,7 +76,7 @@ def test_frames_of_every_tick_are_where_mujoco_has_them(
         enough = 1.2 * spec.episode_ticks
         connection.spin_until(lambda: len(ticks_seen_whole()) > enough, 'frames', 60.0)
         fixed = listen(connection, message, '/tf_static', LISTENING_FIXED)
-        connection.spin_until(lambda: fixed, 'frames that never move, for who is late')
+        connection.spin_until(lambda: fixed, 'frames that never move, for those who are late')
     values = {
         name: {message_stamp(each): decode(topic(spec, name), each) for each in messages}
         for name, messages in told.items()

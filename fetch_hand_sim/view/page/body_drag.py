@@ -15,7 +15,7 @@ from msgs_spec.arrays import Array
 _FORCES = mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
 _TRANSLATE = mujoco.mjtPertBit.mjPERT_TRANSLATE.value
 _IN_THE_PICTURE = mujoco.mjtMouse.mjMOUSE_MOVE_V.value
-# Of the distance to what is looked at: pulling this far pulls as hard as is allowed.
+# Pulling this far, a share of the distance to what is looked at, pulls as hard as is allowed.
 _REACH = 0.1
 
 

@@ -23,7 +23,7 @@ from msgs_spec.tasks import TaskSpec, task_spec
 
 _TIMELINE_HEIGHT = 74.0
 _LEAST_LIST = 100.0
-# Of a page with room for two columns, pixels: a telephone that is held upright has none.
+# The narrowest page with room for two columns, pixels: a telephone that is held upright has none.
 _TWO_COLUMNS = 2.0 * WIDTH + 3.0 * MARGIN
 _BUTTON_HEIGHT = 3.0 * MARGIN
 

@@ -14,7 +14,7 @@ Send = Callable[[Request | LatestRequest], None]
 
 MARGIN = 10.0
 WIDTH = 330.0
-# Of sliders and lists, with room for their names.
+# Width of sliders and lists, pixels, which leaves room for their names.
 ITEM_WIDTH = 210.0
 _LETTERS = 46
 

@@ -58,7 +58,7 @@ class GambleSimulation(Simulation):
         self._parts = _parts(self.spec)
 
     def __getstate__(self) -> dict[str, Any]:
-        """That of `Simulation`, and which episodes are over and how they look."""
+        """The state of `Simulation`, and which episodes are over and how they look."""
         own = {name: getattr(self, name).copy() for name in _OWN_STATE}
         return {**super().__getstate__(), 'gamble': own}
 

@@ -93,7 +93,7 @@ class ConfigFields:
     n_step: int = 1
     """Most steps of a return before it bootstraps."""
     correction: str = 'none'
-    """Of longer returns, whose actions are not the actor's: `none`, `lambda` (their mean is the
+    """For longer returns, whose actions are not the actor's: `none`, `lambda` (their mean is the
     truncated lambda-return) or `cut` (they end before an action far from the actor's)."""
     trace: float = 0.7
     """With `lambda`, the probability of going on after each step; of `ppo` the same lambda."""

@@ -192,7 +192,7 @@ def _contradictions(config: ConfigFields, spec: TaskSpec) -> Iterator[str]:
 
 
 def _contradictions_of_rates(config: ConfigFields) -> Iterator[str]:
-    """The same of what is for other rates than 25 Hz."""
+    """Conflicts between fields for other rates than 25 Hz, and with other fields."""
     holds, several = config.longest_hold > 1, config.n_step > 1
     chosen, weighted = config.goal_choice != 'uniform', config.importance != 'none'
     if 0.0 < config.noise_seconds * config.control_hz < 1.0 - 1e-6:
@@ -217,7 +217,7 @@ def _contradictions_of_rates(config: ConfigFields) -> Iterator[str]:
 
 
 def _contradictions_of_subgoals(config: ConfigFields) -> Iterator[str]:
-    """The same of a high level."""
+    """Conflicts between subgoals, proposed or imagined, and other fields."""
     every, guided, imagined = (
         config.subgoal_every,
         config.subgoal_every > 0,
@@ -243,7 +243,7 @@ def _contradictions_of_subgoals(config: ConfigFields) -> Iterator[str]:
 
 
 def _contradictions_of_values(config: ConfigFields) -> Iterator[str]:
-    """The same of how values are learnt, and of what is learnt from."""
+    """Conflicts between fields of how values are learnt and of what is learnt from."""
     if config.learning_starts > config.replay_transitions:
         yield f'learning_starts needs replay_transitions of {config.learning_starts} or more'
     if config.correction != 'none' and config.n_step == 1:
@@ -267,7 +267,7 @@ def _contradictions_of_values(config: ConfigFields) -> Iterator[str]:
 
 
 def _contradictions_of_targets(config: ConfigFields) -> Iterator[str]:
-    """The same of what values learn to be, and of what normalises them."""
+    """Conflicts between the targets of values and what normalises them."""
     if config.target_noise > 0.0 and (config.longest_hold > 1 or config.subgoal_every > 0):
         yield 'target_noise excludes longest_hold above 1 and subgoal_every'
     if config.norm != 'none' and config.layer_norm:
@@ -277,7 +277,7 @@ def _contradictions_of_targets(config: ConfigFields) -> Iterator[str]:
 
 
 def _contradictions_of_goals(config: ConfigFields) -> Iterator[str]:
-    """The same of goals, and of how near is near enough."""
+    """Conflicts between the choice of goals, their thresholds and the reward."""
     sources = config.goals or config.strategy
     replays_later = 'future' in sources or 'near' in sources
     conditioned, chosen = config.condition != 'none', config.goal_choice != 'uniform'
@@ -301,7 +301,7 @@ def _contradictions_of_goals(config: ConfigFields) -> Iterator[str]:
 
 
 def _contradictions_of_conditions(config: ConfigFields) -> Iterator[str]:
-    """The same of one input more."""
+    """Conflicts between `condition`, one input more of the networks, and other fields."""
     others = config.goal_choice != 'uniform' or config.importance != 'none'
     if config.condition != 'none' and others:
         yield f'condition {config.condition} excludes goal_choice and importance'
@@ -316,7 +316,7 @@ def _contradictions_of_conditions(config: ConfigFields) -> Iterator[str]:
 
 
 def _contradictions_of_importance(config: ConfigFields) -> Iterator[str]:
-    """The same of importance weights."""
+    """Conflicts between importance weights and other fields."""
     if config.importance == 'none':
         return
     if config.n_step > 1:
@@ -331,7 +331,7 @@ def _contradictions_of_importance(config: ConfigFields) -> Iterator[str]:
 
 
 def _contradictions_of_algorithm(config: ConfigFields) -> Iterator[str]:
-    """The same of `ppo`, and of what others could not start from."""
+    """Conflicts between `algorithm`, or `init_from`, and other fields."""
     on_policy = config.algorithm == 'ppo'
     if config.goals and OUTCOME in parse_mixture(config.goals) and not on_policy:
         yield 'goals outcome needs algorithm ppo'
@@ -349,7 +349,7 @@ def _contradictions_of_algorithm(config: ConfigFields) -> Iterator[str]:
 
 
 def _contradictions_of_task(config: ConfigFields, spec: TaskSpec) -> Iterator[str]:
-    """The same of what only some tasks have."""
+    """Conflicts between the task and what only some tasks have."""
     if config.gamble:
         require_idle_gripper(config.task)
     if config.ticks_after_drop >= 0 and spec.goal is not GoalKind.POSE:

@@ -83,7 +83,7 @@ class SubgoalSampler:
         return np.where(generator.random(count) < _DECISIONS, decision, anywhere)
 
     def _with_tests(self, starts: Starts, batch: Transitions) -> Transitions:
-        """The same where tested subgoals were missed: they lead nowhere, whatever the goal is."""
+        """The batch, where missed subgoals that were tested lead nowhere, whatever the goal is."""
         subgoal = subgoals_of(starts)
         pairs = batch.action.astype(np.float64), subgoal.astype(np.float64)
         reward = self.sampler.compute_reward(*pairs)

@@ -33,8 +33,8 @@ from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.transitions import Starts, Transitions
 
 _SMALLEST_DEVIATION = 1e-6
-# Of an error by the ratio of its action, and of what follows by those of the actions before it: the
-# second only makes traces shorter.
+# Largest weight of an error, by the ratio of its action, and of what follows, by those of the
+# actions before it: the second only makes traces shorter.
 _LARGEST_RATIO, _LARGEST_TRACE = 10.0, 1.0
 
 

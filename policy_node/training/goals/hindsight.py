@@ -21,15 +21,15 @@ from policy_node.training.replay.transitions import Starts
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 SuccessFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
 
+OUTCOME = 'outcome'
+# Sources of goals that are a strategy by themselves.
+_STRATEGIES = ('future', 'final', 'episode', 'random')
 # Where the goal of a transition comes from: the episode's own; a later achieved goal of the
 # episode; its last; any of it; any achieved goal of the replay; a desired goal of any episode; what
 # this very step achieved; what one of the next ten achieved; what the state before it achieved,
 # displaced; of whole episodes, what another one brought about (`outcomes.py`).
-OUTCOME = 'outcome'
-# Those that are a strategy by themselves.
-_STRATEGIES = ('future', 'final', 'episode', 'random')
 SOURCES = ('real', *_STRATEGIES, 'actual', 'next', 'near', 'displaced', OUTCOME)
-# Those that a transition may itself have led to.
+# Sources of goals that the transition itself may have led to.
 FROM_THE_EPISODE = ('future', 'final', 'episode', 'next', 'near')
 _NEAR_TICKS = 10
 # One more, where there is a high level: what it had the actor pursue.

@@ -154,7 +154,7 @@ class DDPG(ActorCritic):
         return self._errors(known).square()
 
     def _costs_of_quantiles(self, known: Known) -> Tensor:
-        """The same where quantiles of the return are learnt."""
+        """What errors cost where quantiles of the return are learnt."""
         critic, slow = self.critic, self.target_critic
         assert isinstance(critic, Critic | Ensemble) and isinstance(slow, Critic | Ensemble)
         with torch.no_grad():
@@ -181,7 +181,7 @@ class DDPG(ActorCritic):
         return error
 
     def _advantage_errors(self, known: Known, critic: AdvantageCritic) -> Tensor:
-        """The same of values of states and advantages of actions over the actor's."""
+        """Errors of the critic of values of states and of advantages over the actor's actions."""
         slow = self.target_critic
         assert isinstance(slow, AdvantageCritic)
         with torch.no_grad():
@@ -192,7 +192,7 @@ class DDPG(ActorCritic):
         return error
 
     def _joint_errors(self, known: Known) -> Tensor:
-        """The same from one pass over states and next states, as CrossQ (arXiv 1902.05605).
+        """Errors from one pass over states and next states, as CrossQ (arXiv 1902.05605).
 
         A batch normalisation would otherwise see next actions that its statistics do not know.
         """

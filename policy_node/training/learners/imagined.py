@@ -29,7 +29,7 @@ from policy_node.training.machine.distributed import Workers
 # are what an update costs more.
 CANDIDATES = 8
 _EVERY = 4
-# Of the softmax, in units of value; a tick costs about 1 (RIS: 0.1, over a whole batch).
+# Temperature of the softmax, in units of value: a tick costs about 1 (RIS: .1, over a batch).
 _TEMPERATURE = 1.0
 
 

@@ -21,7 +21,7 @@ from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 
 Goals = NDArray[np.float64]
-# Of the layer that takes the inputs, in actors and critics alike.
+# Names of the layer that takes the inputs, in actors and critics alike.
 _WEIGHT, _BIAS = 'hidden.0.weight', 'hidden.0.bias'
 # Smallest threshold drawn, as a share of the one that is trained for.
 SMALLEST_THRESHOLD = 0.5
@@ -92,7 +92,7 @@ class Horizon:
         return (drawn / self.ticks).astype(np.float32)[:, None]
 
     def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
-        """That of the task."""
+        """The reward (count,) of the task, whatever was drawn."""
         del drawn
         return self.compute_reward(achieved, desired)
 

@@ -36,7 +36,7 @@ class Starts:
         return self.valid_ticks.take(self.row)
 
     def select(self, chosen: NDArray[np.intp]) -> Starts:
-        """Those at these indices."""
+        """The transitions at these indices."""
         return Starts(self.episodes, self.row[chosen], self.tick[chosen], self.valid_ticks)
 
 

@@ -130,7 +130,7 @@ class InitialNetworks:
         return count_critics(part_of(self.tensors, 'critic'))
 
     def with_critics(self, critics: int) -> InitialNetworks:
-        """The same with their critics named as so many are; there may be fewer of them."""
+        """These networks, critics named as those of so many are; there may be fewer of them."""
         if critics == 1 == self.critics and not is_ensemble(part_of(self.tensors, 'critic')):
             return self
         tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}

@@ -28,7 +28,7 @@ from policy_node.training.runs.state_checks import (
 
 FORMAT = 'fetch_hand_training'
 FORMAT_VERSION = 1
-# Of a header: a name, a type, a shape and where the numbers lie.
+# Of an entry of the header: a name, a type, a shape and where the numbers lie.
 _BYTES_OF_AN_ENTRY = 160
 
 

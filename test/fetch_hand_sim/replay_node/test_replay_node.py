@@ -99,7 +99,7 @@ def test_actor_on_a_replay_repeats_the_recorded_commands(start_process, tmp_path
             *ros_args(path=path, rate=RATE, wait_for_commands=True, start_paused=True),
         )
         start_process(*POLICY_NODE, *ros_args(policy=actor))
-        # The replay waits for the policy, not for who listens to it: a busy machine takes seconds.
+        # The replay waits for the policy, not for its listeners: a busy machine takes seconds.
         (subscription,) = listener.node.subscriptions
         listener.spin_until(subscription.get_publisher_count, 'policy that is heard')
         listener.call(SetBool, 'replay_node/pause', data=False)

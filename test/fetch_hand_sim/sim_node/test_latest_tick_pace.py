@@ -1,4 +1,4 @@
-"""The latest tick, for who only looks, on a clock that the test moves."""
+"""The latest tick, for those who only look, on a clock that the test moves."""
 
 from __future__ import annotations
 

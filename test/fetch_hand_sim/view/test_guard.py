@@ -1,4 +1,4 @@
-"""The page is for this machine, or for who has the token; other sites may neither read nor act."""
+"""The page is for this machine, or for those with the token; others may neither read nor act."""
 
 from __future__ import annotations
 
