@@ -14,7 +14,6 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
-from policy_node.policies import files
 from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.distributed import Workers
@@ -261,7 +260,7 @@ def test_a_full_disk_is_said_with_the_file_and_what_is_left(
     def full(descriptor: int) -> None:
         raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr(files, 'os', type('Os', (), {'fsync': full, 'replace': os.replace}))
+    monkeypatch.setattr(os, 'fsync', full)
     fields = [f'--set={name}={value}' for name, value in SMALL.items() if name != 'hidden_sizes']
     fresh = ['--task', 'FetchReach', '--output', str(run.parent / 'new'), *fields]
     where = ['--resume', str(run)] if resumed else fresh
