@@ -23,10 +23,8 @@ from fetch_hand_sim.gym_envs.task_attributes import (
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.arguments import finite_goal, require_whole
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
-from msgs_spec.arrays import Array
+from msgs_spec.arrays import Array, Flags
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
-
-Flags = NDArray[np.bool_]
 
 # What Gymnasium takes for episodes that no number of steps ends.
 _NO_LIMIT = -1

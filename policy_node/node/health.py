@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from msgs_spec.diagnostics import Increase, Report
+from msgs_spec.diagnostics import ASKED_RATE, MODE, PAUSED, RATE, Increase, Report
 from msgs_spec.ros import MEMORY_OF_THE_GRAPH
 from msgs_spec.tick import EpisodeStatus
 from policy_node.node.responder import Responder
@@ -42,16 +42,16 @@ def read_pace(message: Any, namespace: str) -> Pace | None:
     for status in message.status:
         if status.name.rpartition('/')[0] == namespace.rstrip('/'):
             values = {pair.key: pair.value for pair in status.values}
-            if 'paused' in values:
-                return Pace(values['paused'] == 'True', _period(values))
+            if PAUSED in values:
+                return Pace(values[PAUSED] == 'True', _period(values))
     return None
 
 
 def _period(values: Mapping[str, str]) -> float:
-    if values.get('mode') == 'lockstep':
+    if values.get(MODE) == 'lockstep':
         return math.inf
     try:
-        return 1.0 / float(values.get('rate asked (Hz)', ''))
+        return 1.0 / float(values.get(ASKED_RATE, ''))
     except (ValueError, ZeroDivisionError):
         return 0.0
 
@@ -149,7 +149,7 @@ class Health:
             'commander': responder.commander.description,
             'checkpoint sha256': responder.commander.sha256,
             'commands': str(responder.answered),
-            'rate (Hz)': f'{rate:.2f}',
+            RATE: f'{rate:.2f}',
             **{f'inference {name} (ms)': value for name, value in inference.items()},
             'incomplete ticks dropped': str(responder.join.dropped),
             'ticks overtaken': str(responder.overtaken),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_spec.cdr import TopicCodec
+from msgs_spec.command_line import one_line
 from msgs_spec.diagnostics import Durations
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import task_spec
@@ -17,7 +18,6 @@ from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
 from policy_node.node.commander import Commander
 from policy_node.node.stamp_join import StampJoin, Vectors
-from policy_node.policies.files import one_line
 
 # Seconds until a policy that failed is asked again about the same tick.
 _ASK_AGAIN = 1.0

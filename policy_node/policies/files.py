@@ -10,9 +10,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-# Under this name as well, for nodes that say what is wrong with a policy.
-from msgs_spec.command_line import one_line as one_line
-
 # The largest actor of the paper's size has 0.7 MB.
 LARGEST_POLICY = 64 * 2**20
 
