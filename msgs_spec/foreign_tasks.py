@@ -19,6 +19,8 @@ SIMULATIONS = 'fetch_hand_sim_tasks.simulation'
 
 _Spec = TypeVar('_Spec')
 _LOGGER = logging.getLogger(__name__)
+# Whose the tasks are that were taken.
+_PACKAGES: dict[str, str] = {}
 
 
 def foreign_tasks(accept: Callable[[str, Any], _Spec]) -> dict[str, _Spec]:
@@ -35,7 +37,8 @@ def foreign_tasks(accept: Callable[[str, Any], _Spec]) -> dict[str, _Spec]:
             if name in tasks:
                 raise ValueError('another package has a task of this name')
             tasks[name] = accept(name, entry_point.load())
-        except Exception as error:  # whatever a package of somebody else does
+            _PACKAGES[name] = _package(entry_point)
+        except (Exception, SystemExit) as error:  # whatever a package of somebody else does
             _LOGGER.warning('task %s is left out: %s', name, _what_failed(entry_point, error))
     return tasks
 
@@ -46,10 +49,13 @@ def foreign_simulation(name: str) -> Any:
     Raises:
         ValueError: If no package has one, or it cannot be imported; the message is one line.
     """
-    for entry_point in entry_points(group=SIMULATIONS, name=name):
+    found = entry_points(group=SIMULATIONS, name=name)
+    # That of the package whose task was taken, where several have one of the name.
+    own = [each for each in found if _package(each) == _PACKAGES.get(name)]
+    for entry_point in own or found:
         try:
             return entry_point.load()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ValueError(f'task {name}: {_what_failed(entry_point, error)}') from error
     raise ValueError(
         f'task {name} has no simulation: no installed package names one in the entry points '
@@ -57,6 +63,9 @@ def foreign_simulation(name: str) -> Any:
     )
 
 
-def _what_failed(entry_point: EntryPoint, error: Exception) -> str:
-    package = entry_point.dist.name if entry_point.dist is not None else 'a package'
-    return f'{package}: {entry_point.value}: {one_line(error, longest=1000)}'
+def _package(entry_point: EntryPoint) -> str:
+    return entry_point.dist.name if entry_point.dist is not None else 'a package'
+
+
+def _what_failed(entry_point: EntryPoint, error: BaseException) -> str:
+    return f'{_package(entry_point)}: {entry_point.value}: {one_line(error, longest=1000)}'

@@ -311,6 +311,7 @@ def substeps_per_tick(control_hz: float) -> int:
 
 # What Gymnasium takes in an id and every system in a file name.
 _NAME = re.compile(r'\w[\w.-]*')
+_LONGEST_NAME = 64
 
 
 def _accept(name: str, spec: Any) -> TaskSpec:
@@ -321,8 +322,11 @@ def _accept(name: str, spec: Any) -> TaskSpec:
         raise ValueError(f'the task calls itself {spec.name!r}')
     if name in TASKS:
         raise ValueError('one of the thirteen has this name')
-    if not _NAME.fullmatch(name):
-        raise ValueError(f'a name has letters, digits, _, - and . only, not {name!r}')
+    if not _NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
+        raise ValueError(
+            f'a name has letters, digits, _, - and . only, {_LONGEST_NAME} at most, not {name!r}'
+        )
+    _require_sound(spec)
     if spec.formulas is None and not any(_is_observed_as(spec, known) for known in TASKS.values()):
         raise ValueError('it has no formulas')
     achieved = [part.size for part in spec.observation if part.name == spec.achieved_goal]
@@ -331,7 +335,31 @@ def _accept(name: str, spec: Any) -> TaskSpec:
             f'achieved_goal {spec.achieved_goal!r} must be the name of one part of the observation '
             f'with {spec.goal.size} values'
         )
-    return spec
+    # Kept by `replace`, it would take the place of the environment of that id.
+    return replace(spec, reference_id=None)
+
+
+def _require_sound(spec: TaskSpec) -> None:
+    """Refuses what would fail where nobody thinks of this task any more."""
+    if not isinstance(spec.robot, RobotSpec):
+        raise ValueError(f'robot is no RobotSpec but {type(spec.robot).__name__}')
+    if not isinstance(spec.goal, GoalKind):
+        raise ValueError(f'goal is no GoalKind but {type(spec.goal).__name__}')
+    try:
+        hash(spec)
+    except TypeError as error:
+        raise ValueError(f'{error}: its fields take tuples, not lists or arrays') from None
+    for part in spec.robot.command:
+        if not part.lower < part.upper:
+            raise ValueError(f'command {part.name} has limits {part.lower:g} ... {part.upper:g}')
+    positive = {
+        'distance_threshold': spec.distance_threshold,
+        'rotation_threshold': 1.0 if spec.rotation_threshold is None else spec.rotation_threshold,
+        'episode_ticks': spec.episode_ticks,
+    }
+    for name, value in positive.items():
+        if not 0.0 < value < float('inf'):
+            raise ValueError(f'{name} {value}; allowed: more than 0')
 
 
 def _is_observed_as(spec: TaskSpec, known: TaskSpec) -> bool:

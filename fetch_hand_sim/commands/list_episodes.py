@@ -24,7 +24,7 @@ from fetch_hand_sim.episode_log import (
     read_summary,
 )
 from fetch_hand_sim.episode_log.episode_record import integer_or_none
-from fetch_hand_sim.episode_log.summary import EpisodeSummary
+from fetch_hand_sim.episode_log.summary import EpisodeSummary, folders_of_episodes
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
@@ -42,6 +42,8 @@ _NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB'})
 # A pipe has no width to fit into; this one fits every column.
 _PIPE_WIDTH = 200
 _LONGEST_CELL = 60
+# Folders that are named where the one above was given.
+_NAMED = 3
 
 
 def read_summaries(directory: Path) -> tuple[list[EpisodeSummary], list[EpisodeReadError]]:
@@ -73,7 +75,7 @@ def _cells(episode: EpisodeSummary) -> list[str]:
     metadata, outcome = episode.metadata, episode.outcome
     success = {True: 'yes', False: 'no', None: '?'}
     return [
-        episode.path.stem.removesuffix('_0'),
+        _name(episode.path),
         metadata.get('task', '?'),
         _known(integer_or_none(metadata, 'seed')),
         _known(outcome.steps),
@@ -83,6 +85,12 @@ def _cells(episode: EpisodeSummary) -> list[str]:
         f'{episode.size_bytes / 1024:.0f}',
         'complete' if outcome.is_complete else f'interrupted: {outcome.reason or "?"}',
     ]
+
+
+def _name(file: Path) -> str:
+    """What it is called where it lies: its bag's folder, which may have been renamed or copied."""
+    is_bag = (file.parent / 'metadata.yaml').is_file()
+    return file.parent.name if is_bag else file.stem.removesuffix('_0')
 
 
 def _known(number: int | float | None) -> str:
@@ -134,12 +142,23 @@ def _run(options: argparse.Namespace) -> int:
         successes = sum(episode.outcome.is_success is True for episode in shown)
         filtered = len(episodes) - len(shown)
         print(f'{len(shown)} episodes, {successes} successes; {filtered} filtered')
+        if not (episodes or errors) and (below := _folders_below(options.directory)):
+            print(f'there are some in {below}')
     for leftover in leftovers:
         remedy = '' if leftover.problem else '; recover_episodes makes a bag of it'
         print(f'{leftover}{remedy}', file=sys.stderr if options.json else sys.stdout)
     for skipped in errors:
         complain(_NAME, f'skipped {skipped}')
     return EXIT_FAILURE if errors else EXIT_SUCCESS
+
+
+def _folders_below(directory: Path) -> str:
+    try:
+        folders = [printable(str(path)) for path in folders_of_episodes(directory)]
+    except EpisodeReadError:
+        return ''
+    more = f' and {len(folders) - _NAMED} more' if len(folders) > _NAMED else ''
+    return f'{", ".join(folders[:_NAMED])}{more}'
 
 
 def _is_wanted(episode: EpisodeSummary, options: argparse.Namespace) -> bool:

@@ -31,6 +31,7 @@ from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
 from fetch_hand_sim.gym_envs.spaces import observation_space
 from msgs_spec.command_line import UsageError, one_line
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
 # Parts of a dataset's id become directories.
 _DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
@@ -62,6 +63,9 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
             f'dataset name {name!r}; allowed: letters, digits, _ and -, parts separated by /, such '
             'as logged-v0'
         )
+    for task in by_task:
+        if not _DATASET_NAME.fullmatch(task):
+            raise ExportError(f'Minari takes no dataset of a task that is called {task!r}')
     minari, collector = require_module('minari'), require_module('minari.data_collector')
     versioned = name if _VERSION.search(name) else f'{name}-v0'
     ids = {task: f'{task}/{versioned}' for task in by_task}
@@ -105,7 +109,7 @@ def _create_dataset(
         observation_space=observation_space(spec),
         action_space=actions,
         algorithm_name=_algorithm(episodes),
-        description=f'Logged episodes of {spec.name}.',
+        description=_description(episodes[0]),
         data_format='arrow',
         requirements=_requirements(episodes[0]),
     )
@@ -145,6 +149,16 @@ def _environment(episode: EpisodeArrays) -> Any:
         spec.kwargs[name] = getattr(record, name)
     spec.max_episode_steps = episode.spec.episode_ticks
     return spec
+
+
+def _description(episode: EpisodeArrays) -> str:
+    text = f'Logged episodes of {episode.spec.name}.'
+    if episode.record.timing == 'ticks' and episode.record.control_hz != DEFAULT_CONTROL_HZ:
+        text += (
+            ' They are of a robot of version 1.0, whose gripper moved so far per tick at any rate; '
+            'in the environment it moves so far per second.'
+        )
+    return text
 
 
 def _algorithm(episodes: Sequence[EpisodeArrays]) -> str:

@@ -16,6 +16,7 @@ from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
     REWARD_TYPES,
     SUCCESS_RULES,
+    TASKS,
     TIMINGS,
     RewardType,
     SuccessRule,
@@ -163,7 +164,8 @@ def parse_task(metadata: Strings) -> TaskSpec:
     Raises:
         ValueError: If it is unknown.
     """
-    return task_spec(_text(metadata, 'task')[:_SHOWN], _joint_prefix(metadata))
+    name = _text(metadata, 'task')
+    return task_spec(name if name in TASKS else name[:_SHOWN], _joint_prefix(metadata))
 
 
 def parse_control_hz(metadata: Strings) -> float:

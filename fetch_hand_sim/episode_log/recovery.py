@@ -168,7 +168,10 @@ def _recover(leftover: Path, name: str) -> Path | None:
             _clear_away(leftover)
             return None
         if final.exists():
-            raise EpisodeLogError(f'{final} exists; episodes are never overwritten')
+            raise EpisodeLogError(
+                f'{final} exists and is never overwritten; if {leftover.name} is an older copy of '
+                'it, remove that'
+            )
         with _replaced(file, remains):
             durable.publish(leftover, final)
     return final

@@ -123,6 +123,19 @@ def find_episodes(directory: Path) -> list[Path]:
         raise EpisodeReadError(f'{error.filename or directory}: {error.strerror}') from error
 
 
+def folders_of_episodes(directory: Path) -> list[Path]:
+    """Returns the folders in a directory that hold episodes, for who named the one above.
+
+    Raises:
+        EpisodeReadError: If the directory cannot be read.
+    """
+    try:
+        folders = [path for path in sorted(directory.iterdir()) if path.is_dir()]
+        return [path for path in folders if path.name[0] != '.' and find_episodes(path)]
+    except OSError as error:
+        raise EpisodeReadError(f'{error.filename or directory}: {error.strerror}') from error
+
+
 def expand_episodes(path: Path) -> list[Path]:
     """Returns the path itself if it is an episode or no directory, else the episodes in it.
 

@@ -65,7 +65,7 @@ class Film:
             ValueError: If it cannot be read, or the model has no such camera.
             RuntimeError: If there is no OpenGL.
         """
-        (recording,) = load_recordings(Path(path), count=1)
+        (recording,) = load_recordings(Path(path).expanduser(), count=1)
         studio = Studio(width, height, camera)
         try:
             return cls(studio.pictures(recording), recording.arrays.record.control_hz)
@@ -87,7 +87,7 @@ class Film:
             ValueError: If the ending, the folder or the size is not allowed, or .mp4 lacks ffmpeg.
             OSError: If it cannot be written.
         """
-        file = Path(path)
+        file = Path(path).expanduser()
         try:
             if file.suffix.lower() not in MOVING:
                 raise UsageError(f'a film ends in {", ".join(MOVING)}, not {file.name!r}')

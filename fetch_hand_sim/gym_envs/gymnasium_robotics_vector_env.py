@@ -17,10 +17,10 @@ from fetch_hand_sim.gym_envs.gymnasium_robotics_env import (
     make_env,
     task_with_goals,
 )
-from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv, Flags
+from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Observation
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS
-from msgs_spec.arrays import Array
+from msgs_spec.arrays import Array, Flags
 from msgs_spec.tasks import task_spec
 
 

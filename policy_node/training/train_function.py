@@ -97,11 +97,11 @@ def train(
     if resume:
         if output is None:
             raise ValueError('resume=True needs output, the folder of the run to go on with')
-        folder = Path(output)
+        folder = Path(output).expanduser()
         config = resumed_config(folder, task, recipe, typed_fields(fields))
     else:
         config = recipe_config(task, recipe or 'best', **typed_fields(fields))
-        folder = Path(output or default_folder(config))
+        folder = Path(output or default_folder(config)).expanduser()
         if (folder / STATE_FILE).is_file():
             raise ValueError(
                 f'{folder} holds a run: resume=True goes on with it, or choose another'

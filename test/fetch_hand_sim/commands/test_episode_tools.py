@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from fetch_hand_sim.episode_log import (
     read_episode,
     read_summary,
 )
+from fetch_hand_sim.episode_log.episode_record import parse_task
 from fetch_hand_sim.episode_log.model import former_model_sha256, model_sha256
 from fetch_hand_sim.episode_log.ticks import split_ticks
 from fetch_hand_sim.episodes import checker
@@ -373,6 +375,35 @@ def test_list_shows_what_the_files_say(reach, capsys):
         assert float(words[4]) == float(summary.result['return'])
         assert words[5:7] == ['no', '2.00'] and words[8] == 'complete'
     assert lines[-1] == '3 episodes, 0 successes; 0 filtered'
+
+
+def test_list_calls_episodes_as_their_folders_and_names_those_below(reach, tmp_path, capsys):
+    name = f'FetchReach_{0:06d}_seed11'
+    for copy in ('kept', 'kept too'):
+        shutil.copytree(reach / name, tmp_path / 'day 1' / copy)
+    assert list_episodes.main([str(tmp_path / 'day 1')]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split('  ')[0] for line in lines[1:3]] == ['kept', 'kept too']
+    assert list_episodes.main([str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == f'there are some in {tmp_path / "day 1"}'
+
+
+def test_a_leftover_beside_its_finished_episode_is_called_a_copy(reach, tmp_path, capsys):
+    source = sorted(reach.iterdir())[0]
+    shutil.copytree(source, tmp_path / source.name)
+    cut_off(source, tmp_path, 60_000)
+    assert recover_episodes.main([str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert f'if .{source.name}.active is an older copy of it, remove that' in error
+
+
+def test_tasks_of_long_names_are_read_as_they_were_written(monkeypatch):
+    name = 'FetchReachAroundObstaclesWithAVeryLongName'
+    monkeypatch.setitem(TASKS, name, replace(TASKS['FetchReach'], name=name))
+    assert parse_task({'task': name}).name == name
+    with pytest.raises(ValueError, match=f"unknown task '{name[:40]}'"):
+        parse_task({'task': f'{name}s'})
 
 
 def test_summary_agrees_with_all_messages(generated):

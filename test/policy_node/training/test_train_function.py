@@ -244,3 +244,11 @@ def test_a_missing_extra_is_named(tmp_path):
     assert result.stderr.rstrip().endswith(
         "ModuleNotFoundError: torch missing: pip install 'fetch_hand_sim[train]'"
     )
+
+
+def test_the_home_directory_is_called_as_in_a_shell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv('HOME', str(tmp_path))
+    with pytest.raises(ValueError, match=f'{tmp_path}/runs/none'):
+        train('FetchReach', '~/runs/none', resume=True)
