@@ -93,7 +93,8 @@ def test_episodes_of_the_recovered_environment_are_as_long_as_those_logged(
     assert export_episodes.main([str(path), '--to', 'minari', '--output', str(tmp_path)]) == 0
     dataset = minari.load_dataset('FetchReach/logged-v0')
     assert dataset.total_steps == steps
-    moves_otherwise = 'in the environment it moves so far per second' in dataset.storage.metadata['description']
+    description = dataset.storage.metadata['description']
+    moves_otherwise = 'in the environment it moves so far per second' in description
     assert moves_otherwise == (timing == 'ticks')
     environment = dataset.recover_environment()
     assert environment.spec.max_episode_steps == steps
