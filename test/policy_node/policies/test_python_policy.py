@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 from msgs_spec.tasks import task_spec
 from policy_node import load_policy
 from policy_node.node.commander import Commander
+from policy_node.training.evaluate_policy import main as evaluate
 from support.fresh_actor import observations
 
 _MODULE = """
@@ -114,16 +114,9 @@ def test_no_code_is_run_without_trust_and_no_module_is_an_error(module: str) -> 
         load_policy('C:/model.onnx', 'FetchReach', trust=True)
 
 
-def test_a_function_is_evaluated_as_any_policy(module: str, tmp_path: Path) -> None:
-    command = [sys.executable, '-m', 'policy_node.training.evaluate_policy']
+def test_a_function_is_evaluated_as_any_policy(
+    module: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ['--policy', f'{module}:function', '--task', 'FetchReach', '--trust']
-    done = subprocess.run(
-        [*command, *words, '--episodes', '8', '--num-envs', '8', '--threads', '1'],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env=None,
-    )
-    assert done.returncode == 0, done.stderr
-    assert f'{module}:function' in done.stdout
+    assert evaluate([*words, '--episodes', '8', '--num-envs', '8', '--threads', '1']) == 0
+    assert f'{module}:function' in capsys.readouterr().out
