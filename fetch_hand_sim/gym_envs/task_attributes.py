@@ -95,7 +95,7 @@ class TaskAttributes:
 
     @reward_type.setter
     def reward_type(self, reward_type: RewardType) -> None:
-        self.simulation.metric = replace(self.simulation.metric, reward_type=reward_type)
+        self.simulation.metric = self.simulation.metric.with_changes(reward_type=reward_type)
 
     @property
     def distance_threshold(self) -> float:
@@ -133,7 +133,7 @@ class TaskAttributes:
             raise ValueError(f'{name} must be a number of at least 0, not {value!r}')
         metric = self.simulation.metric
         changed: dict[str, Any] = {name: float(value)}
-        self.simulation.metric = replace(metric, spec=replace(metric.spec, **changed))
+        self.simulation.metric = metric.with_changes(spec=replace(metric.spec, **changed))
 
 
 def _check_task(spec: EnvSpec) -> None:

@@ -6,8 +6,9 @@ in a fixed order, so a batch gives the same bits as one call per row.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import copy
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,9 +27,12 @@ def _norm(difference: Array) -> Array:
     return np.asarray(np.sqrt(total))
 
 
-@dataclass(frozen=True, slots=True)
+# Without slots: what a subclass keeps beside the fields is then part of copies and pickles.
+@dataclass(frozen=True)
 class GoalMetric:
     """How far a goal is, when it counts as reached, and what that is worth.
+
+    A subclass may have more fields, or attributes: `with_changes` keeps them.
 
     Attributes:
         spec: The task.
@@ -45,6 +49,36 @@ class GoalMetric:
     def __post_init__(self) -> None:
         _require_choice('success_rule', self.success_rule, SUCCESS_RULES)
         _require_choice('reward_type', self.reward_type, REWARD_TYPES)
+
+    def with_changes(self, **changes: Any) -> Self:
+        """This metric with other values of some fields; all else that it has stays.
+
+        Not `dataclasses.replace`, which asks `__init__` and loses what a subclass did not name.
+
+        Args:
+            changes: By name of the field. `__post_init__` is called after them.
+
+        Raises:
+            ValueError: If a success rule or reward is not known.
+        """
+        changed = copy.copy(self)
+        for name, value in changes.items():
+            object.__setattr__(changed, name, value)
+        changed.__post_init__()
+        return changed
+
+    def __setstate__(self, state: Any) -> None:
+        """Goes on from what `copy` and `pickle` kept; up to 1.0 that was a list of the fields."""
+        if isinstance(state, list):
+            state = dict(zip((field.name for field in fields(GoalMetric)), state, strict=True))
+        parts = state if isinstance(state, tuple) else (state,)
+        for name, value in (item for part in parts for item in (part or {}).items()):
+            object.__setattr__(self, name, value)
+
+    @property
+    def has_own_reward(self) -> bool:
+        """Whether a subclass brought another reward than the sparse and the dense one."""
+        return type(self).reward is not GoalMetric.reward
 
     def distances(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> tuple[Array, Array]:
         """Distance in metres and rotation in radians between goals (..., goal size).
@@ -96,8 +130,7 @@ class GoalMetric:
         A subclass with another `reward` or `success` is asked for both: steps and goals that are
         exchanged afterwards are worth the same.
         """
-        kind = type(self)
-        if kind.reward is not GoalMetric.reward or kind.success is not GoalMetric.success:
+        if self.has_own_reward or type(self).success is not GoalMetric.success:
             reward = self.reward(achieved_goal, desired_goal)
             return reward, self.success(achieved_goal, desired_goal)
         distances = self.distances(achieved_goal, desired_goal)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -146,8 +146,8 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
     fallen = spec.goal is GoalKind.POSE and goals[0][:, 2] < PALM_HEIGHT
     return EpisodeOutcomes(
         seed=np.array(seeds),
-        success_gymnasium=replace(metric, success_rule='gymnasium').success(*goals) & ~diverged,
-        success_paper=replace(metric, success_rule='paper').success(*goals) & ~diverged,
+        success_gymnasium=metric.with_changes(success_rule='gymnasium').success(*goals) & ~diverged,
+        success_paper=metric.with_changes(success_rule='paper').success(*goals) & ~diverged,
         touched=touched,
         episode_return=episode_return,
         diverged=diverged,

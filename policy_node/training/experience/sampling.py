@@ -191,7 +191,11 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
     Args:
         config: The configuration.
         metric: Distances and thresholds of the task, and its reward.
+
+    Raises:
+        ValueError: If the configuration would put another reward in the place of the task's own.
     """
+    _require_reward_kept(config, metric)
 
     def reward_at(progress: float) -> RewardFunction:
         then = narrowed(metric, config, progress)
@@ -220,6 +224,21 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
     )
 
 
+def _require_reward_kept(config: TrainConfig, metric: GoalMetric) -> None:
+    if not metric.has_own_reward:
+        return
+    owner = f'that of {metric.spec.name} itself ({type(metric).__name__})'
+    if config.reward_grades:
+        raise ValueError(
+            f'reward_grades {config.reward_grades} is a reward in the place of {owner}; allowed: '
+            'none (--set reward_grades=)'
+        )
+    if config.condition == 'threshold':
+        raise ValueError(
+            f'condition threshold has a reward in the place of {owner}; allowed: none, horizon'
+        )
+
+
 def narrowed(metric: GoalMetric, config: TrainConfig, progress: float) -> GoalMetric:
     """The metric by which a run rewards goals that have narrowed this far, 0 ... 1."""
     left = max(1.0 - 1.5 * progress, 0.0)
@@ -244,4 +263,4 @@ def scale_thresholds(metric: GoalMetric, distance: float, rotation: float) -> Go
     spec = replace(metric.spec, distance_threshold=metric.spec.distance_threshold * distance)
     if spec.rotation_threshold is not None:
         spec = replace(spec, rotation_threshold=spec.rotation_threshold * rotation)
-    return replace(metric, spec=spec)
+    return metric.with_changes(spec=spec)

@@ -11,7 +11,7 @@ arXiv 1906.04279), so that goals grow towards those of the task as the actor can
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -66,7 +66,7 @@ class Outcomes:
         start = np.tile(episodes.achieved_goal[:, 0], (_CANDIDATES, 1))
         candidates = displace(start, self.before[drawn], self.after[drawn])
         asked = np.tile(episodes.desired_goal, (_CANDIDATES, 1))
-        near = replace(self.metric, reward_type='dense').reward(candidates, asked)
+        near = self.metric.with_changes(reward_type='dense').reward(candidates, asked)
         best = near.reshape(_CANDIDATES, count).argmax(axis=0)
         goals: Array32 = candidates[best * count + np.arange(count)]
         return goals

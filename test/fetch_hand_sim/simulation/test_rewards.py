@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
 
+from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks import make_task
@@ -159,3 +164,66 @@ def test_what_a_metric_of_its_own_says_holds_for_steps_too(name):
     assert np.array_equal(success, mine.success(*goals))
     with_it = {'reward': reward, 'success': success}[name]
     assert np.array_equal(with_it, other(mine, *goals))
+
+
+class Scaled(GoalMetric):
+    """With a parameter that `__init__` sets."""
+
+    def __init__(self, spec, scale=1.0, **others):
+        super().__init__(spec, **others)
+        self.scale = scale
+
+    def reward(self, achieved_goal, desired_goal, info=None):
+        return -self.scale * self.distances(achieved_goal, desired_goal)[0]
+
+
+@dataclass(frozen=True)
+class ScaledField(GoalMetric):
+    """With a parameter that is a field."""
+
+    scale: float = 1.0
+    reward = Scaled.reward
+
+
+@dataclass(frozen=True, slots=True)
+class ScaledSlot(GoalMetric):
+    """Likewise, without a dictionary of its own."""
+
+    scale: float = 1.0
+    reward = Scaled.reward
+
+
+@pytest.mark.parametrize('kind', [Scaled, ScaledField, ScaledSlot])
+def test_a_parameter_of_a_metric_of_its_own_outlives_changes_copies_and_pickles(kind):
+    spec = TASKS['FetchPush']
+    mine = kind(spec, scale=0.5)
+    goals = random_goals(spec, 5)
+    wider = replace(spec, distance_threshold=0.1)
+    for other in (
+        mine.with_changes(spec=wider, reward_type='dense', success_rule='paper'),
+        copy.copy(mine),
+        copy.deepcopy(mine),
+        pickle.loads(pickle.dumps(mine)),
+    ):
+        assert other.scale == 0.5
+        assert other.reward(*goals).tobytes() == mine.reward(*goals).tobytes()
+    changed = mine.with_changes(spec=wider)
+    assert (changed.spec, mine.spec) == (wider, spec)
+    with pytest.raises(ValueError, match="reward_type 'denser' is not known"):
+        mine.with_changes(reward_type='denser')
+
+
+def test_settings_of_an_environment_keep_the_parameter():
+    env = FetchHandEnv('FetchPush')
+    env.simulation.metric = Scaled(env.simulation.spec, scale=0.5)
+    env.distance_threshold = 0.2
+    env.reward_type = 'dense'
+    assert env.simulation.metric.scale == copy.deepcopy(env).simulation.metric.scale == 0.5
+    assert env.distance_threshold == 0.2
+
+
+def test_what_copies_made_by_1_0_say_of_a_metric_is_understood():
+    spec = TASKS['FetchPush']
+    old = GoalMetric.__new__(GoalMetric)
+    old.__setstate__([spec, 'paper', 'dense'])
+    assert old == GoalMetric(spec, 'paper', 'dense')

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from numpy.typing import ArrayLike
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
-from msgs_spec.arrays import Array32
-from msgs_spec.tasks import task_spec
+from msgs_spec.arrays import Array, Array32
+from msgs_spec.tasks import TaskSpec, task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.experience.sampling import TransitionSampler, make_sampler
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.networks.conditions import Horizon, Threshold, fold
@@ -120,6 +123,40 @@ def test_a_threshold_is_in_the_reward_and_in_the_input() -> None:
     reward = condition.reward(achieved, desired, np.array([1.0, 1.7, 1.9]))
     assert reward.tolist() == [-1.0, -1.0, 0.0]
     np.testing.assert_allclose(condition.inputs(np.array([1.0, np.e])), [[0.0], [1.0]], atol=1e-6)
+
+
+class Halved(GoalMetric):
+    """A reward of its own, with a parameter that is no field."""
+
+    def __init__(self, spec: TaskSpec, scale: float = 1.0, **others: Any) -> None:
+        super().__init__(spec, **others)
+        object.__setattr__(self, 'scale', scale)
+
+    def reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Array:
+        scale: float = self.__dict__['scale']
+        return -scale * self.distances(achieved_goal, desired_goal)[0]
+
+
+def test_hindsight_is_rewarded_by_a_metric_of_its_own_as_steps_are() -> None:
+    metric = Halved(task_spec('FetchReach'), scale=0.5)
+    goals = np.zeros((2, 3)), np.full((2, 3), 0.1)
+    for change in ({}, {'reward_distance': 0.5}, {'first_distance': 4.0}):
+        sampler = make_sampler(recipe_config('FetchReach', 'best', **change), metric)
+        assert sampler.compute_reward(*goals).tobytes() == metric.reward(*goals).tobytes()
+
+
+@pytest.mark.parametrize(
+    ('change', 'line'),
+    [
+        ({'reward_grades': '.5,1,2'}, 'reward_grades .5,1,2 is a reward in the place of that of '),
+        ({'condition': 'threshold'}, 'condition threshold has a reward in the place of that of '),
+    ],
+)
+def test_no_other_reward_takes_the_place_of_a_tasks_own(change: dict[str, str], line: str) -> None:
+    config = recipe_config('FetchReach', 'best', **change)
+    with pytest.raises(ValueError, match=f'{line}FetchReach itself .Halved.; allowed: none'):
+        make_sampler(config, Halved(task_spec('FetchReach')))
+    make_sampler(config, GoalMetric(task_spec('FetchReach')))
 
 
 def past_goal(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
