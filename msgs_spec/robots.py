@@ -66,6 +66,19 @@ class RobotSpec:
         return replace(self, joints=joints, command=command)
 
 
+def require_joint_prefix(robot: RobotSpec, prefix: str) -> None:
+    """Refuses another prefix for a robot none of whose joints would be renamed by it.
+
+    Raises:
+        ValueError: If no joint begins with `JOINT_PREFIX`.
+    """
+    if prefix != JOINT_PREFIX and robot.with_joint_prefix(prefix).joints == robot.joints:
+        raise ValueError(
+            f'joint_prefix {prefix!r} takes the place of {JOINT_PREFIX}, with which no joint of '
+            f'{robot.name} begins; allowed: {JOINT_PREFIX!r}'
+        )
+
+
 _FETCH_NAMES = (
     'slide0 slide1 slide2 torso_lift_joint head_pan_joint head_tilt_joint shoulder_pan_joint '
     'shoulder_lift_joint upperarm_roll_joint elbow_flex_joint forearm_roll_joint wrist_flex_joint '

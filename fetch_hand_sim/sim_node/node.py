@@ -36,6 +36,7 @@ from msgs_spec.diagnostics import REPORT_PERIOD, next_report
 from msgs_spec.event_loop import BEAT, EventLoop
 from msgs_spec.node_main import NodeFailure, StopSignals
 from msgs_spec.parameters import SIM_NODE
+from msgs_spec.robots import require_joint_prefix
 from msgs_spec.ros import (
     await_acknowledgements,
     rclpy_profile,
@@ -105,6 +106,7 @@ class SimNode(Node):
                 success_rule=values['success_rule'],
                 control_hz=values['control_hz'],
             )
+            require_joint_prefix(simulation.spec.robot, values['joint_prefix'])
         except ValueError as error:
             raise UsageError(str(error)) from None
         runner = EpisodeRunner(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from msgs_spec.actions import (
     command_limits,
     resting_command,
 )
-from msgs_spec.robots import FETCH, FINGERTIPS, SHADOW_HAND
+from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, require_joint_prefix
 from msgs_spec.tasks import TASKS, substeps_per_tick, task_spec
 
 MODELS = {
@@ -152,3 +154,14 @@ def test_whole_numbers_of_substeps(hz, substeps):
 def test_other_rates_are_refused_with_the_nearest(hz, nearest):
     with pytest.raises(ValueError, match=f'allowed: 500/n Hz .*nearest: .*{nearest}'):
         substeps_per_tick(hz)
+
+
+def test_a_joint_prefix_that_renames_nothing_is_refused():
+    for robot in (FETCH, SHADOW_HAND):
+        require_joint_prefix(robot, 'rh_')
+    arm = replace(FETCH, name='arm', joints=('shoulder', 'elbow'))
+    require_joint_prefix(arm, JOINT_PREFIX)
+    with pytest.raises(
+        ValueError, match=r"'rh_' takes the place of robot0:.* of arm begins; allow"
+    ):
+        require_joint_prefix(arm, 'rh_')
