@@ -236,6 +236,11 @@ LATEST_TICK = TopicSpec(
 MONITORING = (DIAGNOSTICS, REAL_TIME_FACTOR, LATEST_TICK)
 
 
+def sensor_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
+    """Returns the topics of what sensors of a task say; observations are made of them."""
+    return (_joint_topic(task), *_body_topics(task))
+
+
 # Bounded: whoever publishes chooses names of joints, and so any number of tasks.
 @lru_cache(maxsize=256)
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
@@ -249,8 +254,7 @@ def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     )
     return (
         clock,
-        _joint_topic(task),
-        *_body_topics(task),
+        *sensor_topics(task),
         *_goal_topics(task),
         *_result_topics(task),
         *_command_topics(task),

@@ -30,6 +30,7 @@ from fetch_hand_sim.simulation.arguments import (
     selected_simulations,
 )
 from fetch_hand_sim.simulation.divergence import DivergenceWatch
+from fetch_hand_sim.simulation.first_reset import require_as_declared, require_goals
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.actions import command_from_action
@@ -141,6 +142,8 @@ class Simulation:
         self._is_pushed = False
         self._is_started = np.zeros(num_envs, dtype=np.bool_)
         self._process = os.getpid()
+        # The thirteen are held to their specification by tests.
+        self._is_as_declared = self.spec.reference_id is not None
 
     def __repr__(self) -> str:
         """Task and number of copies."""
@@ -223,7 +226,8 @@ class Simulation:
             The observations of all N simulations.
 
         Raises:
-            ValueError: If a seed is negative, or ids or seeds do not fit.
+            ValueError: If a seed is negative, or ids or seeds do not fit; the first time also if
+                a task of another package does not give what its specification says.
             TypeError: If a seed is not an integer.
             RuntimeError: If an object never stays on the palm, or this process was forked and has
                 no threads of the batch.
@@ -437,7 +441,12 @@ class Simulation:
     def _start(self, ids: NDArray[np.intp]) -> None:
         """Begins episodes; what MuJoCo warned of before counts no more."""
         self._require_threads()
-        self.goals[ids] = self._task.reset(ids, [self.generator(i) for i in ids.tolist()])
+        goals = self._task.reset(ids, [self.generator(i) for i in ids.tolist()])
+        if not self._is_as_declared:
+            require_goals(self.spec, goals, ids.size)
+            require_as_declared(self._task, self.metric, goals, ids)
+            self._is_as_declared = True
+        self.goals[ids] = goals
         self._divergence.forget()
         self._is_started[ids] = True
 

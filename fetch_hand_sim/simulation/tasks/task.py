@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 from weakref import WeakMethod
 
 import mujoco
@@ -20,6 +21,7 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
 from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec, Timing
+from msgs_spec.topics import sensor_topics
 
 Ids = NDArray[np.intp]
 Generators = Sequence[np.random.Generator]
@@ -115,7 +117,7 @@ class Task(ABC):
         self._qpos: Array = self.batch.bind('qpos')
         self._qvel: Array = self.batch.bind('qvel')
         self._actuator_force = self.output('qfrc_actuator')
-        joints = [model.joint(name) for name in spec.robot.joints]
+        joints = [_scalar_joint(spec, model, name) for name in spec.robot.joints]
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._joint_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
         # What reads the vectors (N, topic.size) of a topic; families add theirs.
@@ -198,6 +200,30 @@ class Task(ABC):
         self._outputs[name] = self.batch.bind(name)
         return self._outputs[name]
 
+    def add_sensor(self, name: str, function: Callable[[], Array]) -> None:
+        """Says what a topic reads, in place of what said it before.
+
+        Args:
+            name: Of the topic, one of `msgs_spec.topics.sensor_topics`.
+            function: Returns its vectors (N, topic.size) as they are now, a fresh array. A method
+                of the task does not keep the task alive.
+
+        Raises:
+            ValueError: If the task has no such topic; the message lists those it has.
+        """
+        allowed = [topic.name for topic in sensor_topics(self.spec)]
+        if name not in allowed:
+            raise ValueError(
+                f'{self.spec.name} has no sensor {name!r}; allowed: {", ".join(allowed)}'
+            )
+        is_own = inspect.ismethod(function) and function.__self__ is self
+        self._sensors[name] = weakly(function) if is_own else function
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the topics that something says."""
+        return tuple(self._sensors)
+
     def physics_state(self) -> PhysicsState:
         """Returns a copy of the state and of what was derived from it."""
         outputs = {name: values.copy() for name, values in self._outputs.items()}
@@ -265,6 +291,23 @@ class Task(ABC):
             ],
             axis=1,
         )
+
+
+def _scalar_joint(spec: TaskSpec, model: mujoco.MjModel, name: str) -> Any:
+    """A joint of the robot in its model, which slides or turns about one axis.
+
+    Raises:
+        ValueError: If there is none of this name; the message lists those there are.
+    """
+    kinds = (mujoco.mjtJoint.mjJNT_SLIDE.value, mujoco.mjtJoint.mjJNT_HINGE.value)
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT.value, name)
+    if number < 0 or model.jnt_type[number] not in kinds:
+        known = [model.joint(n).name for n in range(model.njnt) if model.jnt_type[n] in kinds]
+        raise ValueError(
+            f'{spec.name}: the model has no hinge or slide joint {name!r}, which its robot names; '
+            f'allowed: {", ".join(known) or "none"}'
+        )
+    return model.joint(number)
 
 
 def weakly(sensor: Callable[[], Array]) -> Callable[[], Array]:

@@ -1,0 +1,173 @@
+"""What a task of another package gives at its first reset, against what its specification says.
+
+What does not fit would fail far from its cause, or never. Looked at once: ticks cost no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, TypeVar
+
+import numpy as np
+
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from fetch_hand_sim.simulation.tasks import Task
+from fetch_hand_sim.simulation.tasks.task import Ids
+from msgs_spec.arrays import Array
+from msgs_spec.command_line import CommandError, one_line
+from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
+from msgs_spec.tasks import TaskSpec
+from msgs_spec.topics import sensor_topics
+
+_Given = TypeVar('_Given')
+# What tells two rows of readings apart where there is one simulation; m, rad and per second.
+_APART = 1e-6
+# Rows one by one may differ from those of a batch by this, as sums in another order do.
+_ROUNDING = 1e-9
+
+
+class SpecificationError(CommandError, ValueError):
+    """A task does not give what its specification says; the message is one line."""
+
+
+def require_goals(spec: TaskSpec, goals: Any, count: int) -> None:
+    """Refuses goals of `reset` that are not (count, goal size) finite numbers.
+
+    Raises:
+        SpecificationError: If they are not; the message says what is wrong.
+    """
+    _require_shape(spec, 'what reset returns', goals, (count, spec.goal.size))
+    _require_finite(spec, 'what reset returns', goals)
+
+
+def require_as_declared(task: Task, metric: GoalMetric, goals: Array, ids: Ids) -> None:
+    """Compares sensors, formulas, rewards and resting commands with the specification.
+
+    Args:
+        task: The task, `ids` of whose simulations have just been reset.
+        metric: What rewards it.
+        goals: (n, goal size) what these are to reach.
+        ids: (n,) which.
+
+    Raises:
+        SpecificationError: If something does not fit; the message says what is allowed.
+    """
+    _require_sensors(task)
+    readings = {name: each[ids] for name, each in task.readings(observed_topics(task.spec)).items()}
+    found = _require_vectors(task, readings, (ids.size,))
+    for name, vectors in found.items():
+        _require_finite(task.spec, name, vectors)
+    _require_any_leading_axes(task, readings)
+    _require_achieved_part(task.spec, found['observation'], found['achieved_goal'])
+    _require_rewards(metric, found['achieved_goal'], goals)
+    shape = (task.batch.nsim, task.spec.robot.action_size)
+    _require_shape(task.spec, 'resting_commands()', task.resting_commands(), shape)
+
+
+def _require_sensors(task: Task) -> None:
+    for topic in sensor_topics(task.spec):
+        first, second = (task.readings([topic.name])[topic.name] for _ in range(2))
+        what = f'what sensor {topic.name} says'
+        _require_shape(task.spec, what, first, (task.batch.nsim, topic.size))
+        if np.shares_memory(first, second):
+            raise SpecificationError(
+                f'{task.spec.name}: {what} is the same array each time, which the next step '
+                'changes; a sensor returns a fresh one (.copy())'
+            )
+
+
+def _require_vectors(task: Task, readings: Readings, leading: tuple[int, ...]) -> dict[str, Array]:
+    """What the formulas make of readings with these leading axes, if sizes and type are right."""
+    spec, where = task.spec, f'of readings with leading axes {leading}'
+
+    def made() -> dict[str, Array]:
+        return {
+            'observation': observation(spec, readings, task.tick_duration),
+            'achieved_goal': achieved_goal(spec, readings),
+        }
+
+    found = _asked(spec, f'what formulas make {where}', made)
+    for name, size in (('observation', spec.observation_size), ('achieved_goal', spec.goal.size)):
+        _require_shape(spec, f'{name} {where}', found[name], (*leading, size))
+        if found[name].dtype != np.float64:
+            raise SpecificationError(
+                f'{spec.name}: {name} is of type {found[name].dtype}, not float64'
+            )
+    return found
+
+
+def _require_any_leading_axes(task: Task, readings: Readings) -> None:
+    """Compares what two rows give together with what each gives alone."""
+    pair = dict(_two_rows(task, readings))
+    together = _require_vectors(task, pair, (2,))
+    for row in range(2):
+        alone = _require_vectors(task, {name: each[row] for name, each in pair.items()}, ())
+        for name, vector in alone.items():
+            if not np.allclose(together[name][row], vector, _ROUNDING, _ROUNDING, equal_nan=True):
+                raise SpecificationError(
+                    f'{task.spec.name}: {name} of a row depends on the other rows of its batch; '
+                    'formulas work row by row, on the last axis'
+                )
+
+
+def _two_rows(task: Task, readings: Readings) -> Iterator[tuple[str, Array]]:
+    """The first and the last row, the last a little apart, but for quaternions."""
+    for topic in sensor_topics(task.spec):
+        if topic.name not in readings:
+            continue
+        apart = [_APART * ('quaternion' not in part.unit) for part in topic.layout]
+        pair = readings[topic.name][[0, -1]]
+        pair[1] += np.repeat(apart, [part.size for part in topic.layout])
+        yield topic.name, pair
+
+
+def _require_achieved_part(spec: TaskSpec, observations: Array, achieved: Array) -> None:
+    start = spec.achieved_goal_start
+    part = observations[:, start : start + spec.goal.size]
+    if not np.allclose(part, achieved, _ROUNDING, _ROUNDING):
+        raise SpecificationError(
+            f'{spec.name}: observation[{start}:{start + spec.goal.size}], by its parts '
+            f'{spec.achieved_goal}, is not the achieved goal: parts are named in the order of the '
+            'vector'
+        )
+
+
+def _require_rewards(metric: GoalMetric, achieved: Array, desired: Array) -> None:
+    spec = metric.spec
+    for goals in ((achieved, desired), (achieved[0], desired[0]), (achieved[None], desired[None])):
+        shape = goals[0].shape[:-1]
+        where = f'of goals {goals[0].shape}'
+        for name, function in (('reward', metric.reward), ('success', metric.success)):
+            values = _asked(spec, f'{name} {where}', partial(function, *goals))
+            _require_shape(spec, f'{name} {where}', values, shape)
+            _require_finite(spec, f'{name} {where}', values)
+            if name == 'success' and (kind := np.asarray(values).dtype) != np.bool_:
+                raise SpecificationError(f'{spec.name}: success is of type {kind}, not bool')
+
+
+def _asked(spec: TaskSpec, what: str, function: Callable[[], _Given]) -> _Given:
+    """What code of another package returns; what it raises is one line."""
+    try:
+        with np.errstate(all='ignore'):
+            return function()
+    except KeyError as error:
+        topics = ', '.join(observed_topics(spec))
+        raise SpecificationError(
+            f'{spec.name}: {what} asks for {error}; the topics of the formulas: {topics}'
+        ) from error
+    except Exception as error:
+        why = f'{type(error).__name__}: {one_line(error)}'
+        raise SpecificationError(f'{spec.name}: {what} cannot be computed: {why}') from error
+
+
+def _require_shape(spec: TaskSpec, what: str, values: Any, shape: tuple[int, ...]) -> None:
+    if np.shape(values) != shape:
+        raise SpecificationError(f'{spec.name}: {what} has shape {np.shape(values)}, not {shape}')
+
+
+def _require_finite(spec: TaskSpec, what: str, values: Any) -> None:
+    if not np.isfinite(values).all():
+        raise SpecificationError(
+            f'{spec.name}: {what} is not finite: {np.asarray(values).tolist()!s:.60}'
+        )
