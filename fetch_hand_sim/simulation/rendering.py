@@ -213,4 +213,5 @@ def simulation_frame(simulation: Simulation, index: int = 0) -> Frame:
         achieved_goal=achieved,
         object_pose=readings['object_pose'][index] if spec.has_object else None,
         is_success=bool(simulation.compute_success(achieved, desired)),
+        qpos=simulation.task.batch.bind('qpos')[index].copy(),
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -72,6 +73,14 @@ def default_view(spec: TaskSpec) -> View:
     return _REACH_VIEW if spec.goal is GoalKind.FINGERTIPS else _MANIPULATE_VIEW
 
 
+def model_view(model: mujoco.MjModel) -> View:
+    """The camera from which MuJoCo sees a model first: `<statistic>` and `<visual><global>`."""
+    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    x, y, z = camera.lookat.tolist()
+    return View((x, y, z), float(camera.distance), float(camera.azimuth), float(camera.elevation))
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """What is known of a robot at one tick; goals and poses in the world frame.
@@ -82,6 +91,8 @@ class Frame:
         achieved_goal: Likewise.
         object_pose: (7,) m and quaternion wxyz; None where there is no object.
         is_success: Whether the goal is reached.
+        qpos: (nq,) where all joints of the model are, those of a door too; None where only the
+            above is known, as in a log: other joints then stay where they are.
     """
 
     joint_position: Array
@@ -89,6 +100,7 @@ class Frame:
     achieved_goal: Array
     object_pose: Array | None
     is_success: bool
+    qpos: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +147,8 @@ class Scene:
         _dress(mjcf)
         self.model = mjcf.compile()
         self.data = mujoco.MjData(self.model)
-        self.view = default_view(self.spec)
+        is_own = self.spec.looks_like is None and Path(task_asset(task)).is_absolute()
+        self.view = model_view(self.model) if is_own else default_view(self.spec)
         joints = [self.model.joint(name) for name in self.spec.robot.joints]
         self._joints = np.array([int(joint.qposadr[0]) for joint in joints])
         self._object = self._free_joint(self.spec.object_name)
@@ -150,7 +163,9 @@ class Scene:
         return self.spec.goal is GoalKind.POSE and self.spec.has_object and joint >= 0
 
     def show(self, frame: Frame) -> None:
-        """Poses robot, object and ghost."""
+        """Poses robot, object and ghost, and whatever else is known to move."""
+        if frame.qpos is not None and frame.qpos.shape == self.data.qpos.shape:
+            self.data.qpos[:] = frame.qpos
         self.data.qpos[self._joints] = frame.joint_position
         if self._object is not None and frame.object_pose is not None:
             self.data.qpos[self._object] = frame.object_pose

@@ -11,7 +11,9 @@ import pytest
 
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.models import load_spec
+from fetch_hand_sim.simulation.rendering import simulation_frame
 from fetch_hand_sim.simulation.rewards import GoalMetric
+from fetch_hand_sim.simulation.scene import Scene, default_view
 from fetch_hand_sim.simulation.tasks import registry
 from fetch_hand_sim.simulation.tasks.task import Task
 from msgs_spec.command_line import CommandError
@@ -320,3 +322,32 @@ def test_one_simulation_says_it_too_and_later_resets_do_not_ask(make):
     first = len(asked)
     simulation.reset(seed=0)
     assert len(asked) == first + 1
+
+
+def test_what_neither_robot_nor_object_moves_is_drawn_where_it_is(make):
+    simulation = make()
+    simulation.reset(seed=0)
+    simulation.step(np.ones((2, 2)))
+    qpos = simulation.task.batch.bind('qpos')
+    slider = int(simulation.model.joint('slider').qposadr[0])
+    qpos[1, slider] = 0.3
+    scene, frame = Scene('ArmReach'), simulation_frame(simulation, 1)
+    scene.show(frame)
+    assert scene.data.qpos.tobytes() == qpos[1].tobytes()
+    # Of a log only the robot is known.
+    scene = Scene('ArmReach')
+    scene.show(replace(frame, qpos=None))
+    assert scene.data.qpos[slider] == 0.0
+    assert (scene.data.qpos[:2] == frame.joint_position).all()
+
+
+def test_the_camera_looks_at_a_model_of_its_own(make):
+    simulation = make()
+    statistic = '<mujoco><statistic center="2 1 .5" extent="4"/>'
+    simulation.asset.write_text(MJCF.replace('<mujoco>', statistic))
+    view = Scene('ArmReach').view
+    assert (view.lookat, view.distance) == ((2.0, 1.0, 0.5), 6.0)
+    # What is made from one of the thirteen looks like it.
+    make(looks_like='FetchPush')
+    assert Scene('ArmReach').view == default_view(simulation.spec)
+    assert Scene('FetchPush').view == default_view(TASKS['FetchPush'])
