@@ -224,7 +224,7 @@ BROKEN = {
         'from dataclasses import replace\nfrom msgs_spec.tasks import TASKS\n'
         'near = replace(TASKS["FetchPush"], name="Push (near)")\n',
         'Push (near)',
-        "a name has letters, digits, _, - and . only, not 'Push (near)'",
+        "a name has letters, digits, _, - and . only, 64 at most, not 'Push (near)'",
     ),
     'another name': (
         'from msgs_spec.tasks import TASKS\nMine = TASKS["FetchPush"]\n',
