@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
 import tempfile
+import time
 from collections.abc import Callable, MutableMapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 
 # Enough for any node on a busy machine: 0.3 s are usual.
 _DESTROY_SECONDS = 10.0
+# Seconds within which several signals are one.
+_AT_ONCE = 1.0
 
 
 class NodeFailure(CommandError):
@@ -51,7 +55,7 @@ class StopSignals:
 
     def __init__(self) -> None:
         self.received: str | None = None
-        self._count = 0
+        self._received_at = -math.inf
         for number in heard([signal.SIGINT, signal.SIGTERM, signal.SIGHUP]):
             signal.signal(number, self._handle)
 
@@ -62,12 +66,15 @@ class StopSignals:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
         self.received = signal.Signals(number).name
-        self._count += 1
+        self._received_at = time.monotonic()
 
     def watch(self) -> Callable[[], bool]:
-        """Returns what says whether another signal has come since now."""
-        before = self._count
-        return lambda: self._count > before
+        """Returns what says whether another signal has come, a second or more from now.
+
+        Whoever ends a process may send several at once.
+        """
+        earliest = time.monotonic() + _AT_ONCE
+        return lambda: self._received_at >= earliest
 
 
 class RunnableNode(Protocol):
@@ -185,7 +192,7 @@ def find_place_for_logs(environment: MutableMapping[str, str] = os.environ) -> N
     if any(map(environment.get, ('ROS_LOG_DIR', 'ROS_HOME'))):
         return
     home = environment.get('HOME', '')
-    folder = os.path.join(home, '.ros', 'log')
+    folder = os.path.abspath(os.path.join(home, '.ros', 'log'))
     while home and not os.path.exists(folder):
         folder = os.path.dirname(folder)
     if not home or not os.access(folder, os.W_OK):

@@ -151,13 +151,15 @@ class ObservationAssembler:
     def _what_is_not_finite(self, vectors: Readings) -> str:
         for spec in self.topics:
             strange = ~np.isfinite(vectors[spec.name].reshape(-1, spec.size)).all(axis=0)
-            if not strange.any():
-                continue
-            if spec.name != 'joint_states':
+            if spec.name == 'joint_states':
+                # Parts one after the other, each with a value for every joint.
+                labels = [f'{part.name} of {name}' for part in spec.layout for name in spec.names]
+                found = [labels[place] for place in np.flatnonzero(strange).tolist()]
+                # No observation is made of efforts.
+                found = [label for label in found if not label.startswith('effort')]
+                if found:
+                    rest = f' and {len(found) - _NAMED} more' if len(found) > _NAMED else ''
+                    return f'{spec.name}: no finite {", ".join(found[:_NAMED])}{rest}'
+            elif strange.any():
                 return f'{spec.name}: not every value is finite'
-            # Parts one after the other, each with a value for every joint.
-            labels = [f'{part.name} of {name}' for part in spec.layout for name in spec.names]
-            found = [labels[place] for place in np.flatnonzero(strange).tolist()]
-            rest = f' and {len(found) - _NAMED} more' if len(found) > _NAMED else ''
-            return f'{spec.name}: no finite {", ".join(found[:_NAMED])}{rest}'
         return 'too large a value for an observation'

@@ -350,8 +350,11 @@ def _require_sound(spec: TaskSpec) -> None:
     except TypeError as error:
         raise ValueError(f'{error}: its fields take tuples, not lists or arrays') from None
     for part in spec.robot.command:
-        if not part.lower < part.upper:
-            raise ValueError(f'command {part.name} has limits {part.lower:g} ... {part.upper:g}')
+        if not -float('inf') < part.lower < part.upper < float('inf'):
+            raise ValueError(
+                f'command {part.name} has limits {part.lower:g} ... {part.upper:g}; allowed: '
+                'finite, the lower below the upper'
+            )
     positive = {
         'distance_threshold': spec.distance_threshold,
         'rotation_threshold': 1.0 if spec.rotation_threshold is None else spec.rotation_threshold,

@@ -132,7 +132,8 @@ def _known(values: Mapping[str, str], name: str, allowed: tuple[Word, ...]) -> W
     for word in allowed:
         if values[name] == word:
             return word
-    raise ValueError(f'episode_status with {name} {values[name][:40]!r}')
+    given = values[name][:40]
+    raise ValueError(f'episode_status with {name} {given!r}; allowed: {", ".join(allowed)}')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

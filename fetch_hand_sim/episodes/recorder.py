@@ -145,17 +145,16 @@ class EpisodeRecorder:
 
     def _await(self, thread: Thread, gives_up: Callable[[], bool], began: float) -> None:
         """Waits for the end of a thread that a disk may hold up, also for ever."""
-        if self.has_failed:
-            thread.join(_LAST_CHANCE)
-            return
         has_said = False
         while thread.is_alive() and not self.has_failed:
             thread.join(_LOOK_AFTER)
-            if gives_up():
+            if thread.is_alive() and gives_up():
                 self._fail('episode log stopped: the disk was not waited for any more')
             elif not has_said and time.monotonic() - began > _PATIENCE:
                 has_said = True
                 self._on_slow('waiting for the disk; another signal (Ctrl-C) gives up')
+        if self.has_failed:
+            thread.join(_LAST_CHANCE)
 
     def _end(self, reason: str | None) -> None:
         """Completes the running episode, if there is one; with a reason, marked as cut short."""

@@ -168,7 +168,11 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         if not draws_goals or any(self.overrides(name) for name in _EVALUATION):
             return self._evaluate(diverged)
         info = {'is_success': float(result.success[0]), 'diverged': diverged}
-        return _first(result.observation), float(result.reward[0]), False, diverged, info
+        observation, reward = _first(result.observation), result.reward[0]
+        if self.overrides('compute_reward'):
+            goals = observation['achieved_goal'], observation['desired_goal']
+            reward = self.compute_reward(*goals, info)
+        return observation, float(reward), False, diverged, info
 
     def _evaluate(self, diverged: bool) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """What a step gives, asked of the methods, in the order of `robot_env.py`."""
@@ -264,7 +268,6 @@ _EVALUATION = (
     '_is_success',
     'compute_terminated',
     'compute_truncated',
-    'compute_reward',
 )
 
 

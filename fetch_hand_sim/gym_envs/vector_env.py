@@ -197,9 +197,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             Observations (N, ...), rewards (N,), terminated (N,), never, truncated (N,), at the end
             of an episode, or when MuJoCo lost the simulation, both also where a subclass says so,
             and a dictionary with `is_success` and `diverged` (N,), masked by `_is_success` and
-            `_diverged` where an episode only started, and missing where all only started. In mode
-            `SAME_STEP` also `final_obs` (N,), a dictionary for each episode that ended, and
-            `final_info`.
+            `_diverged` where an episode only started. In mode `SAME_STEP` also `final_obs` (N,), a
+            dictionary for each episode that ended, and `final_info`.
 
         Raises:
             ValueError: If the actions have a wrong shape, a value is not a number (NaN), or what a
@@ -426,9 +425,7 @@ def _evaluated(result: StepResult) -> tuple[Array, Array, dict[str, Any]]:
 
 
 def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
-    """Info as Gymnasium batches it: values (N,) and for whom they count; nothing for nobody."""
-    if not mask.any():
-        return {}
+    """Info as Gymnasium batches it: values (N,) and for whom they count, be it nobody."""
     return {**values, **{f'_{name}': mask.copy() for name in values}}
 
 

@@ -39,6 +39,8 @@ _PATIENCE = 3.0
 _SERVED_AT_ONCE = 1000
 # Seconds for which it holds what a robot says of its pace, or that it is paused: once a second.
 _PACE_HOLDS = 3.0
+# Robots beside the known one that need not be looked at twice.
+_REMEMBERED = 7
 _ANY_TASK = next(iter(TASKS.values()))
 
 
@@ -56,7 +58,8 @@ class PolicyNode(Node):
         self._settings = declare_parameters(self, POLICY_NODE)
         self._loaded = self._load_ahead()
         self._status: EpisodeStatus | None = None
-        self._refused: EpisodeStatus | None = None
+        # Robots that the policy does not fit, beside the one it is for.
+        self._refused: list[EpisodeStatus] = []
         self._status_stamp = 0
         self._responder: Responder | None = None
         self._answered_status: EpisodeStatus | None = None
@@ -122,7 +125,8 @@ class PolicyNode(Node):
     def _start(self, status: EpisodeStatus, loop: EventLoop, stop: StopSignals) -> None:
         """Begins to answer the robot that was found."""
         try:
-            commander = Commander(self._load_for(status), status.control_hz)
+            self._loaded = self._load_for(status)
+            commander = Commander(self._loaded, status.control_hz)
             responder = Responder(commander, status, self._send)
         except ValueError as error:
             raise NodeFailure(str(error)) from None
@@ -160,7 +164,7 @@ class PolicyNode(Node):
         if wanted and wanted != status.task:
             raise ValueError(f'the robot does {status.task}, not {wanted}')
         if self._loaded is None or self._loaded.task != status.task:
-            self._loaded = load_policy(name, status.task, trust=self._settings['trust'])
+            return load_policy(name, status.task, trust=self._settings['trust'])
         return self._loaded
 
     def _has_robot_changed(self) -> bool:
@@ -178,7 +182,7 @@ class PolicyNode(Node):
             except ValueError as error:
                 return SetParametersResult(successful=False, reason=str(error))
             self._settings['policy'] = parameter.value
-            self._refused = None
+            self._refused.clear()
             self._is_replaced = self._answered_status is not None
         return result
 
@@ -189,9 +193,9 @@ class PolicyNode(Node):
             ValueError: If there is no such policy, or it fits no robot; one line says why.
         """
         is_there = self.count_publishers(self._status_name) > 0
-        known = [each for each in (self._status, self._refused) if each is not None]
+        known: list[EpisodeStatus | None] = [self._status] if self._status else []
         # One that is gone may be followed by a robot of another task.
-        robots = [*known] if known and is_there else [None]
+        robots = [*known, *self._refused] if known and is_there else [None]
         problems = []
         for status in robots:
             task = status.task if status else self._settings['task'] or None
@@ -280,6 +284,8 @@ class PolicyNode(Node):
             return
         stamp = message_stamp(message)
         if not self._may_follow(status):
+            line = f'ignored: another robot here, {status.task} at {status.control_hz:g} Hz'
+            self.get_logger().warning(line, **seldom(_WARN_PERIOD))
             return
         # A robot that was started again, or an episode that is replayed again.
         if self._responder is not None and (
@@ -289,22 +295,23 @@ class PolicyNode(Node):
         self._status, self._status_stamp = status, stamp
 
     def _may_follow(self, status: EpisodeStatus) -> bool:
-        """Whether who speaks is the robot that is answered, or another that the policy fits.
+        """Whether who speaks is the robot that is known, its successor, or one the policy fits.
 
-        A stranger in the namespace does not end what is between a robot and its policy.
+        A stranger beside a robot does not end what is between that and its policy.
         """
-        answered, refused = self._answered_status, self._refused
-        if answered is None or status.is_of_same_robot(answered) or self._is_replaced:
+        known = self._status
+        if known is None or status.is_of_same_robot(known):
             return True
-        if refused is not None and status.is_of_same_robot(refused):
+        if self.count_publishers(self._status_name) <= 1:
+            # The robot itself has changed.
+            return True
+        if any(status.is_of_same_robot(each) for each in self._refused):
             return False
         try:
             Commander(self._load_for(status), status.control_hz)
         except ValueError as error:
-            self._refused = status
-            self.get_logger().warning(
-                f'ignored: a robot of {status.task} at {status.control_hz:g} Hz: {error}'
-            )
+            self._refused = [*self._refused[-_REMEMBERED:], status]
+            self.get_logger().warning(str(error))
             return False
         return True
 

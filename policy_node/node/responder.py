@@ -117,6 +117,7 @@ class Responder:
         """
         if self._due is not None:
             self._asked = self._observed(self._due)
+            self._note_arrival()
         elif self._asked is None or self._clock() < self._ask_again_at:
             return
         self._answer(self._asked)
@@ -142,11 +143,14 @@ class Responder:
             self.unusable += 1
             raise ValueError(f'no observation: {one_line(error)}') from None
 
+    def _note_arrival(self) -> None:
+        now = self._clock()
+        if self.received_at is not None:
+            self.interval = now - self.received_at
+        self.received_at = now
+
     def _answer(self, observation: dict[str, NDArray[np.float64]]) -> None:
         began = self._clock()
-        if self.received_at is not None:
-            self.interval = began - self.received_at
-        self.received_at = began
         try:
             command = self.commander.command(observation)
         except ValueError as error:

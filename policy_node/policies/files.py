@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import hashlib
 import json
 import os
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 # The largest actor of the paper's size has 0.7 MB.
 LARGEST_POLICY = 64 * 2**20
+# Seconds.
+_LONGEST_WRITE = 3600.0
 
 
 def read_file(path: Path, largest: int = LARGEST_POLICY) -> bytes:
@@ -65,6 +69,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
         for path, partial in partials.items():
             with _named(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
+                _clear_away_leftovers(path)
                 with partial.open('wb') as file:
                     file.write(files[path])
                     file.flush()
@@ -77,6 +82,17 @@ def write_files(files: Mapping[Path, bytes]) -> None:
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
         raise
+
+
+def _clear_away_leftovers(path: Path) -> None:
+    """Removes what processes left that were killed while they wrote a file."""
+    for left in path.parent.glob(f'.{glob.escape(path.name)}.*.partial'):
+        number = left.name.split('.')[-2]
+        with contextlib.suppress(OSError):
+            # Of this machine, or of one that shares the disk: an hour is longer than writing takes.
+            is_old = time.time() - left.stat().st_mtime > _LONGEST_WRITE
+            if is_old and number.isdigit() and not Path(f'/proc/{number}').exists():
+                left.unlink()
 
 
 @contextlib.contextmanager

@@ -68,20 +68,25 @@ def load_python(name: str, task: str) -> LoadedPolicy:
         ValueError: If there is no such module or function, or it fails; one line says why.
     """
     module_name, _, function_name = name.partition(':')
-    # Executables have their own folder there instead.
-    if (here := os.getcwd()) not in sys.path:
-        sys.path.append(here)
+    # Executables have their own folder first; what is imported later finds its own module again.
+    here = os.getcwd()
+    sys.path.insert(0, here)
     try:
         made = getattr(import_module(module_name), function_name)(task)
-    except Exception as error:
+        control_hz = getattr(made, 'control_hz', None)
+        control_hz = None if control_hz is None else float(control_hz)
+    except (Exception, SystemExit) as error:
         # It may raise anything, as it is imported and as it is called.
         raise ValueError(
             f'{name} makes no policy: {type(error).__name__}: {one_line(error)}'
         ) from None
+    finally:
+        sys.path.remove(here)
+        sys.path.append(here)
     if not (callable(made) or hasattr(made, 'predict')):
         raise ValueError(
             f'{name} makes {one_line(type(made).__name__)}; allowed: an object with predict, or a '
             'function from observation to action'
         )
     policy: Policy = made if hasattr(made, 'predict') else FunctionPolicy(made)
-    return LoadedPolicy(policy, task, name, getattr(made, 'control_hz', None))
+    return LoadedPolicy(policy, task, name, control_hz)

@@ -20,6 +20,7 @@ from msgs_spec.node_main import StopSignals, find_place_for_logs
         ({'HOME': ''}, True),
         ({'HOME': 'writable'}, False),
         ({'HOME': 'writable/not/there/yet'}, False),
+        ({'HOME': '~'}, False),
         ({'HOME': 'locked'}, True),
         ({'HOME': 'locked', 'ROS_HOME': 'elsewhere'}, False),
         ({'ROS_LOG_DIR': 'elsewhere'}, False),
@@ -31,7 +32,8 @@ def test_logs_of_ros_go_where_they_can(
     for name in ('writable', 'locked'):
         (tmp_path / name).mkdir()
     environment = dict(given)
-    if given.get('HOME'):
+    monkeypatch.chdir(tmp_path)
+    if given.get('HOME') not in (None, '', '~'):
         environment['HOME'] = str(tmp_path / given['HOME'])
     before = dict(environment)
     # Root may write everywhere.
@@ -41,13 +43,19 @@ def test_logs_of_ros_go_where_they_can(
     assert environment == before | added
 
 
-def test_a_second_signal_is_told_from_the_first() -> None:
+def test_a_second_signal_is_told_from_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [10.0]
+    monkeypatch.setattr(node_main.time, 'monotonic', lambda: now[0])
     handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
     try:
         stop = StopSignals()
         os.kill(os.getpid(), signal.SIGTERM)
         gives_up = stop.watch()
         assert stop.received == 'SIGTERM' and not gives_up()
+        now[0] = 10.5
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert not gives_up()
+        now[0] = 12.0
         os.kill(os.getpid(), signal.SIGINT)
         assert gives_up()
     finally:

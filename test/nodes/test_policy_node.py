@@ -237,7 +237,7 @@ def test_a_robot_of_a_rate_that_physics_has_not_is_none(start_process: Start) ->
         robot.connect('episode_status')
         for control_hz in ('0', '30.0'):
             publish_status(robot, control_hz=control_hz)
-            robot.spin(1.5)
+            robot.spin(2.5)
     assert policy.poll() is None
     output = end(policy)
     for control_hz in ('0', '30'):
@@ -260,8 +260,9 @@ def test_a_robot_that_does_not_fit_ends_nothing_that_works(start_process: Start)
         )
     end(sim)
     output = end(policy)
-    assert 'ignored: a robot of FetchReach at 50 Hz: actor FetchReach.safetensors was' in output
-    assert 'ignored: a robot of HandReach at 25 Hz: ' in output
+    assert 'actor FetchReach.safetensors was trained at 25 Hz; the robot runs at 50 Hz' in output
+    assert 'ignored: another robot here, FetchReach at 50 Hz' in output
+    assert 'trained on FetchReach, not on HandReach' in output
     assert 'the robot changed' not in output
 
 

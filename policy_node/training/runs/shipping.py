@@ -138,7 +138,7 @@ def _evaluate(candidate: _Candidate, episodes: int, num_envs: int, threads: int)
 
 
 def _write(candidate: _Candidate, target: Path, summary: dict[str, Any]) -> None:
-    """Writes the actor, and beside it critic, curve and evaluation: all, or none is replaced."""
+    """Writes the actor, and beside it critic, curve and evaluation, once there is room for all."""
     info = replace(candidate.info, success=summary, command=candidate.command)
     actor = checkpoint.to_bytes(candidate.actor, info)
     files = {target: actor}

@@ -203,6 +203,7 @@ def test_a_disk_that_never_takes_the_end_is_waited_for_until_somebody_gives_up(
     stuck, errors, slow = threading.Event(), [], []
     monkeypatch.setattr(EpisodeWriter, 'store', lambda *_: stuck.wait(20.0) and None)
     monkeypatch.setattr(recorder_module, '_PATIENCE', 0.3)
+    monkeypatch.setattr(recorder_module, '_LAST_CHANCE', 0.1)
     recorder = recorder_into(tmp_path / 'recorder', errors.append, slow.append)
     for tick, messages in ticks:
         recorder.record(tick, messages)

@@ -48,6 +48,14 @@ def wrong(task):
     return lambda observation: [0.0]
 
 
+def leaves(task):
+    raise SystemExit(f'usage: for {task}')
+
+
+class Odd(Model):
+    control_hz = 'often'
+
+
 nothing = 5
 number = lambda task: 7
 """
@@ -91,6 +99,8 @@ def test_a_function_answers_one_observation_and_batches_row_by_row(module: str) 
     [
         ('fails', 'makes no policy: RuntimeError: no weights for FetchReach'),
         ('missing', 'makes no policy: AttributeError: .*missing'),
+        ('leaves', 'makes no policy: SystemExit: usage: for FetchReach'),
+        ('Odd', "makes no policy: ValueError: .*'often'"),
         ('nothing', 'makes no policy: TypeError: '),
         ('number', 'makes int; allowed: an object with predict, or a function'),
         ('wrong', r'answers with \[0.\]; allowed: 4 finite numbers'),
