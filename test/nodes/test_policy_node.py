@@ -266,6 +266,18 @@ def test_a_robot_that_does_not_fit_ends_nothing_that_works(start_process: Start)
     assert 'the robot changed' not in output
 
 
+def test_a_robot_that_comes_back_as_one_that_does_not_fit_is_not_commanded(
+    start_process: Start,
+) -> None:
+    policy = start_process(*POLICY_NODE, *ros_args(policy='FetchReach'))
+    end(_answered_robot(start_process, REACH))
+    sim = start_process(*SIM_NODE, *ros_args(mode='lockstep', control_hz=50.0))
+    code, output = finish(policy)
+    assert code == 1
+    assert 'actor FetchReach.safetensors was trained at 25 Hz; the robot runs at 50 Hz' in output
+    end(sim)
+
+
 @pytest.mark.alone
 def test_the_first_command_comes_soon_after_the_start(start_process: Start) -> None:
     """Under 3 s on an idle machine; this one may be busy, so only what it costs is counted."""
