@@ -1,9 +1,14 @@
-"""What somebody who mistyped a name probably meant."""
+"""What is said of names: which was meant, which are allowed, and a few of many."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeVar
+
+Name = TypeVar('Name', bound=str)
+# Characters of a name from anywhere that are shown.
+_SHOWN = 40
 
 
 def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
@@ -18,3 +23,26 @@ def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
     by_lower = {name.lower(): meant for name, meant in meanings.items() if name}
     found = difflib.get_close_matches(given.lower(), by_lower, n=1)
     return f'; did you mean {by_lower[found[0]]!r}?' if found else ''
+
+
+def one_of(given: str, allowed: Sequence[Name], meaning: str) -> Name:
+    """Returns the name that was given, as one of those that there are.
+
+    Args:
+        given: The name, from anywhere.
+        allowed: Those that there are.
+        meaning: What it names, for the error.
+
+    Raises:
+        ValueError: If it is none of them, in one line.
+    """
+    for name in allowed:
+        if given == name:
+            return name
+    raise ValueError(f'{meaning} {given[:_SHOWN]!r}; allowed: {", ".join(allowed)}')
+
+
+def first_of(names: Sequence[str], most: int) -> str:
+    """Returns the first of many names and how many are left out: `a, b and 3 more`."""
+    rest = f' and {len(names) - most} more' if len(names) > most else ''
+    return f'{", ".join(names[:most])}{rest}'

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from msgs_spec.arrays import Array
+from msgs_spec.hints import first_of
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.rotations import matrix_to_euler, quaternion_to_matrix
 from msgs_spec.tasks import PHYSICS_TIMESTEP, GoalKind, TaskSpec, substeps_per_tick
@@ -158,8 +159,7 @@ class ObservationAssembler:
                 # No observation is made of efforts.
                 found = [label for label in found if not label.startswith('effort')]
                 if found:
-                    rest = f' and {len(found) - _NAMED} more' if len(found) > _NAMED else ''
-                    return f'{spec.name}: no finite {", ".join(found[:_NAMED])}{rest}'
+                    return f'{spec.name}: no finite {first_of(found, _NAMED)}'
             elif strange.any():
                 return f'{spec.name}: not every value is finite'
         return 'too large a value for an observation'

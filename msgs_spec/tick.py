@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Literal
 
 from numpy.typing import ArrayLike
 
 from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_status
+from msgs_spec.hints import one_of
 from msgs_spec.observations import Readings
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.schemas import serialize
@@ -25,7 +26,6 @@ from msgs_spec.tasks import (
 )
 from msgs_spec.topics import TopicSpec, topics
 
-Word = TypeVar('Word', bound=str)
 Phase = Literal['waiting', 'reset', 'running', 'finished']
 # What each says of the tick it comes with. An episode that is given up ends without `finished`.
 PHASES: dict[Phase, str] = {
@@ -91,18 +91,19 @@ class EpisodeStatus:
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
         if missing:
             raise ValueError(f'episode_status without {", ".join(missing)}')
-        phases: dict[str, Phase] = {phase: phase for phase in PHASES}
         # As Python writes them, and as C++ and YAML do.
         flags = {'True': True, 'true': True, '1': True, 'False': False, 'false': False, '0': False}
-        reward_type = _known(values, 'reward_type', REWARD_TYPES)
-        success_rule = _known(values, 'success_rule', SUCCESS_RULES)
+        said = 'episode_status with'
+        phase = one_of(values['phase'], tuple(PHASES), f'{said} phase')
+        reward_type = one_of(values['reward_type'], REWARD_TYPES, f'{said} reward_type')
+        success_rule = one_of(values['success_rule'], SUCCESS_RULES, f'{said} success_rule')
         try:
             status = cls(
                 task=values['task'],
                 episode=int(values['episode']),
                 seed=int(values['seed']),
                 tick=int(values['tick']),
-                phase=phases[values['phase']],
+                phase=phase,
                 control_hz=float(values['control_hz']),
                 reward_type=reward_type,
                 success_rule=success_rule,
@@ -111,7 +112,7 @@ class EpisodeStatus:
                 joint_prefix=values['joint_prefix'],
             )
         except (KeyError, ValueError) as error:
-            raise ValueError(f'episode_status with unreadable value: {error}') from None
+            raise ValueError(f'{said} unreadable value: {error}') from None
         status._require_known()
         return status
 
@@ -125,15 +126,6 @@ class EpisodeStatus:
             raise ValueError(
                 f'episode_status with joint_prefix of {len(self.joint_prefix)} characters'
             )
-
-
-def _known(values: Mapping[str, str], name: str, allowed: tuple[Word, ...]) -> Word:
-    """The word of a pair; ValueError if it is not one of those allowed."""
-    for word in allowed:
-        if values[name] == word:
-            return word
-    given = values[name][:40]
-    raise ValueError(f'episode_status with {name} {given!r}; allowed: {", ".join(allowed)}')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

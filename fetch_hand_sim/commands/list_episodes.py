@@ -34,6 +34,7 @@ from msgs_spec.command_line import (
     printable,
     run_command,
 )
+from msgs_spec.hints import first_of
 from msgs_spec.tasks import TASKS
 
 _NAME = 'list_episodes'
@@ -157,8 +158,7 @@ def _folders_below(directory: Path) -> str:
         folders = [printable(str(path)) for path in folders_of_episodes(directory)]
     except EpisodeReadError:
         return ''
-    more = f' and {len(folders) - _NAMED} more' if len(folders) > _NAMED else ''
-    return f'{", ".join(folders[:_NAMED])}{more}'
+    return first_of(folders, _NAMED)
 
 
 def _is_wanted(episode: EpisodeSummary, options: argparse.Namespace) -> bool:

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
+from msgs_spec.hints import one_of
 from msgs_spec.parameters import LARGEST_PERTURBATION
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import (
@@ -28,7 +29,6 @@ from msgs_spec.tasks import (
 
 Strings = Mapping[str, str]
 Number = TypeVar('Number', int, float)
-Word = TypeVar('Word', bound=str)
 
 # Seeds and numbers of episodes are parameters of a node and columns of a table: int64.
 _LARGEST = 2**63 - 1
@@ -74,13 +74,13 @@ class EpisodeRecord:
             task=parse_task(metadata),
             episode=_integer(metadata, 'episode'),
             seed=_integer(metadata, 'seed'),
-            reward_type=_word(metadata, 'reward_type', REWARD_TYPES),
-            success_rule=_word(metadata, 'success_rule', SUCCESS_RULES),
+            reward_type=one_of(_text(metadata, 'reward_type'), REWARD_TYPES, 'reward_type'),
+            success_rule=one_of(_text(metadata, 'success_rule'), SUCCESS_RULES, 'success_rule'),
             control_hz=parse_control_hz(metadata),
             joint_prefix=_joint_prefix(metadata),
             interface_version=_integer(metadata, 'interface_version', default='1'),
             perturb_limit=_perturb_limit(metadata),
-            timing=_word({'timing': 'ticks', **metadata}, 'timing', TIMINGS),
+            timing=one_of(metadata.get('timing', 'ticks'), TIMINGS, 'timing'),
         )
 
     @property
@@ -221,14 +221,6 @@ def _perturb_limit(metadata: Strings) -> float:
         allowed = f'0 ... {LARGEST_PERTURBATION:g}'
         raise ValueError(f'perturb_limit {text[:_SHOWN]!r}; allowed: {allowed}')
     return value
-
-
-def _word(content: Strings, name: str, allowed: tuple[Word, ...]) -> Word:
-    text = _text(content, name)
-    for word in allowed:
-        if text == word:
-            return word
-    raise ValueError(f'{name} {text[:_SHOWN]!r}; allowed: {", ".join(allowed)}')
 
 
 def _counts(text: str) -> dict[str, int]:

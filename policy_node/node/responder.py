@@ -116,7 +116,8 @@ class Responder:
             ValueError: If there is no answer, in one line; it is counted.
         """
         if self._due is not None:
-            self._asked = self._observed(self._due)
+            vectors, self._due, self._asked = self._due, None, None
+            self._asked = self._observed(vectors)
             self._note_arrival()
         elif self._asked is None or self._clock() < self._ask_again_at:
             return
@@ -135,7 +136,6 @@ class Responder:
         self._due = self._asked = self._unsent = None
 
     def _observed(self, vectors: Vectors) -> dict[str, NDArray[np.float64]]:
-        self._due = self._asked = None
         try:
             return self._assembler.assemble(vectors)
         except Exception as error:
