@@ -299,6 +299,7 @@ def test_a_replay_that_will_outgrow_the_memory_is_said_at_the_start(
     whole = 16 * (51 * 13 + 3 + 50 * 4) * 4
     arguments = ['--task', 'FetchReach', '--steps', '800', '--set', 'num_envs=2']
     arguments += ['--threads', '1', '--torch-threads', '1', '--set', 'updates_per_cycle=1']
+    arguments += ['--set', 'evaluation_episodes=2']
     for available, warns in ((whole, False), (whole - 1, True), (None, False)):
         monkeypatch.setattr(run_module, 'available_memory', lambda available=available: available)
         assert main([*arguments, '--output', str(tmp_path / str(available))]) == 0

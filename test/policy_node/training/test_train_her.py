@@ -455,7 +455,7 @@ def test_networks_whose_files_could_not_be_read_are_refused_at_once(tmp_path: Pa
 def test_a_run_that_began_anew_has_one_part(tmp_path: Path) -> None:
     """One that was killed before it had saved anything does not count."""
     (tmp_path / 'command.txt').write_text('train_her of before\n')
-    train_run(small_config(), tmp_path, command='train_her of now')
+    train_run(small_config(total_steps=800), tmp_path, command='train_her of now')
     assert (tmp_path / 'command.txt').read_text() == 'train_her of now\n'
     train_run(small_config(total_steps=1600), tmp_path, resume=True, command='more')
     assert (tmp_path / 'command.txt').read_text() == 'train_her of now\nmore\n'
