@@ -6,6 +6,8 @@ Here, because commands of both packages use it and neither package knows the oth
 from __future__ import annotations
 
 import argparse
+import errno
+import io
 import os
 import re
 import select
@@ -26,6 +28,8 @@ from msgs_spec.loading import is_nobodys
 
 # Done; done, and something is wrong; not begun, because of what was given.
 EXIT_SUCCESS, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
+# What a stream says that takes nothing more.
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 # As shells say it: 128 + SIGPIPE.
 EXIT_CLOSED_PIPE = 141
 
@@ -165,6 +169,7 @@ def run_command(name: str, run: Callable[[], int]) -> int:
         Ctrl-C (it is acknowledged at once with a line), 141 if nobody reads the output any more.
         SIGTERM and SIGHUP are as Ctrl-C, with 143 and 129.
     """
+    _make_output_usable()
     with _stopping_is_said(name) as stopping:
         code = _exit_code(name, run, stopping)
         if stopping and code == EXIT_INTERRUPTED:
@@ -185,12 +190,34 @@ def _exit_code(name: str, run: Callable[[], int], stopping: Sequence[int]) -> in
     except BrokenPipeError:
         _discard_output(sys.stdout.fileno())
         return EXIT_CLOSED_PIPE
+    except OSError as error:
+        if error.filename is not None or error.errno not in _FULL:
+            raise
+        _discard_output(sys.stdout.fileno())
+        complain(name, f'cannot write: {error.strerror}')
+        return EXIT_FAILURE
     except ImportError:
         # What becomes of KeyboardInterrupt in the initialisation of many a library.
         if not stopping:
             raise
         return EXIT_INTERRUPTED
     return code
+
+
+def _make_output_usable() -> None:
+    """Lets this process print where its stdout or stderr is closed, or cannot take every letter.
+
+    Of a program of somebody else that runs a command, nothing is changed.
+    """
+    if not is_nobodys():
+        return
+    for name in ('stdout', 'stderr'):
+        stream = getattr(sys, name)
+        if stream is None:
+            # What cron and daemons may start; it stays open to the end.
+            setattr(sys, name, open(os.devnull, 'w'))
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='backslashreplace')
 
 
 def start_command(name: str, module: str, *extras: str) -> int:

@@ -75,6 +75,8 @@ LARGEST_SEED = 2**32 - 1
 
 # More than that throws the robots apart, N.
 LARGEST_PERTURBATION = 100.0
+# Pixels of a side that are drawn.
+LARGEST_PICTURE_SIDE = 4096
 
 SIM_NODE = (
     ParameterSpec('task', 'string', 'FetchReach', 'Task to run.', choices=tuple(TASKS)),
@@ -244,8 +246,8 @@ REPLAY_NODE = (
 )
 
 VISUALIZATION_NODE = (
-    ParameterSpec('camera_width', 'integer', 640, 'Pixels.', lower=16, upper=4096),
-    ParameterSpec('camera_height', 'integer', 480, 'Pixels.', lower=16, upper=4096),
+    ParameterSpec('camera_width', 'integer', 640, 'Pixels.', lower=16, upper=LARGEST_PICTURE_SIDE),
+    ParameterSpec('camera_height', 'integer', 480, 'Pixels.', lower=16, upper=LARGEST_PICTURE_SIDE),
     ParameterSpec(
         'camera_hz',
         'double',

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.episode_log import EpisodeReadError, expand_episodes
+from fetch_hand_sim.episode_log.summary import holds_no_episode
 from fetch_hand_sim.episodes.checker import CheckResult, EpisodeChecker
 from msgs_spec.command_line import (
     EXIT_FAILURE,
@@ -59,7 +60,7 @@ def _expand(paths: Sequence[Path]) -> tuple[list[Path], int]:
         try:
             found = expand_episodes(path)
             if not found:
-                raise EpisodeReadError(f'{path} holds no episode')
+                raise holds_no_episode(path)
         except EpisodeReadError as error:
             complain(_NAME, error)
             code = EXIT_USAGE

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from fetch_hand_sim.commands.episode_filter import add_filter_options, is_wanted
 from fetch_hand_sim.commands.picture_size import picture_size
 from fetch_hand_sim.datasets import minari
 from fetch_hand_sim.datasets.parquet import export_parquet
@@ -21,6 +22,7 @@ from fetch_hand_sim.episode_log import (
     expand_episodes,
 )
 from fetch_hand_sim.episode_log.arrays import load_episode
+from fetch_hand_sim.episode_log.summary import holds_no_episode
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
@@ -44,9 +46,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument('path', type=Path, help='an episode, or a directory of episodes')
     parser.add_argument('--to', choices=tuple(_TITLES), required=True)
     parser.add_argument('--output', type=Path, required=True, help='directory to write to')
-    parser.add_argument(
-        '--name', default='logged-v0', help='of a Minari dataset; default: logged-v0'
-    )
+    add_filter_options(parser)
+    parser.add_argument('--name', help='of a Minari dataset; default: logged-v0')
     parser.add_argument(
         '--pictures',
         type=picture_size,
@@ -55,6 +56,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument('--camera', help='of the model, for --pictures; default: a good view')
     options = parser.parse_args(arguments)
+    if options.name is not None and options.to != 'minari':
+        parser.error(f'--name is for --to minari, not {options.to}')
     if options.pictures and options.to != 'lerobot':
         parser.error(f'--pictures is for --to lerobot, not {options.to}')
     if options.camera and not options.pictures:
@@ -72,14 +75,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     require_extra('data')
+    name = minari.dataset_name('logged-v0' if options.name is None else options.name)
     skipped: list[EpisodeReadError] = []
     by_task: dict[str, list[EpisodeArrays]] = {}
+    filtered = 0
     try:
         paths = expand_episodes(options.path)
         with progress('episodes', len(paths)) as advance:
             for path in paths:
                 try:
-                    _add(path, by_task, options.to)
+                    filtered += not _add(path, by_task, options)
                 except EpisodeReadError as error:
                     skipped.append(error)
                 advance(1)
@@ -91,23 +96,42 @@ def _run(options: argparse.Namespace) -> int:
     if not by_task and skipped:
         return EXIT_USAGE
     if not by_task:
-        raise UsageError(f'{options.path} holds no episode')
-    for task, written in _export(options, by_task).items():
-        say(f'{len(by_task[task])} episodes of {task}: {written}')
+        raise UsageError(_why_none(options.path, filtered))
+    for task, written in _export(options, by_task, name).items():
+        say(f'{_counted(by_task[task])} of {task}: {written}')
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
 
 
-def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], to: str) -> None:
-    """Reads an episode and puts it beside those of its task.
+def _why_none(path: Path, filtered: int) -> str:
+    if filtered:
+        return f'none of {filtered} episodes in {path} is one of those asked for'
+    return str(holds_no_episode(path))
+
+
+def _counted(episodes: Sequence[EpisodeArrays]) -> str:
+    """How many there are, and how many of them were cut short, which learners may not expect."""
+    interrupted = sum(not episode.is_complete for episode in episodes)
+    told = f', {interrupted} of them interrupted,' if interrupted else ''
+    return f'{len(episodes)} episodes{told}'
+
+
+def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.Namespace) -> bool:
+    """Reads an episode and puts it beside those of its task, if it is asked for.
+
+    Returns:
+        Whether it is.
 
     Raises:
         EpisodeReadError: If it cannot be read, or a dataset of this kind cannot hold it.
     """
     episode = load_episode(path)
+    if not is_wanted(options, episode.spec.name, episode):
+        return False
     others = by_task.setdefault(episode.spec.name, [])
-    if why := _why_left_out(episode, others, to):
+    if why := _why_left_out(episode, others, options.to):
         raise EpisodeReadError(f'{path}: {why}')
     others.append(episode)
+    return True
 
 
 def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: str) -> str:
@@ -119,15 +143,15 @@ def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: s
     return why_apart(episode, others[0]) if others else ''
 
 
-def _export(options: argparse.Namespace, by_task: dict[str, list[EpisodeArrays]]) -> dict[str, str]:
-    """Writes all; returns for each task where it is."""
+def _export(options: argparse.Namespace, by_task: ByTask, name: str) -> dict[str, str]:
+    """Writes all, a Minari dataset under a name; returns for each task where it is."""
     if options.to == 'parquet':
         files = export_parquet(by_task, options.output)
         return {task: ', '.join(map(str, paths)) for task, paths in files.items()}
     if options.to == 'lerobot':
         found = _export_lerobot(options, by_task)
         return {task: f'LeRobot dataset {path}' for task, path in found.items()}
-    ids = minari.export_minari(by_task, options.output, options.name)
+    ids = minari.export_minari(by_task, options.output, name)
     return {task: f'Minari dataset {each} in {options.output}' for task, each in ids.items()}
 
 

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from fetch_hand_sim.commands.episode_filter import add_filter_options, is_wanted
 from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeReadError,
@@ -24,7 +25,7 @@ from fetch_hand_sim.episode_log import (
     read_summary,
 )
 from fetch_hand_sim.episode_log.episode_record import integer_or_none
-from fetch_hand_sim.episode_log.summary import EpisodeSummary, folders_of_episodes
+from fetch_hand_sim.episode_log.summary import EpisodeSummary, folders_below
 from msgs_spec.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
@@ -34,17 +35,14 @@ from msgs_spec.command_line import (
     printable,
     run_command,
 )
-from msgs_spec.hints import first_of
-from msgs_spec.tasks import TASKS
 
 _NAME = 'list_episodes'
 _COLUMNS = ('episode', 'task', 'seed', 'steps', 'return', 'success', 'seconds', 'KiB', 'ended')
 _NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB'})
-# A pipe has no width to fit into; this one fits every column.
-_PIPE_WIDTH = 200
+# Every column fits, whatever a file says: of a name that is cut short nobody finds the episode, so
+# a narrow terminal wraps lines instead.
+_WIDEST = 400
 _LONGEST_CELL = 60
-# Folders that are named where the one above was given.
-_NAMED = 3
 
 
 def read_summaries(directory: Path) -> tuple[list[EpisodeSummary], list[EpisodeReadError]]:
@@ -107,18 +105,7 @@ def _shown(cell: str) -> str:
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('directory', type=Path, help='where episodes are collected')
-    parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='only this task')
-    success = parser.add_mutually_exclusive_group()
-    success.add_argument('--success', action='store_true', default=None, help='only successes')
-    success.add_argument(
-        '--failure', dest='success', action='store_false', help='only failures', default=None
-    )
-    parser.add_argument(
-        '--complete',
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help='only episodes that ran to their end, or only interrupted ones',
-    )
+    add_filter_options(parser)
     parser.add_argument('--json', action='store_true', help='print one JSON array, no table')
     return parser.parse_args(arguments)
 
@@ -135,7 +122,7 @@ def _run(options: argparse.Namespace) -> int:
         leftovers = find_leftovers(options.directory)
     except (EpisodeReadError, EpisodeLogError) as error:
         raise UsageError(str(error)) from None
-    shown = [episode for episode in episodes if _is_wanted(episode, options)]
+    shown = [each for each in episodes if is_wanted(options, each.metadata.get('task'), each)]
     if options.json:
         print(json.dumps([_as_json(episode) for episode in shown], indent=2))
     else:
@@ -143,7 +130,7 @@ def _run(options: argparse.Namespace) -> int:
         successes = sum(episode.outcome.is_success is True for episode in shown)
         filtered = len(episodes) - len(shown)
         print(f'{len(shown)} episodes, {successes} successes; {filtered} filtered')
-        if not (episodes or errors) and (below := _folders_below(options.directory)):
+        if not (episodes or errors) and (below := folders_below(options.directory)):
             print(f'there are some in {below}')
     for leftover in leftovers:
         remedy = '' if leftover.problem else '; recover_episodes makes a bag of it'
@@ -153,27 +140,9 @@ def _run(options: argparse.Namespace) -> int:
     return EXIT_FAILURE if errors else EXIT_SUCCESS
 
 
-def _folders_below(directory: Path) -> str:
-    try:
-        folders = [printable(str(path)) for path in folders_of_episodes(directory)]
-    except EpisodeReadError:
-        return ''
-    return first_of(folders, _NAMED)
-
-
-def _is_wanted(episode: EpisodeSummary, options: argparse.Namespace) -> bool:
-    """Whether an episode is to be shown; an option that was not given is None."""
-    outcome = episode.outcome
-    return (
-        options.task in (None, episode.metadata.get('task'))
-        and options.success in (None, outcome.is_success is True)
-        and options.complete in (None, outcome.is_complete)
-    )
-
-
 def _print_table(episodes: Sequence[EpisodeSummary]) -> None:
-    console = Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH)
     if episodes:
+        console = Console(width=_WIDEST)
         with console.capture() as captured:
             console.print(make_table(episodes))
         print(captured.get(), end='')

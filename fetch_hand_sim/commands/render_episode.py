@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from fetch_hand_sim.commands.picture_size import picture_size
+from fetch_hand_sim.commands.picture_size import picture_size, two_numbers
 from msgs_spec.arrays import Picture
 from msgs_spec.command_line import (
     EXIT_SUCCESS,
@@ -43,15 +43,13 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument('--camera', help='a camera of the model; default: a good view')
     parser.add_argument(
-        '--grid', type=picture_size, metavar='CxR', help='columns x rows of episodes, such as 4x4'
+        '--grid', type=two_numbers(20), metavar='CxR', help='columns x rows of episodes: 4x4'
     )
     parser.add_argument('--frame', type=int, help='of a picture; default: -1, the last')
     parser.add_argument('--speed', type=float, help='of a film: simulated seconds per second')
     options = parser.parse_args(arguments)
     if options.speed is not None and not _SPEEDS[0] <= options.speed <= _SPEEDS[1]:
         parser.error(f'--speed {options.speed:g}; allowed: {_SPEEDS[0]:g} ... {_SPEEDS[1]:g}')
-    if options.grid and not all(1 <= side <= 20 for side in options.grid):
-        parser.error('--grid: allowed: 1x1 ... 20x20')
     return options
 
 

@@ -9,7 +9,7 @@ import copy
 import os
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,7 +30,7 @@ from fetch_hand_sim.datasets.writing import (
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
 from fetch_hand_sim.gym_envs.spaces import observation_space
-from msgs_spec.command_line import UsageError, one_line
+from msgs_spec.command_line import UsageError, one_line, progress
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 
 # Parts of a dataset's id become directories.
@@ -38,6 +38,22 @@ _DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
 _VERSION = re.compile(r'-v\d+$')
 # Minari's: where datasets live, and what is in the directories above one.
 _MINARI_PATH, _NAMESPACE = 'MINARI_DATASETS_PATH', 'namespace_metadata.json'
+
+
+def dataset_name(text: str) -> str:
+    """Returns the name of a dataset, with a version after it if it has none.
+
+    Raises:
+        UsageError: If it is not allowed.
+    """
+    *folders, _ = text.split('/')
+    # In a folder with a version is another dataset, and Minari finds none within it.
+    if not _DATASET_NAME.fullmatch(text) or any(map(_VERSION.search, folders)):
+        raise UsageError(
+            f'dataset name {text!r}; allowed: letters, digits, _ and -, parts separated by /, a '
+            'version in the last alone, such as me/logged-v0'
+        )
+    return text if _VERSION.search(text) else f'{text}-v0'
 
 
 def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]:
@@ -58,23 +74,20 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
         ExportError: If minari is missing, the dataset exists or cannot be written. No dataset is
             created in either case.
     """
-    if not _DATASET_NAME.fullmatch(name):
-        raise UsageError(
-            f'dataset name {name!r}; allowed: letters, digits, _ and -, parts separated by /, such '
-            'as logged-v0'
-        )
+    versioned = dataset_name(name)
     for task in by_task:
         if not _DATASET_NAME.fullmatch(task):
             raise ExportError(f'Minari takes no dataset of a task that is called {task!r}')
     minari, collector = require_module('minari'), require_module('minari.data_collector')
-    versioned = name if _VERSION.search(name) else f'{name}-v0'
     ids = {task: f'{task}/{versioned}' for task in by_task}
     try:
         with alone_in(directory):
             require_new(directory / dataset_id for dataset_id in ids.values())
-            with _appearing(directory, list(ids.values())):
+            count = sum(map(len, by_task.values()))
+            with _appearing(directory, list(ids.values())), progress('written', count) as advance:
                 for task, episodes in by_task.items():
-                    _create_dataset(minari, collector, ids[task], episodes)
+                    buffers = _buffers(collector, episodes, advance)
+                    _create_dataset(minari, ids[task], episodes, buffers)
     except ImportError as error:
         raise ExportError(f"{error}; install with pip install 'fetch_hand_sim[data]'") from error
     except (OSError, ValueError, AssertionError) as error:
@@ -82,13 +95,12 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
     return ids
 
 
-def _create_dataset(
-    minari: Any, collector: Any, dataset_id: str, episodes: Sequence[EpisodeArrays]
-) -> None:
-    """Writes a dataset where `MINARI_DATASETS_PATH` says."""
-    spec = episodes[0].spec
-    buffers = [
-        collector.EpisodeBuffer(
+def _buffers(
+    collector: Any, episodes: Sequence[EpisodeArrays], advance: Callable[[int], None]
+) -> Iterator[Any]:
+    """What Minari writes, one after the other."""
+    for index, episode in enumerate(episodes):
+        yield collector.EpisodeBuffer(
             id=index,
             seed=episode.record.seed,
             observations=dict(episode.observations),
@@ -98,21 +110,43 @@ def _create_dataset(
             truncations=episode.truncated.tolist(),
             infos={'is_success': episode.success[:, None]},
         )
-        for index, episode in enumerate(episodes)
-    ]
+        advance(1)
+
+
+def _create_dataset(
+    minari: Any, dataset_id: str, episodes: Sequence[EpisodeArrays], buffers: Iterator[Any]
+) -> None:
+    """Writes a dataset where `MINARI_DATASETS_PATH` says."""
+    spec = episodes[0].spec
     # Actions worked out from commands are not all float32.
     actions = spaces.Box(-1.0, 1.0, (spec.robot.action_size,), np.float64)
-    minari.create_dataset_from_buffers(
-        dataset_id,
-        buffers,
-        env=_environment(episodes[0]),
-        observation_space=observation_space(spec),
-        action_space=actions,
-        algorithm_name=_algorithm(episodes),
-        description=_description(episodes[0]),
-        data_format='arrow',
-        requirements=_requirements(episodes[0]),
-    )
+    with _unmeasured():
+        dataset = minari.create_dataset_from_buffers(
+            dataset_id,
+            buffers,
+            env=_environment(episodes[0]),
+            observation_space=observation_space(spec),
+            action_space=actions,
+            algorithm_name=_algorithm(episodes),
+            description=_description(episodes[0]),
+            data_format='arrow',
+            requirements=_requirements(episodes[0]),
+        )
+    # Measures it, too.
+    complete = [{'complete': episode.is_complete} for episode in episodes]
+    dataset.storage.update_episode_metadata(complete)
+
+
+@contextmanager
+def _unmeasured() -> Iterator[None]:
+    """Minari looks at every file of a dataset after every episode, to say how large it is."""
+    storage = require_module('minari.dataset.minari_storage').MinariStorage
+    measure = storage.get_size
+    storage.get_size = lambda dataset: 0.0
+    try:
+        yield
+    finally:
+        storage.get_size = measure
 
 
 @contextmanager

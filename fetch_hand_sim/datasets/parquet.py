@@ -116,10 +116,15 @@ def _episode_row(index: int, episode: EpisodeArrays) -> dict[str, Any]:
         'task': episode.spec.name,
         'seed': record.seed,
         'steps': len(episode),
-        'return': float(episode.rewards.sum()),
-        'success': bool(episode.success[-1]),
+        # Of an episode that was cut off and does not say it, what its ticks come to.
+        'return': _first(outcome.episode_return, sum(episode.rewards.tolist())),
+        'success': _first(outcome.is_success, bool(episode.success[-1])),
         'complete': outcome.is_complete,
         'control_hz': record.control_hz,
         'metadata': json.dumps(episode.metadata),
         'result': json.dumps(episode.result),
     }
+
+
+def _first(said: Any, found: Any) -> Any:
+    return found if said is None else said

@@ -23,7 +23,8 @@ from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
 
 
-@dataclass(frozen=True, slots=True)
+# Compared by identity: arrays compare number by number, and cannot say whether all are equal.
+@dataclass(frozen=True, slots=True, eq=False)
 class EpisodeArrays(HasOutcome):
     """One episode of N steps.
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from fetch_hand_sim.episode_log.errors import EpisodeExistsError, EpisodeLogError
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from fetch_hand_sim.episode_log.writer import EpisodeWriter
 
-_NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed\d+(\.active)?')
+_NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed(?P<seed>\d+)(\.active)?')
 
 
 def episode_name(task: str, index: int, seed: int) -> str:
@@ -20,12 +20,19 @@ def episode_name(task: str, index: int, seed: int) -> str:
 
 def next_index(directory: Path, task: str) -> int:
     """Returns the index after the largest of a task, counting cut-off episodes; 0 at first."""
-    if not directory.is_dir():
-        return 0
-    names = (_NAME.fullmatch(path.name) for path in directory.iterdir())
-    return max(
-        (int(name['index']) + 1 for name in names if name and name['task'] == task), default=0
-    )
+    return max((int(name['index']) + 1 for name in _names(directory, task)), default=0)
+
+
+def named_seeds(directory: Path, task: str) -> set[int]:
+    """Returns the seeds of the episodes of a task in a directory, as their names say."""
+    return {int(name['seed']) for name in _names(directory, task)}
+
+
+def _names(directory: Path, task: str) -> Iterator[re.Match[str]]:
+    if directory.is_dir():
+        for path in directory.iterdir():
+            if (name := _NAME.fullmatch(path.name)) and name['task'] == task:
+                yield name
 
 
 class EpisodeDirectory:
@@ -42,9 +49,9 @@ class EpisodeDirectory:
     """
 
     def __init__(
-        self, path: Path, settings: LogSettings | None = None, namespace: str = '/'
+        self, path: Path | str, settings: LogSettings | None = None, namespace: str = '/'
     ) -> None:
-        self.path = path
+        self.path = Path(path)
         self._settings = settings
         self._namespace = namespace
         self._next: dict[str, int] = {}

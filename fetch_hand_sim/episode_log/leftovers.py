@@ -44,7 +44,7 @@ class Leftover:
         )
 
 
-def find_leftovers(directory: Path, now_s: float | None = None) -> list[Leftover]:
+def find_leftovers(directory: Path | str, now_s: float | None = None) -> list[Leftover]:
     """Returns the unfinished episodes in a directory by name, without those in progress.
 
     Args:
@@ -56,7 +56,7 @@ def find_leftovers(directory: Path, now_s: float | None = None) -> list[Leftover
     """
     now = time.time() if now_s is None else now_s
     try:
-        found = [inspect_leftover(path, now) for path in sorted(directory.iterdir())]
+        found = [inspect_leftover(path, now) for path in sorted(Path(directory).iterdir())]
     except FileNotFoundError:
         return []
     except OSError as error:

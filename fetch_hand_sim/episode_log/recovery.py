@@ -113,7 +113,7 @@ class _Remains:
             return []
 
 
-def recover_episode(leftover: Path) -> Path | None:
+def recover_episode(leftover: Path | str) -> Path | None:
     """Completes an episode that a crash cut off.
 
     All whole chunks become a bag under the name of the episode; at most the last quarter of a
@@ -130,6 +130,7 @@ def recover_episode(leftover: Path) -> Path | None:
         EpisodeInUseError: If it is being written, or another process recovers it or has done so.
         EpisodeLogError: If it is not what a robot leaves, or the disk refuses.
     """
+    leftover = Path(leftover)
     name = durable.active_name(leftover)
     if name is None:
         raise EpisodeLogError(f'{leftover} is no unfinished episode')

@@ -25,8 +25,12 @@ from fetch_hand_sim.episode_log.reader import (
     one_line_errors,
 )
 from fetch_hand_sim.episode_log.untrusted import BoundedStream, Records
+from msgs_spec.command_line import printable
+from msgs_spec.hints import first_of
 
 _MAGIC_BYTES = 8
+# Folders that are named where the one above was given.
+_NAMED = 3
 # Opcode, length, two offsets and a CRC.
 _FOOTER_BYTES = 1 + 8 + 8 + 8 + 4
 _AT_THE_END = frozenset({Opcode.FOOTER, Opcode.STATISTICS, Opcode.METADATA_INDEX})
@@ -107,7 +111,7 @@ def _metadata_at(stream: BinaryIO, index: MetadataIndex) -> dict[str, str]:
     return dict(record.metadata)
 
 
-def find_episodes(directory: Path) -> list[Path]:
+def find_episodes(directory: Path | str) -> list[Path]:
     """Returns what may be an episode in a directory, by name; nothing is opened.
 
     These are bag directories and MCAP files, but not the hidden directories of episodes that are
@@ -117,31 +121,37 @@ def find_episodes(directory: Path) -> list[Path]:
         EpisodeReadError: If it is no directory or cannot be read.
     """
     try:
-        entries = sorted(directory.iterdir())
+        entries = sorted(Path(directory).iterdir())
         return [path for path in entries if not durable.active_name(path) and _is_bag(path)]
     except OSError as error:
         raise EpisodeReadError(f'{error.filename or directory}: {error.strerror}') from error
 
 
-def folders_of_episodes(directory: Path) -> list[Path]:
-    """Returns the folders in a directory that hold episodes, for who named the one above.
-
-    Raises:
-        EpisodeReadError: If the directory cannot be read.
-    """
+def folders_below(directory: Path) -> str:
+    """Names the first folders in a directory that hold episodes, for who named the one above."""
     try:
         folders = [path for path in sorted(directory.iterdir()) if path.is_dir()]
-        return [path for path in folders if path.name[0] != '.' and find_episodes(path)]
-    except OSError as error:
-        raise EpisodeReadError(f'{error.filename or directory}: {error.strerror}') from error
+        held = [path for path in folders if path.name[0] != '.' and find_episodes(path)]
+    except (OSError, EpisodeReadError):
+        return ''
+    return first_of([printable(str(path)) for path in held], _NAMED)
 
 
-def expand_episodes(path: Path) -> list[Path]:
+def holds_no_episode(directory: Path) -> EpisodeReadError:
+    """The error of who needs an episode and got a folder without any."""
+    below = folders_below(directory)
+    return EpisodeReadError(
+        f'{directory} holds no episode{f"; there are some in {below}" if below else ""}'
+    )
+
+
+def expand_episodes(path: Path | str) -> list[Path]:
     """Returns the path itself if it is an episode or no directory, else the episodes in it.
 
     Raises:
         EpisodeReadError: If it does not exist, or is a directory that cannot be read.
     """
+    path = Path(path)
     try:
         if not path.exists():
             raise EpisodeReadError(f'{path}: No such file or directory')

@@ -68,7 +68,7 @@ class EpisodeWriter:
 
     def __init__(
         self,
-        directory: Path,
+        directory: Path | str,
         name: str,
         metadata: Mapping[str, str],
         attachments: Sequence[Attachment] = (),
@@ -81,6 +81,7 @@ class EpisodeWriter:
             raise ValueError(f'{attached} bytes attached; allowed: {MAX_ATTACHMENT_BYTES}')
         self._settings = settings or LogSettings()
         self._namespace = namespace.rstrip('/') + '/'
+        directory = Path(directory)
         self._final = directory / name
         self._channels: dict[str, ChannelSpec] = {}
         self._flushed_ns: int | None = None
@@ -217,6 +218,11 @@ class EpisodeWriter:
             outcome = {'complete': 'false', 'reason': reason}
         return self._end({**result, **outcome})
 
+    def discard(self) -> None:
+        """Removes what there is of an episode that is not completed."""
+        if self._is_open:
+            self._discard()
+
     def store(self) -> Path | None:
         """Does the second half: waits for the disk several times, then shows the episode.
 
@@ -307,7 +313,7 @@ class EpisodeWriter:
         return EpisodeLogError(f'episode log stopped, {self._stream.name}: {_reason(error)}')
 
     def _discard(self) -> None:
-        """Removes what this writer created; only called while there is no message in it."""
+        """Removes what this writer created."""
         self._stop()
         shutil.rmtree(self._active, ignore_errors=True)
 

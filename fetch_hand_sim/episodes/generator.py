@@ -144,7 +144,8 @@ class EpisodeGenerator:
                 if command is not None:
                     writer.write_received(self._commands, command)
         except KeyboardInterrupt:
-            writer.abort('interrupted')
+            # A part of an episode that had been played to its end would be neither.
+            writer.discard()
             raise
         robot.messages.clear()
         return writer

@@ -18,6 +18,8 @@ from msgs_spec.command_line import CommandError, UsageError
 
 MOVING = ('.mp4', '.gif', '.webp')
 STILL = ('.png', '.jpg')
+# All pixels of a picture that are held at a time, at most: 0.8 GB.
+_MOST_PIXELS = 2**28
 # Pixels of a side, at most.
 _LARGEST_SIDE = {'.mp4': 16384, '.gif': 65535, '.webp': 16383, '.jpg': 65500}
 
@@ -49,6 +51,8 @@ def check_size(path: Path, width: int, height: int) -> None:
     largest = _LARGEST_SIDE.get(kind)
     if largest is not None and max(width, height) > largest:
         raise UsageError(f'{width}x{height} pixels; allowed: {largest} a side of a {kind} file')
+    if width * height > _MOST_PIXELS:
+        raise UsageError(f'{width}x{height} pixels; allowed: {_MOST_PIXELS} in all')
 
 
 def write_film(

@@ -21,6 +21,9 @@ from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes
 from msgs_spec.arrays import Picture
 from msgs_spec.command_line import CommandError, UsageError
 
+# Pictures per second that a file can have.
+_RATES = (0.001, 1000.0)
+
 
 class Film:
     """Moving pictures; as the last line of a cell, a notebook plays them.
@@ -34,12 +37,12 @@ class Film:
 
     Raises:
         ValueError: If there is no picture, or something else than a picture of the first one's
-            size.
+            size, or the rate is not 0.001 ... 1000.
     """
 
     def __init__(self, pictures: Iterable[Picture], fps: float = 25.0) -> None:
-        if not fps > 0.0:
-            raise ValueError(f'fps {fps:g}; allowed: more than 0')
+        if not _RATES[0] <= fps <= _RATES[1]:
+            raise ValueError(f'fps {fps:g}; allowed: {_RATES[0]:g} ... {_RATES[1]:g}')
         self.fps = fps
         self._roll = Roll()
         self._shape: tuple[int, ...] = ()

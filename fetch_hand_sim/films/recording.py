@@ -11,7 +11,7 @@ import numpy as np
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode
 from fetch_hand_sim.episode_log.messages import MessageFile, read_messages
-from fetch_hand_sim.episode_log.summary import expand_episodes
+from fetch_hand_sim.episode_log.summary import expand_episodes, holds_no_episode
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
 from msgs_spec.arrays import Array
@@ -145,5 +145,5 @@ def find_playable(path: Path) -> list[Path]:
     """
     paths = expand_episodes(path)
     if not paths:
-        raise EpisodeReadError(f'{path}: no episodes')
+        raise holds_no_episode(path)
     return paths

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import operator
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -15,9 +16,10 @@ from fetch_hand_sim.simulation.opengl import ADVICE, prepare_opengl
 from fetch_hand_sim.simulation.scene import SHOWN_SITES, Frame, Scene
 from fetch_hand_sim.simulation.simulation import Simulation
 from msgs_spec.arrays import Array, Picture
+from msgs_spec.parameters import LARGEST_PICTURE_SIDE
 
 WIDTH, HEIGHT = 640, 480
-LARGEST_SIDE = 4096
+LARGEST_SIDE = LARGEST_PICTURE_SIDE
 
 
 class SceneRenderer:
@@ -34,6 +36,7 @@ class SceneRenderer:
 
     Raises:
         ValueError: If the model has no such camera or the size is not allowed.
+        TypeError: If a side is no whole number.
         RuntimeError: If there is no OpenGL.
     """
 
@@ -44,6 +47,8 @@ class SceneRenderer:
         height: int = HEIGHT,
         camera: str | Mapping[str, Any] | None = None,
     ) -> None:
+        # Not every number is a whole one, and OpenGL would be blamed for it.
+        width, height = operator.index(width), operator.index(height)
         for side in (width, height):
             if not 1 <= side <= LARGEST_SIDE:
                 raise ValueError(f'size {width}x{height}; allowed: 1 ... {LARGEST_SIDE} pixels')

@@ -16,6 +16,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeLogError
+from fetch_hand_sim.episode_log.episodes import named_seeds
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.simulation import Observation, Simulation
@@ -24,6 +25,8 @@ from msgs_spec.command_line import (
     CommandError,
     CommandParser,
     UsageError,
+    complain,
+    one_line,
     progress,
     run_command,
     say,
@@ -86,6 +89,7 @@ def _run(options: argparse.Namespace) -> int:
         generator, simulation = make_generator(options)
     except ValueError as error:
         raise UsageError(str(error)) from None
+    _say_what_is_there(options, simulation.spec.name)
     began, cpu_began = time.perf_counter(), time.process_time()
     count = steps = successes = 0
     try:
@@ -97,6 +101,9 @@ def _run(options: argparse.Namespace) -> int:
                 advance(1)
     except EpisodeLogError as error:
         raise CommandError(str(error)) from None
+    except ValueError as error:
+        # What a policy of one's own answers may be anything.
+        raise CommandError(f'{options.policy}: {one_line(error)}') from None
     finally:
         wall, cpu = time.perf_counter() - began, time.process_time() - cpu_began
         simulated = steps * simulation.tick_duration
@@ -106,6 +113,21 @@ def _run(options: argparse.Namespace) -> int:
             f'time, {simulated / cpu:.0f} x per core'
         )
     return EXIT_SUCCESS
+
+
+def _say_what_is_there(options: argparse.Namespace, task: str) -> None:
+    """Warns of episodes that would be in the folder twice, as who learns from it would not see."""
+    try:
+        seeds = named_seeds(options.output, task)
+    except OSError:
+        return  # Who writes there will say why not.
+    series = range(options.first_seed, options.first_seed + options.episodes)
+    if twice := sum(seed in seeds for seed in series):
+        complain(
+            _NAME,
+            f'{options.output} holds {twice} of these seeds of {task} already; --first-seed '
+            f'{max(seeds) + 1} goes on after them',
+        )
 
 
 if __name__ == '__main__':

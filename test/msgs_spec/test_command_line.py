@@ -137,6 +137,27 @@ def test_a_closed_output_ends_quietly(flush):
     assert process.wait(20) == 141
 
 
+def test_a_full_output_is_one_line():
+    with open('/dev/full', 'w') as full:
+        process = run_script('print("line")\nreturn 0', stdout=full)
+    assert process.stderr.read() == 'tool: cannot write: No space left on device\n'
+    assert process.wait(20) == 1
+
+
+@pytest.mark.parametrize('closed', [1, 2])
+def test_a_command_without_stdout_or_stderr_does_its_work(closed, tmp_path):
+    body = f'with progress("x", 1): print(1); print(2, file=sys.stderr)\nopen("{tmp_path}/x", "w")'
+    process = run_script(f'{body}\nreturn 3', preexec_fn=lambda: os.close(closed))
+    process.communicate(timeout=20)
+    assert process.returncode == 3 and (tmp_path / 'x').exists()
+
+
+def test_letters_that_the_output_does_not_have_are_escaped(monkeypatch):
+    monkeypatch.setenv('PYTHONIOENCODING', 'latin-1')
+    process = run_script('print("日本")\nraise UsageError("ж")')
+    assert process.communicate(timeout=20) == ('\\u65e5\\u672c\n', 'tool: \\u0436\n')
+
+
 @pytest.mark.parametrize('open_pair', [pty.openpty, os.pipe])
 def test_what_nobody_reads_goes_nowhere_where_a_command_has_more_to_do(open_pair):
     code = (

@@ -13,11 +13,16 @@ import pytest
 from fetch_hand_sim.commands import check_episode, list_episodes, recover_episodes
 from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
+    EpisodeLogError,
     EpisodeReadError,
     EpisodeWriter,
+    expand_episodes,
+    find_episodes,
+    find_leftovers,
     load_episodes,
     read_episode,
     read_summary,
+    recover_episode,
 )
 from fetch_hand_sim.episode_log.episode_record import parse_task
 from fetch_hand_sim.episode_log.model import former_model_sha256, model_sha256
@@ -389,6 +394,18 @@ def test_list_calls_episodes_as_their_folders_and_names_those_below(reach, tmp_p
     assert lines[-1] == f'there are some in {tmp_path / "day 1"}'
 
 
+def test_a_narrow_terminal_wraps_names_and_numbers_instead_of_cutting_them(
+    reach, monkeypatch, capsys
+):
+    monkeypatch.setenv('COLUMNS', '40')
+    assert list_episodes.main([str(reach)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[1:-1]] == sorted(
+        path.name for path in reach.iterdir()
+    )
+    assert not any('…' in line for line in lines)
+
+
 def test_a_leftover_beside_its_finished_episode_is_called_a_copy(reach, tmp_path, capsys):
     source = sorted(reach.iterdir())[0]
     shutil.copytree(source, tmp_path / source.name)
@@ -431,6 +448,14 @@ def test_list_filters(reach, tmp_path, capsys):
         table = capsys.readouterr().out.splitlines()[1:-1]
         return [line.split()[0] for line in table]
 
+    # Killed, and recovered: nobody knows how it would have ended.
+    writer = EpisodeWriter(directory, 'x2', {'task': 'HandReach', 'seed': '1'})
+    writer.write(spec, TopicCodec(spec).encode(0, []), 1)
+    writer.abort('killed')
+    assert names('--task', 'HandReach') == ['x2']
+    assert not names('--task', 'HandReach', '--failure')
+    assert not names('--task', 'HandReach', '--success')
+    shutil.rmtree(directory / 'x2')
     assert len(names()) == 5
     assert names('--task', 'FetchPush') == ['x0']
     assert names('--success') == ['x0']
@@ -573,6 +598,11 @@ def test_the_command_line_generates(tmp_path, capsys):
     assert list_episodes.main([str(tmp_path), '--complete']) == 0
     assert generate_episodes.main(['--policy', 'random', '--output', str(tmp_path)]) == 2
     assert 'random needs a task' in capsys.readouterr().err
+    assert generate_episodes.main([*arguments, '--episodes', '3', '--threads', '1']) == 0
+    assert 'holds 2 of these seeds of FetchReach already; --first-seed 2' in capsys.readouterr().err
+    more = ['--episodes', '1', '--threads', '1', '--first-seed', '3']
+    assert generate_episodes.main([*arguments, *more]) == 0
+    assert capsys.readouterr().err == ''
     with pytest.raises(SystemExit) as caught:
         generate_episodes.main([*arguments, '--episodes', '0'])
     assert caught.value.code == 2
@@ -580,6 +610,18 @@ def test_the_command_line_generates(tmp_path, capsys):
     file.touch()
     assert generate_episodes.main([*arguments[:-1], str(file), '--episodes', '1']) == 1
     assert 'cannot log episode' in capsys.readouterr().err
+
+
+def test_a_policy_that_answers_nonsense_on_the_way_is_one_line(tmp_path, monkeypatch, capsys):
+    (tmp_path / 'strange_policy.py').write_text(
+        'import itertools\nimport numpy as np\ncalls = itertools.count()\n'
+        'def make(spec):\n    return lambda _: np.full(4, 0.0 if next(calls) < 20 else np.nan)\n'
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    arguments = ['--policy', 'strange_policy:make', '--trust', '--task', 'FetchReach']
+    arguments += ['--episodes', '1', '--threads', '1', '--output', str(tmp_path / 'out')]
+    assert generate_episodes.main(arguments) == 1
+    assert capsys.readouterr().err.startswith('generate_episodes: strange_policy:make: ')
 
 
 def test_equal_command_lines_give_equal_messages(tmp_path):
@@ -592,3 +634,19 @@ def test_arrays_are_as_documented(reach):
     (arrays, *_) = load_episodes(reach)
     names = {field.name for field in dataclasses.fields(arrays)}
     assert {'observations', 'actions', 'rewards', 'terminated', 'truncated', 'success'} <= names
+
+
+def test_loaded_episodes_can_be_looked_up_and_paths_may_be_text(reach, tmp_path):
+    first, second, *_ = episodes = load_episodes(str(reach))
+    assert episodes.index(second) == 1 and len({first, second, first}) == 2
+    assert find_episodes(str(reach)) == expand_episodes(str(reach)) == find_episodes(reach)
+    assert find_leftovers(str(reach)) == []
+    with pytest.raises(EpisodeLogError, match='is no unfinished episode'):
+        recover_episode(str(reach))
+    spec = topic(task_spec('FetchReach'), '/clock')
+    for writer in (
+        EpisodeDirectory(str(tmp_path)).begin('FetchReach', 0, {}),
+        EpisodeWriter(str(tmp_path), 'mine', {}),
+    ):
+        writer.write(spec, TopicCodec(spec).encode(0, []), 1)
+        assert writer.finish({}).parent == tmp_path

@@ -54,6 +54,8 @@ def test_parquet_holds_every_value(episodes, tmp_path, capsys):
         assert mine[1]['timestamp'] == 0.04
         assert (about[index]['seed'], about[index]['steps']) == (index, 50)
         assert json.loads(about[index]['metadata']) == arrays.metadata
+        said = json.loads(about[index]['result'])
+        assert about[index]['return'] == float(said['return']), 'the last bit too'
     assert export_episodes.main(arguments) == 1
     assert 'nothing is overwritten' in capsys.readouterr().err
 
@@ -159,6 +161,7 @@ def test_of_two_tasks_none_is_written_where_there_is_no_room_for_both(
         if len(done) == (2 if format_ == 'parquet' else 1):
             raise OSError(errno.ENOSPC, 'No space left on device')
         done.append(written(*arguments, **options))
+        return done[-1]
 
     arguments = [str(two_tasks), '--to', format_, '--output', str(tmp_path)]
     with monkeypatch.context() as patch:
@@ -270,6 +273,34 @@ def test_usage_errors(tmp_path, capsys):
     with pytest.raises(SystemExit) as caught:
         export_episodes.main([str(tmp_path), '--to', 'paper', '--output', 'x'])
     assert caught.value.code == 2
+    with pytest.raises(SystemExit):
+        export_episodes.main([str(tmp_path), *arguments, '--name', 'mine'])
+    assert '--name is for --to minari, not parquet' in capsys.readouterr().err
+
+
+def test_of_a_folder_only_what_is_asked_for_is_exported(episodes, tmp_path, monkeypatch, capsys):
+    minari = pytest.importorskip('minari')
+    folder = tmp_path / 'with a short one'
+    shutil.copytree(episodes, folder)
+    recorder = Recorder(TASK)
+    writer = EpisodeDirectory(folder).begin(TASK, 0, recorder.metadata())
+    recorder.write(writer, recorder.ticks()[:5])
+    writer.abort('the robot stopped')
+    arguments = [str(folder), '--to', 'minari', '--output', str(tmp_path / 'minari')]
+    assert export_episodes.main([*arguments, '--name', 'all']) == 0
+    assert f'3 episodes, 1 of them interrupted, of {TASK}' in capsys.readouterr().out
+    assert export_episodes.main([*arguments, '--name', 'whole', '--complete']) == 0
+    assert f'2 episodes of {TASK}' in capsys.readouterr().out
+    monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path / 'minari'))
+    for name, complete in (('all', [True, True, False]), ('whole', [True, True])):
+        dataset = minari.load_dataset(f'{TASK}/{name}-v0')
+        told = dataset.storage.get_episode_metadata(dataset.episode_indices)
+        assert [each['complete'] for each in told] == complete
+        assert dataset.storage.metadata['dataset_size'] == dataset.storage.get_size()
+    assert export_episodes.main([*arguments, '--task', 'FetchReach']) == 2
+    assert f'none of 3 episodes in {folder} is one of' in capsys.readouterr().err
+    assert export_episodes.main([str(tmp_path), *arguments[1:]]) == 2
+    assert f'{tmp_path} holds no episode; there are some in {folder}' in capsys.readouterr().err
 
 
 def test_of_several_moves_all_are_made_or_none(tmp_path):

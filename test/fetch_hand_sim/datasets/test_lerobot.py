@@ -167,7 +167,8 @@ def test_colors_are_summed_up_as_numbers_are():
     ('arguments', 'says'),
     [
         (['--to', 'lerobot', '--pictures', '95x96'], 'even sides'),
-        (['--to', 'lerobot', '--pictures', 'large'], 'two numbers with an x'),
+        (['--to', 'lerobot', '--pictures', 'large'], '1x1 ... 4096x4096'),
+        (['--to', 'lerobot', '--pictures', '0x0'], '1x1 ... 4096x4096'),
         (['--to', 'minari', '--pictures', '96x96'], 'is for --to lerobot'),
         (['--to', 'lerobot', '--camera', 'gripper_camera_rgb'], 'needs --pictures'),
         (['--to', 'lerobot', '--pictures', '96x96', '--camera', 'nosuch'], 'nosuch'),

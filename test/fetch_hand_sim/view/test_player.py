@@ -199,7 +199,7 @@ def test_an_unreadable_file_is_one_line(tmp_path, content):
 
 
 def test_an_empty_folder_is_one_line(tmp_path):
-    with pytest.raises(EpisodeReadError, match='no episodes'):
+    with pytest.raises(EpisodeReadError, match='holds no episode'):
         find_playable(tmp_path)
 
 

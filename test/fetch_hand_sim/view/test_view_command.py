@@ -52,7 +52,7 @@ def test_a_file_that_cannot_be_read(capsys, tmp_path, content):
 
 def test_a_folder_without_episodes(capsys, tmp_path):
     code, (line,) = error_of(capsys, [tmp_path, '--no-browser'])
-    assert (code, line) == (2, f'view: {tmp_path}: no episodes')
+    assert (code, line) == (2, f'view: {tmp_path} holds no episode')
 
 
 def test_a_file_of_a_task_that_is_not_installed(capsys, tmp_path):
