@@ -48,12 +48,13 @@ TEST = [
 
 setup(
     name=PACKAGE,
-    version='1.0.0',
+    version='1.1.0',
     description='The Fetch and Shadow hand tasks of Plappert et al. 2018 as ROS 2 nodes on MuJoCo',
-    long_description=Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
+    # Resolved: `colcon build --symlink-install` links this file alone.
+    long_description=Path(__file__).resolve().with_name('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     license='Apache-2.0',
-    license_files=['LICENSE'],
+    license_files=['LICENSE', 'NOTICE'],
     author='The fetch_hand_sim maintainers',
     project_urls={'Paper': 'https://arxiv.org/abs/1802.09464'},
     keywords=['robotics', 'reinforcement learning', 'mujoco', 'ros2', 'gymnasium', 'her', 'mcap'],
@@ -83,7 +84,7 @@ setup(
     exclude_package_data={'policy_node': ['actors/*.training.safetensors']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
-        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}', ['package.xml', 'LICENSE', 'NOTICE']),
         (f'share/{PACKAGE}/launch', glob('launch/*.launch.xml')),
         (f'share/{PACKAGE}/config', glob('config/*.*')),
     ],

@@ -66,6 +66,16 @@ class CommandParser(argparse.ArgumentParser):
         complain(self.prog, f'{message}{self._hint(message)}')
         sys.exit(EXIT_USAGE)
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Prints help and the like; that nobody reads them, argparse would swallow or trace."""
+
+        def write() -> int:
+            print(message, end='', file=file or sys.stderr)
+            return EXIT_SUCCESS
+
+        if code := _exit_code(self.prog, write, ()):
+            sys.exit(code)
+
     def _hint(self, message: str) -> str:
         unknown = re.match(r'unrecognized arguments: (--[\w-]+)', message)
         if unknown:

@@ -23,6 +23,7 @@ from msgs_spec.command_line import (
     heard,
     one_line,
     require_extra,
+    run_command,
 )
 from msgs_spec.last_resort import ends_within
 from msgs_spec.parameters import usage
@@ -105,9 +106,13 @@ def node_main(
     """
     given = sys.argv[1:] if args is None else args
     if '-h' in given or '--help' in given:
-        print(usage(name, summary))
-        return EXIT_SUCCESS
+        return run_command(name, lambda: _print_usage(name, summary))
     return run_node(name, lambda stop: _run(load, stop), args, shared_memory)
+
+
+def _print_usage(name: str, summary: str) -> int:
+    print(usage(name, summary))
+    return EXIT_SUCCESS
 
 
 def _run(load: Callable[[], Callable[[], RunnableNode]], stop: StopSignals) -> None:

@@ -12,7 +12,7 @@ sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' >/dev/null 2>&1
 }
 
 find_python() {
-    for candidate in ${PYTHON:-python3.14 python3.13 python3.12 python3.11 python3}; do
+    for candidate in ${PYTHON:-python3.12 python3.11 python3.13 python3.14 python3}; do
         if suitable "$candidate"; then
             echo "$candidate"
             return

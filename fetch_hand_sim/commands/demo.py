@@ -42,7 +42,7 @@ from msgs_spec.command_line import (
     run_command,
     whole_number,
 )
-from msgs_spec.node_main import StopSignals, destroy
+from msgs_spec.node_main import StopSignals, destroy, find_place_for_logs
 from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.ros import (
     DISCOVERY_TIME,
@@ -333,6 +333,7 @@ def _run(options: argparse.Namespace) -> int:
     import rclpy
 
     keep_discovery_local()
+    find_place_for_logs()
     os.environ.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
     stop = StopSignals()
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)

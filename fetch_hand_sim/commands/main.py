@@ -16,7 +16,13 @@ from typing import NoReturn
 import shtab
 
 from fetch_hand_sim.commands.executables import find_executable
-from msgs_spec.command_line import EXIT_USAGE, CommandParser, run_command, start_command
+from msgs_spec.command_line import (
+    EXIT_SUCCESS,
+    EXIT_USAGE,
+    CommandParser,
+    run_command,
+    start_command,
+)
 from msgs_spec.hints import did_you_mean
 
 _NAME = 'fetch_hand_sim'
@@ -76,11 +82,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     command, path, rest = _split(given)
     if command is None or command.commands:
-        # Help, the version, or an error: the parser says it and exits.
-        make_parser().parse_args(given if rest else [*path, '--help'])
-        return EXIT_USAGE
+        return run_command(_NAME, lambda: _explain(given if rest else [*path, '--help']))
     sys.argv = [command.executable or path[-1], *(ros_arguments(rest) if command.is_node else rest)]
     return run_command(_NAME, lambda: _start(command, path[-1]))
+
+
+def _explain(words: Sequence[str]) -> int:
+    """Help, the version, completion, or an error: the parser says it and exits."""
+    try:
+        make_parser().parse_args(words)
+    except SystemExit as end:
+        return int(end.code or EXIT_SUCCESS)
+    return EXIT_USAGE
 
 
 def _split(words: Sequence[str]) -> tuple[Command | None, list[str], list[str]]:

@@ -144,6 +144,27 @@ def test_a_full_output_is_one_line():
     assert process.wait(20) == 1
 
 
+@pytest.mark.parametrize(
+    'words',
+    [
+        ['fetch_hand_sim', '--print-completion', 'bash'],
+        ['fetch_hand_sim', '--version'],
+        ['fetch_hand_sim.commands.list_episodes', '--help'],
+        ['fetch_hand_sim.sim_node', '--help'],
+    ],
+)
+def test_help_that_nobody_reads_ends_as_every_command(words):
+    command = [sys.executable, '-m', *words]
+    for output, code, said in (('/dev/full', 1, 'cannot write: No space'), (None, 141, '')):
+        reader, writer = os.pipe() if output is None else (None, os.open(output, os.O_WRONLY))
+        if reader is not None:
+            os.close(reader)
+        process = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True)
+        os.close(writer)
+        assert process.returncode == code
+        assert said in process.stderr and process.stderr.count('\n') == bool(said)
+
+
 @pytest.mark.parametrize('closed', [1, 2])
 def test_a_command_without_stdout_or_stderr_does_its_work(closed, tmp_path):
     body = f'with progress("x", 1): print(1); print(2, file=sys.stderr)\nopen("{tmp_path}/x", "w")'

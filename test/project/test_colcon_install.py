@@ -142,6 +142,21 @@ def test_package_xml_and_setup_py_say_the_same(distribution):
     assert 'Apache License' in (ROOT / 'LICENSE').read_text()
 
 
+def test_the_licence_is_where_package_xml_says(prefix):
+    installed = prefix / 'share' / PACKAGE
+    licence = ElementTree.parse(installed / 'package.xml').getroot().find('license').get('file')
+    assert (installed / licence).read_bytes() == (ROOT / 'LICENSE').read_bytes()
+
+
+@pytest.mark.release
+def test_it_builds_with_links_to_the_sources_too(workspace, tmp_path):
+    """`colcon` then links setup.py into its build folder, and nothing beside it."""
+    shutil.copytree(workspace / 'src', tmp_path / 'src')
+    build = colcon(tmp_path, 'build', '--symlink-install')
+    assert build.returncode == 0, build.stdout + build.stderr
+    assert (tmp_path / 'install' / PACKAGE / 'lib' / PACKAGE / 'sim_node').is_file()
+
+
 def test_launch_files_name_installed_executables_and_files(prefix, executables):
     launch_files = list((prefix / 'share' / PACKAGE / 'launch').glob('*.launch.xml'))
     for path in launch_files:

@@ -123,6 +123,11 @@ def test_all_versions_are_one(metadata) -> None:
     citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
     versions = {metadata['Version'], parse_package(ROOT / 'package.xml').version}
     assert versions == {citation['version']}
+    news, *releases = (ROOT / 'CHANGELOG.md').read_text().split('\n## [')[1:]
+    (version,) = (tuple(map(int, each.split('.'))) for each in versions)
+    released = tuple(map(int, releases[0].partition(']')[0].split('.')))
+    assert news.startswith('Unreleased]'), 'where what comes next is written down'
+    assert version > released if '- ' in news else version == released
 
 
 def test_package_xml_is_valid() -> None:
