@@ -30,7 +30,12 @@ from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.runs.finite_checks import TrainingError
 from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.read_networks import read_initial_networks
-from policy_node.training.runs.run_folder import COMMAND_FILE, LOCK_FILE, STATE_FILE
+from policy_node.training.runs.run_folder import (
+    COMMAND_FILE,
+    LOCK_FILE,
+    STATE_FILE,
+    remove_former_run,
+)
 from policy_node.training.runs.run_log import Row, RunLog, draw_curve, read_progress
 from policy_node.training.runs.saving import NAME
 from policy_node.training.runs.trainer import Trainer
@@ -190,6 +195,8 @@ def _train(
             trainer.stop('stopped by on_cycle')
 
     if trainer.workers.is_first:
+        if not resume:
+            remove_former_run(output)
         # One line for each part; of a run that was killed before anything was saved there is none.
         with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
             file.write(command + '\n')

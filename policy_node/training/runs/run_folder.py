@@ -23,6 +23,7 @@ BEST_FILE = 'best.safetensors'
 REPLAY_FILE = 'replay.safetensors'
 LOCK_FILE = '.lock'
 COMMAND_FILE = 'command.txt'
+BOARD_FOLDER = 'tensorboard'
 
 
 def default_folder(config: TrainConfig) -> Path:
@@ -33,6 +34,22 @@ def default_folder(config: TrainConfig) -> Path:
 def companion_file(actor: Path) -> Path:
     """Where the critic of an actor lies, so that training can go on from it."""
     return actor.with_suffix('.training.safetensors')
+
+
+def remove_former_run(folder: Path) -> None:
+    """Removes what a run has left that was killed before its first checkpoint.
+
+    The run that begins in its folder would take its best actor for its own.
+
+    Raises:
+        OSError: If a file cannot be removed.
+    """
+    files = [folder / name for name in (BEST_FILE, LATEST_FILE, REPLAY_FILE)]
+    replays = folder.glob(f'*.{REPLAY_FILE}')
+    files += [file for file in replays if file.name.partition('.')[0].isdecimal()]
+    files += folder.glob(f'{BOARD_FOLDER}/events.out.tfevents.*')
+    for file in files:
+        file.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from rich.live import Live
 from rich.text import Text
 
 from msgs_spec.command_line import discard_unread_output
+from policy_node.training.runs.run_folder import BOARD_FOLDER
 
 COLUMNS = (
     'seconds',
@@ -186,7 +187,7 @@ def _tensorboard(output: Path, resumed_steps: int) -> Any:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         return None
-    return SummaryWriter(str(output / 'tensorboard'), purge_step=resumed_steps + 1)
+    return SummaryWriter(str(output / BOARD_FOLDER), purge_step=resumed_steps + 1)
 
 
 def read_progress(path: str | Path) -> list[dict[str, float]]:

@@ -71,8 +71,9 @@ class Saver:
     def keep_no_worse(self, counters: Counters) -> tuple[Actor, ActorInfo] | None:
         """Lets the best actor in the folder stay, which a killed run may have saved last.
 
-        Where it is gone or damaged, the next one that is evaluated takes its place: a run must not
-        end with a success that no file has. One without a measured return decides nothing.
+        Where it is gone, damaged or of another task, the next one that is evaluated takes its
+        place: a run must not end with a success that no file has. One without a measured return
+        decides nothing.
 
         Returns:
             The best actor where it was measured otherwise than this run measures, by another rule
@@ -84,7 +85,7 @@ class Saver:
                 raise ValueError(f'{file} is gone')
             if not file.is_file():
                 return None
-            actor, info = checkpoint.load(file)
+            actor, info = checkpoint.load(file, self._config.task)
         except ValueError as error:
             self._forget_best(counters, f'{error}; the best actor is looked for anew')
             return None

@@ -14,6 +14,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
+from policy_node.policies.shipped import shipped_actors
 from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.distributed import Workers
@@ -185,12 +186,12 @@ def test_a_log_that_is_none_does_not_stop_a_run(
     assert 'Traceback' not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('gone', [True, False])
+@pytest.mark.parametrize('there', [None, b'damaged', shipped_actors()['FetchPush'].read_bytes()])
 def test_a_best_actor_that_is_lost_is_looked_for_anew(
-    run: Path, gone: bool, capsys: pytest.CaptureFixture[str]
+    run: Path, there: bytes | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     change_state(run, counters={'best_success': 1.0, 'best_return': 0.0})
-    (run / BEST).unlink() if gone else (run / BEST).write_bytes(b'damaged')
+    (run / BEST).unlink() if there is None else (run / BEST).write_bytes(there)
     assert main(['--resume', str(run), '--steps', '1600']) == 0
     assert 'the best actor is looked for anew' in capsys.readouterr().err
     assert read_tensors(run / BEST)[1]['task'] == '"FetchReach"'
