@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from policy_node.policies import checkpoint
+from policy_node.policies.checkpoint import ActorInfo
 from policy_node.policies.shipped import actor_path
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_rules import unusual_networks
@@ -20,6 +21,9 @@ from policy_node.training.runs.mean_networks import mean_of
 from policy_node.training.runs.origins import steps_behind
 from policy_node.training.runs.run_folder import STATE_FILE, companion_file
 from policy_node.training.runs.training_state import part_of, read_state
+
+# What an actor and the critic beside it have in common.
+_SHARED = ('task', 'hidden_sizes', 'layer_norm', 'goal_features')
 
 
 def read_initial_networks(name: str) -> InitialNetworks:
@@ -93,6 +97,7 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
             raise ValueError(f'{source} is the critic of another actor than {path}')
         config = config_from_dict(state.extra['config'])
         _require_usual(config, str(source))
+        _require_critic_of(info, path, config, source)
         norm, valued_by = config.norm, _valued_by(config)
         critic = _unconditioned(part_of(state.tensors, 'critic'), config)
         tensors |= {f'critic.{key}': value for key, value in critic.items()}
@@ -106,6 +111,17 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         'init_from': info.init_from,
     }
     return InitialNetworks(tensors, info.shape, info.goal_features, norm, origin, valued_by)
+
+
+def _require_critic_of(info: ActorInfo, path: Path, config: TrainConfig, source: Path) -> None:
+    """Refuses a critic that was not trained with the actor it lies beside."""
+    for name in _SHARED:
+        of_actor, of_critic = getattr(info, name), getattr(config, name)
+        if of_actor != of_critic:
+            raise ValueError(
+                f'{source} is the critic of another actor than {path}: '
+                f'{name} {of_critic}, not {of_actor}'
+            )
 
 
 def _valued_by(config: TrainConfig) -> dict[str, Any]:

@@ -42,6 +42,7 @@ from policy_node.training.runs.run_log import RunLog
 from policy_node.training.runs.saving import NAME, Saver
 from policy_node.training.runs.training_state import (
     Counters,
+    fitting,
     load_networks,
     load_state,
     require_readable,
@@ -95,8 +96,9 @@ class Trainer:
         self._build_simulations()
         self._build_learner()
         if init_from is not None:
-            tensors = init_from.completed(self.learner)
-            load_networks(tensors, self.learner, self.experience.statistics)
+            with fitting(origin['name']):
+                tensors = init_from.completed(self.learner)
+                load_networks(tensors, self.learner, self.experience.statistics)
             self._let_critic_learn_first()
         self.counters = Counters()
         self._part_noise()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -195,17 +197,31 @@ def load_state(
         ValueError: If the file is no training state or its tensors do not fit.
     """
     state = read_state(path)
-    try:
+    with fitting(path):
         torch.set_rng_state(state.tensors['torch_generator'])
         load_networks(state.tensors, learner, statistics)
         for part, optimizer in learner.optimizers().items():
             _load_optimizer(optimizer, part_of(state.tensors, part))
         if state.counters.updates > 0 and not part_of(state.tensors, 'critic_optimizer'):
             raise ValueError('critic_optimizer is missing')
-    except (RuntimeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f'{path} does not fit this configuration: {_reason(error)}') from None
     learner.updates = state.counters.updates
     return state
+
+
+@contextmanager
+def fitting(source: object) -> Iterator[None]:
+    """What is raised where tensors are loaded becomes one line that says where they are from.
+
+    Args:
+        source: A file, or what networks are called.
+
+    Raises:
+        ValueError: If they do not fit.
+    """
+    try:
+        yield
+    except (RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f'{source} does not fit this configuration: {_reason(error)}') from None
 
 
 def _reason(error: Exception) -> str:

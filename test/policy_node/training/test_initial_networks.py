@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +15,7 @@ from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
 from policy_node.policies.loading import load_actor
 from policy_node.policies.shipped import shipped_actors
+from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.distributed import Workers
@@ -322,6 +324,43 @@ def test_where_it_started_is_kept_through_resume_and_shipped(
     shutil.copy(run / 'latest.safetensors', actors / 'HandManipulateBlockFull.safetensors')
     with pytest.raises(ValueError, match='is the critic of another actor'):
         read_initial_networks(str(actors / 'HandManipulateBlockFull.safetensors'))
+
+
+@pytest.mark.parametrize(
+    ('source', 'message'),
+    [
+        ({'task': 'FetchPush'}, 'task FetchPush, not HandManipulateBlockRotateXYZ'),
+        ({'hidden_sizes': [16, 16]}, r'hidden_sizes \(16, 16\), not \(32, 32\)'),
+        ({'layer_norm': True}, 'layer_norm True, not False'),
+        ({'goal_features': 'plain'}, 'goal_features plain, not relative'),
+    ],
+)
+def test_a_critic_beside_an_actor_is_that_actors(
+    tmp_path: Path, block_run: Path, source: dict[str, object], message: str
+) -> None:
+    """Critics of other tasks may be of the same sizes."""
+    run = shutil.copytree(block_run, tmp_path / 'run')
+    tensors, metadata = read_tensors(run / STATE_FILE)
+    extra = json.loads(metadata['extra'])
+    extra['config'] |= source
+    write_tensors(run / STATE_FILE, tensors, metadata | {'extra': json.dumps(extra)})
+    with pytest.raises(ValueError, match=f'is the critic of another actor than .*: {message}'):
+        read_initial_networks(str(run / 'best.safetensors'))
+
+
+def test_networks_whose_tensors_do_not_fit_are_one_line(
+    tmp_path: Path, block_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = shutil.copytree(block_run, tmp_path / 'run')
+    tensors, metadata = read_tensors(run / STATE_FILE)
+    name = 'critic.network.output.bias'
+    tensors = tensors | {name: np.zeros(2, np.float32)}
+    write_tensors(run / STATE_FILE, tensors, metadata)
+    arguments = ['--task', 'HandManipulateBlockRotateXYZ', *SET, '--init-from', str(run)]
+    assert main([*arguments, '--output', str(tmp_path / 'on')]) == 2
+    error = capsys.readouterr().err
+    assert f'{run} does not fit this configuration: ' in error and 'output.bias' in error
+    assert error.count('\n') == 1
 
 
 def test_normalisers_of_an_actor_go_on_from_what_it_has_seen(tmp_path: Path) -> None:
