@@ -50,7 +50,13 @@ from policy_node.training.benchmark.shared_runs import (
 from policy_node.training.benchmark.stored_runs import StoredRuns
 from policy_node.training.benchmark.studies import PAPER, best_jobs, paper_jobs, reduced_budget
 from policy_node.training.benchmark.study import FINAL_EPISODES, Study, research_jobs
-from policy_node.training.benchmark.workers import Processes, Ray, ThisProcess, run_jobs
+from policy_node.training.benchmark.workers import (
+    JobsStopped,
+    Processes,
+    Ray,
+    ThisProcess,
+    run_jobs,
+)
 from policy_node.training.configuration.config_rules import FROM_NOTHING
 from policy_node.training.configuration.config_values import parse_assignment
 
@@ -216,8 +222,12 @@ def _run(options: argparse.Namespace, command: str) -> int:
     require_readable(finished)
     try:
         whole = _run_where_asked(options, jobs, command)
+    except JobsStopped as stopped:
+        return stopped.exit_code
     finally:
-        shipped = _report(options, jobs, command)
+        finished = _report(options, jobs, command)
+    # Not where jobs were stopped: that would be thousands of episodes before the command ends.
+    shipped = options.study != 'best' or _ship(options, finished)
     return EXIT_SUCCESS if whole and shipped else EXIT_FAILURE
 
 
@@ -273,18 +283,22 @@ def _report_finished(options: argparse.Namespace, jobs: Sequence[Job], command: 
     return finished
 
 
-def _report(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> bool:
-    """Draws, prints and ships what is finished, says what is not; whether nothing failed."""
-    finished, whole = _report_finished(options, jobs, command), True
-    if options.study == 'best':
-        actors = options.actors or _output(options) / 'actors'
-        whole = ship_all(finished, actors, options.episodes or 2000)
-        if whole and actors.is_dir():
-            table = _report_folder(options) / ACTORS_TABLE
-            try:
-                write_file(table, f'{actors_table(actors)}\n'.encode())
-            except (OSError, ValueError) as error:
-                raise CommandError(f'no {table}: {error}') from None
+def _report(options: argparse.Namespace, jobs: Sequence[Job], command: str) -> list[Job]:
+    """Draws and prints what is finished, which it returns, and says how much is not."""
+    finished = _report_finished(options, jobs, command)
     if len(finished) < len(jobs):
         print(f'{len(finished)} of {len(jobs)} jobs are finished; the same command goes on')
+    return finished
+
+
+def _ship(options: argparse.Namespace, finished: Sequence[Job]) -> bool:
+    """Evaluates and ships the best actors of finished jobs; whether nothing failed."""
+    actors = options.actors or _output(options) / 'actors'
+    whole = ship_all(finished, actors, options.episodes or 2000)
+    if whole and actors.is_dir():
+        table = _report_folder(options) / ACTORS_TABLE
+        try:
+            write_file(table, f'{actors_table(actors)}\n'.encode())
+        except (OSError, ValueError) as error:
+            raise CommandError(f'no {table}: {error}') from None
     return whole

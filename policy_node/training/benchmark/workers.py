@@ -36,12 +36,40 @@ _STATUS_SECONDS = 600.0
 
 
 class Outcome(Enum):
-    """What became of a job."""
+    """What became of a job; the value is the exit status of its process."""
 
     FINISHED = EXIT_SUCCESS
     FAILED = EXIT_FAILURE
-    STOPPED = 3
     TAKEN = 4
+    # Stopped by a signal, as shells say it.
+    HUNG_UP = 128 + signal.SIGHUP
+    INTERRUPTED = 128 + signal.SIGINT
+    TERMINATED = 128 + signal.SIGTERM
+
+    @classmethod
+    def stopped_by(cls, number: int) -> Outcome:
+        """Returns what became of a job that this signal stopped."""
+        return cls(128 + number)
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether a signal stopped it."""
+        return self.value > 128
+
+
+class JobsStopped(KeyboardInterrupt):
+    """A signal stopped jobs.
+
+    Args:
+        outcome: What became of the first.
+
+    Attributes:
+        exit_code: With which the command ends.
+    """
+
+    def __init__(self, outcome: Outcome) -> None:
+        super().__init__()
+        self.exit_code: int = outcome.value
 
 
 class Place(Protocol):
@@ -70,11 +98,12 @@ def run_jobs(
         when_finished: Called after each job that finished.
 
     Raises:
-        KeyboardInterrupt: If a signal stopped a job; nothing else is started then.
+        JobsStopped: If a signal stopped a job; nothing else is started then.
     """
     waiting = [job for job in jobs if not job.is_finished]
     numbers = {job.name: number for number, job in enumerate(jobs, 1)}
-    running, stopped, whole = 0, False, True
+    running, whole = 0, True
+    stopped: Outcome | None = None
     while True:
         for job in [job for job in waiting if job.is_ready and not stopped]:
             if running < place.limit:
@@ -87,14 +116,14 @@ def run_jobs(
         job, outcome = place.wait()
         running -= 1
         whole &= outcome is Outcome.FINISHED
-        stopped |= outcome is Outcome.STOPPED
+        stopped = stopped or (outcome if outcome.is_stopped else None)
         if outcome is Outcome.FINISHED:
             left = sum(not other.is_finished for other in jobs)
             _tell(f'{job.name} is finished; {left} to go')
             if when_finished is not None:
                 _report(when_finished)
     if stopped:
-        raise KeyboardInterrupt
+        raise JobsStopped(stopped)
     return whole and not waiting
 
 
@@ -127,7 +156,7 @@ def attempt(job: Job, command: str) -> Outcome:
             resume = job.has_checkpoint
             ending = train_run(job.config, job.folder, resume=resume, command=command)
             if ending.signal:
-                return Outcome.STOPPED
+                return Outcome.stopped_by(ending.signal)
             if not job.is_trained:
                 raise CommandError(f'it ended before its steps were done: {ending.reason}')
         with lock_run(job.folder):
@@ -191,7 +220,7 @@ class Processes:
         self.limit = limit
         self._command = command
         self._running: dict[int, tuple[Job, BaseProcess]] = {}
-        self._stopping = False
+        self._stopped_by = 0
         self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -209,11 +238,11 @@ class Processes:
             signal.signal(number, handler)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
-        del number, frame
-        if not self._stopping:
+        del frame
+        if not self._stopped_by:
             text = 'stopping; jobs finish their cycle and keep their state'
             complain_from_handler('benchmark', text)
-            self._stopping = True
+            self._stopped_by = number
             for _, process in self._running.values():
                 process.terminate()
 
@@ -223,7 +252,7 @@ class Processes:
         process = context.Process(target=_work, args=(job, self._command))
         process.start()
         self._running[process.sentinel] = job, process
-        if self._stopping:
+        if self._stopped_by:
             process.terminate()
 
     def wait(self) -> tuple[Job, Outcome]:
@@ -237,8 +266,11 @@ class Processes:
         process.join()
         # By the signal itself where it came before the trainer listened.
         codes = {outcome.value: outcome for outcome in Outcome}
-        codes[-signal.SIGTERM] = Outcome.STOPPED
+        codes[-signal.SIGTERM] = Outcome.TERMINATED
         outcome = codes.get(process.exitcode or 0, Outcome.FAILED)
+        if outcome.is_stopped and self._stopped_by:
+            # Whatever came here went on as SIGTERM.
+            outcome = Outcome.stopped_by(self._stopped_by)
         if outcome is Outcome.FAILED:
             complain('benchmark', f'{job.name} failed; see {job.folder / LOG_FILE}')
         elif outcome is Outcome.TAKEN:

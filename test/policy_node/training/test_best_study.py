@@ -16,12 +16,14 @@ import torch
 
 from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
+from policy_node.training.benchmark import command, workers
 from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.studies import BEST_ORDER, STARTS_FROM, start_from
 from policy_node.training.benchmark.workers import LOG_FILE, Outcome, run_jobs
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.runs.origins import steps_behind
+from policy_node.training.runs.run import Ending
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import Counters, TrainingState, write_state
 
@@ -133,6 +135,37 @@ def test_a_report_that_cannot_be_written_ends_no_job(
     assert "benchmark: no report yet: [Errno 28] No space left on device: 'runs.csv'" in (
         capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_who_stops_jobs_does_not_wait_for_actors_to_be_evaluated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    shipped: list[object] = []
+    ending = Ending('stopped', Counters(), number)
+    monkeypatch.setattr(workers, 'train_run', lambda *_, **__: ending)
+    monkeypatch.setattr(command, 'ship_all', lambda *given: bool(shipped.append(given)))
+    arguments = [*TINY, '--tasks', 'FetchReach', '--jobs', '1', '--output', str(tmp_path)]
+    assert main(arguments) == 128 + number
+    assert shipped == []
+
+
+def test_processes_end_by_the_signal_that_came_though_all_get_sigterm(tmp_path: Path) -> None:
+    class Ended:
+        exitcode = 128 + signal.SIGTERM
+
+        def terminate(self) -> None:
+            os.close(writer)
+
+        def join(self) -> None: ...
+
+    (job,) = jobs_of('--tasks', 'FetchReach', '--output', str(tmp_path))
+    (reader, writer), place = os.pipe(), workers.Processes(1, '')
+    with place:
+        place._running[reader] = job, Ended()  # type: ignore[assignment]
+        os.kill(os.getpid(), signal.SIGINT)
+        assert place.wait() == (job, Outcome.INTERRUPTED)
+    os.close(reader)
 
 
 # Nine processes that load torch: on a busy machine that takes its time.
