@@ -7,6 +7,8 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from msgs_spec.hints import did_you_mean
 from policy_node.training.configuration.config import TrainConfig
 
@@ -82,12 +84,18 @@ def typed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _typed(name: str, value: Any, kind: Any) -> Any:
-    """A value from JSON as its field has it."""
+    """A value from JSON or Python as its field has it; scalars of NumPy count as those they are."""
     if isinstance(kind, types.GenericAlias):
-        fits = isinstance(value, list | tuple) and all(type(part) is int for part in value)
-        value = tuple(value) if fits else value
+        is_list = isinstance(value, list | tuple)
+        value = tuple(map(_plain, value)) if is_list else value
+        fits = is_list and all(type(part) is int for part in value)
     else:
+        value = _plain(value)
         fits = type(value) is kind or (kind is float and type(value) is int)
     if not fits:
         raise ValueError(f'{name} {value!r} is not of type {getattr(kind, "__name__", kind)}')
     return value
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value

@@ -8,6 +8,7 @@ import os
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from msgs_spec.command_line import CommandParser
@@ -22,7 +23,11 @@ from policy_node.training.configuration.config_options import (
     given_fields,
 )
 from policy_node.training.configuration.config_rules import FROM_NOTHING
-from policy_node.training.configuration.config_values import config_from_dict, parse_assignment
+from policy_node.training.configuration.config_values import (
+    config_from_dict,
+    parse_assignment,
+    typed_fields,
+)
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.threads import split_threads
 from policy_node.training.train_her import config_from_arguments, parse_arguments
@@ -95,6 +100,22 @@ def test_what_a_study_switches_is_on_the_page_with_a_request() -> None:
 )
 def test_assignments_take_the_type_of_the_field(text: str, expected: tuple[str, object]) -> None:
     assert parse_assignment(text) == expected
+
+
+def test_scalars_of_numpy_are_values_of_python() -> None:
+    """Those of `np.linspace`, and of what was read from a file."""
+    given = {
+        'gamma': np.float64(0.9),
+        'total_steps': np.int64(400),
+        'overlap': np.bool_(False),
+        'hidden_sizes': [16, np.int64(16)],
+    }
+    found = typed_fields(given)
+    assert found == {'gamma': 0.9, 'total_steps': 400, 'overlap': False, 'hidden_sizes': (16, 16)}
+    parts = [*found.values(), *found['hidden_sizes']]
+    assert not [part for part in parts if isinstance(part, np.generic)]
+    with pytest.raises(ValueError, match=r'total_steps 400\.0 is not of type int'):
+        typed_fields({'total_steps': np.float64(400)})
 
 
 @pytest.mark.parametrize(
