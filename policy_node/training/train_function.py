@@ -94,20 +94,24 @@ def train(
         KeyboardInterrupt: After Ctrl-C.
         SystemExit: After SIGTERM or SIGHUP, with code 143 or 129.
     """
+    fields = typed_fields(fields)
     if resume:
         if output is None:
             raise ValueError('resume=True needs output, the folder of the run to go on with')
         folder = Path(output).expanduser()
-        config = resumed_config(folder, task, recipe, typed_fields(fields))
+        config = resumed_config(folder, task, recipe, fields)
     else:
-        config = recipe_config(task, recipe or 'best', **typed_fields(fields))
+        config = recipe_config(task, recipe or 'best', **fields)
         folder = Path(output or default_folder(config)).expanduser()
         if (folder / STATE_FILE).is_file():
             raise ValueError(
                 f'{folder} holds a run: resume=True goes on with it, or choose another'
             )
+    given: dict[str, Any] = {'recipe': recipe} if recipe else {}
+    given |= {'resume': True} if resume else {}
+    command = _command(task, folder, given | fields)
     with _PROGRAM:
-        ending = _ending(config, folder, resume, Caller(on_cycle, quiet))
+        ending = _ending(config, folder, resume, command, Caller(on_cycle, quiet))
     if ending.signal == signal.SIGINT:
         raise KeyboardInterrupt(ending.reason)
     if ending.signal:
@@ -118,9 +122,16 @@ def train(
     )
 
 
-def _ending(config: TrainConfig, folder: Path, resume: bool, caller: Caller) -> Ending:
+def _command(task: str, folder: Path, given: dict[str, Any]) -> str:
+    """The call in one line, for the record."""
+    named = [f'{name}={value!r}' for name, value in given.items()]
+    return f'policy_node.training.train({", ".join([repr(task), repr(str(folder)), *named])})'
+
+
+def _ending(
+    config: TrainConfig, folder: Path, resume: bool, command: str, caller: Caller
+) -> Ending:
     """Runs it; what commands say in one line are errors as Python has them."""
-    command = f'policy_node.training.train({config.task!r}, {str(folder)!r})'
     try:
         return train_run(config, folder, resume=resume, command=command, caller=caller)
     except UsageError as error:

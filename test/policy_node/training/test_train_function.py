@@ -35,6 +35,18 @@ def test_a_run_leaves_an_actor_and_its_curve(tmp_path, capfd):
     assert capfd.readouterr() == ('', '')
 
 
+def test_the_record_says_all_that_was_given(tmp_path):
+    fields = {name: value for name, value in SMALL.items() if name != 'quiet'}
+    train('FetchReach', tmp_path, recipe='best', total_steps=400, goals='future=.8', **SMALL)
+    train('FetchReach', tmp_path, resume=True, gamma=np.float64(0.9), total_steps=400, quiet=True)
+    named = {'recipe': 'best', 'total_steps': 400, 'goals': 'future=.8', **fields}
+    first = ''.join(f', {name}={value!r}' for name, value in named.items())
+    assert (tmp_path / 'command.txt').read_text().splitlines() == [
+        f"policy_node.training.train('FetchReach', {str(tmp_path)!r}{rest})"
+        for rest in (first, ', resume=True, gamma=0.9, total_steps=400')
+    ]
+
+
 def test_it_trains_what_the_command_trains(tmp_path):
     """To the same bits: the function is no second trainer."""
     run = train('FetchReach', tmp_path / 'function', total_steps=800, overlap=False, **SMALL)
