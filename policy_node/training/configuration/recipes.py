@@ -14,7 +14,7 @@ STEP_COUNTS = ('total_steps', 'evaluate_every')
 # Who sets one of these at another rate than 25 Hz decides what happens there.
 _DECIDE_AT_RATES = (
     'algorithm discount n_step noise_seconds parameter_noise longest_hold advantage condition '
-    'importance subgoal_every'
+    'importance subgoal_every goal_choice temporal_smoothness'
 ).split()
 
 # Who sets one of these does without imagined subgoals, which exclude other values of them.

@@ -312,6 +312,16 @@ def test_the_best_recipe_counts_time_as_time_at_high_rates() -> None:
     assert (paper.n_step, paper.total_steps) == (1, recipe_config('FetchPush', 'paper').total_steps)
 
 
+@pytest.mark.parametrize(
+    'changes', [{'goal_choice': 'bellman', 'critics': 2}, {'temporal_smoothness': 1.0}]
+)
+def test_the_best_recipe_adds_no_longer_returns_to_what_is_of_one_tick(
+    changes: dict[str, object],
+) -> None:
+    config = recipe_config('FetchPush', 'best', control_hz=250.0, **changes)
+    assert (config.discount, config.noise_seconds, config.n_step) == ('tick', 0.0, 1)
+
+
 @pytest.mark.parametrize('control_hz', [0.0, -25.0, float('nan'), float('inf'), 60.0])
 def test_the_best_recipe_refuses_a_rate_that_there_is_not(control_hz: float) -> None:
     assert_refused('control_hz', control_hz=control_hz)
