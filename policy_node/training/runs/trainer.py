@@ -155,7 +155,10 @@ class Trainer:
             ValueError: If the file does not fit the configuration.
         """
         state = load_state(path, self.learner, self.experience.statistics)
-        self.counters = state.counters
+        self.counters = counters = state.counters
+        # Sooner where evaluations come more often from now on; else it is due before that anyway.
+        soonest = counters.env_steps + self.config.evaluate_every
+        counters.next_evaluation = min(counters.next_evaluation, soonest)
         self._part_noise()
         self._narrowing.resume(self.counters)
         origin = state.extra.get('init_from', {})

@@ -234,6 +234,16 @@ def test_the_last_evaluation_is_of_the_last_actor(
     assert len(evaluated) == sum('eval_success' in row for row in log.rows) == 5 - overlap
 
 
+def test_a_run_that_goes_on_is_evaluated_as_often_as_it_now_should(tmp_path: Path) -> None:
+    trainer = Trainer(small(), tmp_path, Workers())
+    trainer.counters.env_steps, trainer.counters.next_evaluation = 4_000, 4_800
+    trainer.save()
+    for evaluate_every, due in ((400, 4_400), (1_000, 4_800), (100_000, 4_800)):
+        trainer = Trainer(small(evaluate_every=evaluate_every), tmp_path, Workers())
+        trainer.resume(tmp_path / STATE)
+        assert trainer.counters.next_evaluation == due
+
+
 def test_a_run_that_is_stopped_does_not_wait_for_an_evaluation(tmp_path: Path) -> None:
     trainer = Trainer(small(total_steps=2_000, evaluate_every=100_000), tmp_path, Workers())
     log = StopAfter(trainer, 3)
