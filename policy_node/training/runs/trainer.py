@@ -213,8 +213,10 @@ class Trainer:
             TrainingError: If a loss, a weight or an observation is not finite; the checkpoints
                 written before are left as they are.
         """
-        if self.counters.env_steps >= self.config.total_steps:
-            return f'{self.config.total_steps:,} environment steps were done before'
+        ended = self._ended()
+        if self.workers.any(ended is not None):
+            field, reason = ended or ('configuration', 'another worker had ended')
+            return f'{reason} before; give another {field} to go on'
         clock = RunClock(self.counters)
         with _collecting_thread() as executor:
             submit = executor.submit if self.config.overlap else _run_now
@@ -228,16 +230,15 @@ class Trainer:
                 job = None
                 if self.config.overlap:
                     # At the end the actor after this cycle is evaluated, not the one before it.
-                    job = submit(
-                        self._collect, *self._prepare_collection(may_evaluate=not self._limit())
-                    )
+                    is_last = self._ended() is not None
+                    job = submit(self._collect, *self._prepare_collection(may_evaluate=not is_last))
                 losses = self._learn()
                 if job is None:
                     job = submit(self._collect, *self._prepare_collection())
                 collected = self._collect_or_explain(job)
                 clock.write(self.counters)
                 knows = self.counters.updates > 0 or bool(self.config.init_from)
-                if collected.evaluation is None and knows and self._limit():
+                if collected.evaluation is None and knows and self._ended():
                     # Noise and learning rate have fallen, and nothing else would measure it.
                     last = self._actor_to_evaluate()
                     collected = submit(self._evaluate, collected, last).result()
@@ -339,20 +340,20 @@ class Trainer:
         if outcomes is not None and actor is not None and self._evaluator.is_complete(outcomes):
             self._saver.keep_best(outcomes, actor, self.counters)
 
-    def _limit(self) -> str:
-        """Which of its own limits the run has reached; empty if none."""
+    def _ended(self) -> tuple[str, str] | None:
+        """The field by which the run is over, and why in words; None if it is not."""
         config, counters = self.config, self.counters
+        if 0 < config.success_target <= counters.best_success:
+            return 'success_target', f'success target {config.success_target:g} reached'
         if counters.env_steps >= config.total_steps:
-            return f'{config.total_steps:,} environment steps done'
+            return 'total_steps', f'{config.total_steps:,} environment steps done'
         if 0 < config.time_limit <= counters.seconds:
-            return f'time limit of {config.time_limit:g} s reached'
-        return ''
+            return 'time_limit', f'time limit of {config.time_limit:g} s reached'
+        return None
 
     def _reason_to_stop(self) -> str:
-        target, reason = self.config.success_target, self._stop_reason
-        if not reason and 0 < target <= self.counters.best_success:
-            reason = f'success target {target:g} reached'
-        reason = reason or self._limit()
+        _, ended = self._ended() or ('', '')
+        reason = self._stop_reason or ended
         return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
 
     def save(self) -> None:

@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import pty
+import shutil
 import signal
 import subprocess
 import sys
@@ -197,10 +198,32 @@ def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(
     assert main(['--task', 'FetchReach', *SET, '--steps', '1200', '--output', str(run)]) == 0
     before = (run / STATE).read_bytes()
     assert main(['--resume', str(run)]) == 0
-    assert '1,200 environment steps were done before' in capsys.readouterr().out
+    assert (
+        '1,200 environment steps done before; give another total_steps' in capsys.readouterr().out
+    )
     assert (run / STATE).read_bytes() == before
     assert main(['--resume', str(run), '--steps', '2000']) == 0
     assert [row['updates'] for row in read_progress(run / 'progress.csv')] == [4, 8, 12, 16, 20]
+
+
+@pytest.mark.parametrize(
+    ('limit', 'message'),
+    [
+        ({'time_limit': 5.0}, 'time limit of 5 s reached before; give another time_limit to go on'),
+        ({'success_target': 0.5}, 'success target 0.5 reached before; give another success_target'),
+    ],
+)
+def test_a_run_that_its_limits_ended_is_not_trained_any_further(
+    tmp_path: Path, limit: dict[str, object], message: str
+) -> None:
+    trainer = Trainer(small(**limit), tmp_path, Workers())
+    trainer.counters.seconds, trainer.counters.best_success = 5.0, 0.5
+    trainer.save()
+    shutil.copy(tmp_path / 'latest.safetensors', tmp_path / 'best.safetensors')
+    again = Trainer(small(**limit), tmp_path, Workers())
+    again.resume(tmp_path / STATE)
+    assert again.train().startswith(message)
+    assert again.counters.env_steps == 0
 
 
 def test_the_actor_that_a_run_ends_with_is_evaluated(tmp_path: Path) -> None:
