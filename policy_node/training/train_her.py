@@ -20,9 +20,12 @@ from msgs_spec.command_line import (
 )
 from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.config_options import add_field_options, given_fields
+from policy_node.training.configuration.config_options import (
+    add_field_options,
+    given_fields,
+    with_assignments,
+)
 from policy_node.training.configuration.config_rules import RECIPES
-from policy_node.training.configuration.config_values import parse_assignment
 from policy_node.training.configuration.recipes import recipe_config
 
 if TYPE_CHECKING:
@@ -46,7 +49,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add('--task', choices=list(TASKS), metavar='TASK', help=', '.join(TASKS))
     add('--recipe', choices=RECIPES, help='default: best')
-    add('--her', action=argparse.BooleanOptionalAction, default=True, help='hindsight on or off')
+    add('--her', action=argparse.BooleanOptionalAction, help='hindsight on or off; default: on')
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='a field by its name')
     add('--output', type=Path, help='default: runs/<task>_<recipe>_seed<seed>')
     add('--resume', type=Path, help='folder of a run to continue; its configuration is kept')
@@ -61,12 +64,19 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
     Raises:
         ValueError: If something is missing, unknown or not allowed.
     """
-    overrides = given_fields(options, _OWN_OPTIONS)
-    overrides.update(parse_assignment(text) for text in options.set)
-    if not options.her:
+    overrides = with_assignments(given_fields(options, _OWN_OPTIONS), options.set)
+    if options.her is False:
         if overrides.get('strategy', 'none') != 'none':
             raise ValueError(f'--no-her excludes --strategy {overrides["strategy"]}')
         overrides['strategy'] = 'none'
+    config = _configured(options, overrides)
+    if options.her and config.strategy == 'none':
+        raise ValueError('--her excludes strategy none: give another --strategy')
+    return config
+
+
+def _configured(options: argparse.Namespace, overrides: dict[str, Any]) -> TrainConfig:
+    """The recipe, or the run that goes on, with fields replaced."""
     task, recipe = (_own_option(options, overrides, name) for name in _OWN_OPTIONS)
     if options.resume is not None:
         if options.output is not None:

@@ -57,8 +57,8 @@ from policy_node.training.benchmark.workers import (
     ThisProcess,
     run_jobs,
 )
+from policy_node.training.configuration.config_options import with_assignments
 from policy_node.training.configuration.config_rules import FROM_NOTHING
-from policy_node.training.configuration.config_values import parse_assignment
 
 _NAME = 'benchmark'
 ACTORS_TABLE = 'actors.md'
@@ -133,8 +133,8 @@ def _overrides(options: argparse.Namespace) -> dict[str, Any]:
         'simulation_threads': options.threads,
         'torch_threads': options.torch_threads,
     }
-    overrides = {name: value for name, value in chosen.items() if value is not None}
-    overrides.update(parse_assignment(text) for text in options.set)
+    given = {name: value for name, value in chosen.items() if value is not None}
+    overrides = with_assignments(given, options.set)
     decided: tuple[str, ...] = ('task', 'recipe', 'seed', 'init_from')
     if (study := _study(options)) is not None:
         decided = (*decided, *(name for arm in study.arms for name in arm.own))

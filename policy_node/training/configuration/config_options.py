@@ -7,12 +7,13 @@ import ast
 import inspect
 import itertools
 import typing
+from collections.abc import Iterable
 from typing import Any
 
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_fields import ConfigFields
 from policy_node.training.configuration.config_rules import CHOICES
-from policy_node.training.configuration.config_values import parse_value
+from policy_node.training.configuration.config_values import parse_assignment, parse_value
 
 # Former and shorter names.
 _OTHER_NAMES = {
@@ -51,6 +52,24 @@ def given_fields(options: argparse.Namespace, without: tuple[str, ...]) -> dict[
     fields = typing.get_type_hints(TrainConfig).keys() - set(without)
     given = vars(options).items()
     return {name: value for name, value in given if name in fields and value is not None}
+
+
+def with_assignments(given: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
+    """Fields that a command line has options for, and those of its `--set`.
+
+    Args:
+        given: The former.
+        assignments: The latter, `name=value`; the last one of a field counts.
+
+    Raises:
+        ValueError: If an assignment is none, or says something else than the option of its field.
+    """
+    assigned = dict(parse_assignment(text) for text in assignments)
+    for name, value in assigned.items():
+        if given.get(name, value) != value:
+            option = f'--{name.replace("_", "-")} {given[name]}'
+            raise ValueError(f'{option} excludes --set {name}={value}')
+    return {**given, **assigned}
 
 
 def field_docstrings(kind: type) -> dict[str, str]:

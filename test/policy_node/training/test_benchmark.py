@@ -302,6 +302,10 @@ def test_another_budget_in_the_same_folder_is_refused(
         (['--set', 'strategy=none'], '--set strategy=none is not possible: choose --arms'),
         (['--seeds', '-1'], 'seed -1; allowed: 0 ... '),
         (['--steps', '0'], 'total_steps 0; allowed: 1 ... '),
+        (
+            ['--steps', '9', '--set', 'total_steps=8'],
+            '--total-steps 9 excludes --set total_steps=8',
+        ),
         (['--study', 'best', '--arms', 'her_sparse'], '--arms does not belong to --study best'),
         (['--study', 'best', '--full'], '--full belongs to --study paper'),
         (['--episodes', '10'], '--episodes does not belong to --study paper without --page'),

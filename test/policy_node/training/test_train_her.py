@@ -541,6 +541,14 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
         (['--task', 'FetchReach', '--no-her', '--strategy', 'final'], '--no-her excludes'),
         (['--task', 'FetchReach', '--no-her', '--set', 'strategy=final'], '--no-her excludes'),
         (
+            [*'--task FetchReach --steps 1 --her --set strategy=none'.split()],
+            '--her excludes strategy none: give another --strategy',
+        ),
+        (
+            [*'--task FetchReach --steps 1 --set gamma=.9 --gamma .95'.split()],
+            '--gamma 0.95 excludes --set gamma=0.9',
+        ),
+        (
             [*'--task FetchReach --replay-transitions 1000 --learning-starts 1001'.split()],
             'learning_starts needs replay_transitions of 1001 or more',
         ),
@@ -571,6 +579,7 @@ def test_bad_usage_is_one_line_and_exit_status_2(
         (['--task', 'FetchSlide'], 'is a run of FetchReach, not of FetchSlide'),
         (['--set', 'task=FetchSlide'], 'is a run of FetchReach, not of FetchSlide'),
         (['--recipe', 'paper'], 'is a run of best, not of paper'),
+        (['--her'], '--her excludes strategy none: give another --strategy'),
         (['--output', 'elsewhere'], '--output excludes --resume: the run goes on in '),
         (['--set', 'init_from=FetchReach'], "networks of init_from '', which stay; not 'FetchR"),
         (['--quantiles', '5'], 'has networks of quantiles 1, which stay; not 5'),
@@ -581,7 +590,7 @@ def test_bad_usage_is_one_line_and_exit_status_2(
 def test_what_a_run_that_goes_on_cannot_change(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    Trainer(small_config(), tmp_path, Workers()).save()
+    Trainer(small_config(strategy='none'), tmp_path, Workers()).save()
     assert main(['--resume', str(tmp_path), *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1
