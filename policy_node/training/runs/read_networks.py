@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ def read_initial_networks(name: str) -> InitialNetworks:
     Raises:
         ValueError: If there is no such actor or run, a file is damaged, or several do not fit.
     """
-    path = Path(name)
+    path = Path(os.path.expanduser(name))
     if path.is_dir():
         return _of_run(path)
     if ',' in name and not path.exists():

@@ -326,6 +326,13 @@ def test_where_it_started_is_kept_through_resume_and_shipped(
         read_initial_networks(str(actors / 'HandManipulateBlockFull.safetensors'))
 
 
+def test_a_run_in_the_home_directory_is_found_there(
+    block_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv('HOME', str(block_run.parent))
+    assert read_initial_networks(f'~/{block_run.name}').origin['name'] == str(block_run)
+
+
 @pytest.mark.parametrize(
     ('source', 'message'),
     [
