@@ -34,6 +34,7 @@ from policy_node.training.evaluation.episodes import (
 )
 from policy_node.training.evaluation.table import print_table
 from policy_node.training.policy_options import (
+    CheckedPolicy,
     add_batch_options,
     add_policy_options,
     add_reward_options,
@@ -82,7 +83,7 @@ def _run(options: argparse.Namespace) -> int:
     for file in (options.json, options.csv):
         if file not in (None, _STDOUT):
             require_writable(file)
-    outcomes, code = _evaluate(options, simulation, loaded.policy)
+    outcomes, code = _evaluate(options, simulation, CheckedPolicy(loaded))
     report = {
         'policy': options.policy or loaded.task,
         'task': loaded.task,

@@ -5,12 +5,30 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.command_line import FormerOption, UsageError, complain, whole_number
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES, TASKS
+from fetch_hand_sim.simulation.arguments import finite_numbers
+from msgs_spec.command_line import (
+    CommandError,
+    FormerOption,
+    UsageError,
+    complain,
+    one_line,
+    whole_number,
+)
+from msgs_spec.tasks import (
+    DEFAULT_CONTROL_HZ,
+    REWARD_TYPES,
+    SUCCESS_RULES,
+    TASKS,
+    task_spec,
+)
 from policy_node.policies.loading import POLICY_NAMES, load_policy
-from policy_node.policies.policy import LoadedPolicy
+from policy_node.policies.policy import LoadedPolicy, Observation
 
 
 def add_policy_options(parser: argparse.ArgumentParser, former: str | None = None) -> None:
@@ -65,6 +83,42 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
         return load_policy(name, options.task, trust=options.trust)
     except ValueError as error:
         raise UsageError(str(error)) from None
+
+
+class CheckedPolicy:
+    """A policy of which a command says in one line that it fails, or what it answered.
+
+    When it was loaded it answered one observation; code of somebody's own may fail at a later one.
+
+    Args:
+        loaded: The policy.
+    """
+
+    def __init__(self, loaded: LoadedPolicy) -> None:
+        self._loaded = loaded
+        self._size = task_spec(loaded.task).robot.action_size
+
+    def predict(
+        self, observation: Observation, *, deterministic: bool = True
+    ) -> tuple[NDArray[Any], Any]:
+        """Asks the policy about a batch.
+
+        Raises:
+            CommandError: If it fails, or answers with something else than an action for each.
+        """
+        try:
+            answer, state = self._loaded.policy.predict(observation, deterministic=deterministic)
+            shape = len(np.asarray(observation['observation'])), self._size
+            actions = finite_numbers('actions', answer, shape, self._loaded.task)
+            if (np.abs(actions) > 1.0).any():
+                raise ValueError(f'actions lie in [-1, 1], not at {np.abs(actions).max():g}')
+        except Exception as error:
+            # Libraries raise types of their own.
+            kind = '' if isinstance(error, ValueError) else f'{type(error).__name__}: '
+            raise CommandError(
+                f'{self._loaded.description} fails: {kind}{one_line(error)}'
+            ) from None
+        return actions, state
 
 
 def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:

@@ -56,6 +56,22 @@ class Odd(Model):
     control_hz = 'often'
 
 
+def late(answer):
+    class Late(Model):
+        calls = 0
+
+        def predict(self, observation, **rest):
+            self.calls += 1
+            good, _ = super().predict(observation)
+            return good if self.calls < 30 else answer(good), None
+
+    return Late
+
+
+nan = late(lambda good: good * np.nan)
+outside = late(lambda good: good * 6)
+short = late(lambda good: good[:, :3])
+stops = late(lambda good: good / (1 // 0))
 nothing = 5
 number = lambda task: 7
 """
@@ -130,3 +146,21 @@ def test_a_function_is_evaluated_as_any_policy(
     words = ['--policy', f'{module}:function', '--task', 'FetchReach', '--trust']
     assert evaluate([*words, '--episodes', '8', '--num-envs', '8', '--threads', '1']) == 0
     assert f'{module}:function' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ('function', 'line'),
+    [
+        ('nan', 'actions must be finite; actions[0, 0] is nan'),
+        ('outside', 'actions lie in [-1, 1], not at 1.5'),
+        ('short', 'actions of FetchReach have shape (2, 4), not (2, 3)'),
+        ('stops', 'ZeroDivisionError: integer division or modulo by zero'),
+    ],
+)
+def test_what_acts_wrongly_later_is_said_in_one_line(
+    module: str, function: str, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ['--policy', f'{module}:{function}', '--task', 'FetchReach', '--trust']
+    assert evaluate([*words, '--episodes', '2', '--threads', '1']) == 1
+    error = capsys.readouterr().err
+    assert error == f'evaluate_policy: {module}:{function} fails: {line}\n'
