@@ -80,9 +80,11 @@ def _run(options: argparse.Namespace) -> int:
         simulation = make_chosen_simulation(options, loaded)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    for file in (options.json, options.csv):
-        if file not in (None, _STDOUT):
-            require_writable(file)
+    files = [file for file in (options.json, options.csv) if file not in (None, _STDOUT)]
+    for file in files:
+        require_writable(file)
+    if len({file.resolve() for file in files}) < len(files) and _is_replaced(files[0]):
+        raise UsageError(f'--json and --csv are one file, {files[0]}: the second would replace it')
     outcomes, code = _evaluate(options, simulation, CheckedPolicy(loaded))
     report = {
         'policy': options.policy or loaded.task,
@@ -103,6 +105,11 @@ def _run(options: argparse.Namespace) -> int:
     except OSError as error:
         raise CommandError(f'{error.filename or "output"}: {error.strerror}') from None
     return code
+
+
+def _is_replaced(file: Path) -> bool:
+    """Whether writing takes away what was there, as of `/dev/null` or a pipe it does not."""
+    return file.is_file() or not file.exists()
 
 
 def _show(report: dict[str, Any], json_file: Path | None) -> None:

@@ -218,6 +218,10 @@ def test_former_names_work_and_say_what_they_are_called_now(
         # Before the episodes are played, not after.
         (['--policy', 'FetchReach', '--json', '/dev/null/a.json'], 'a.json cannot be written: '),
         (['--policy', 'FetchReach', '--csv', '/dev'], '/dev cannot be written: it is a folder'),
+        (
+            '--policy FetchReach --episodes 1 --json /tmp/e --csv /tmp/../tmp/e'.split(),
+            '--json and --csv are one file, /tmp/e: the second would replace it',
+        ),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(
