@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
-from policy_node.policies.policy import observation_part
+from policy_node.policies.policy import observation_and_goal
 
 
 class MLP(nn.Module):
@@ -116,7 +116,8 @@ class Actor(nn.Module):
 
         Args:
             observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
-                in the units of the task; other keys are ignored.
+                in the units of the task, where one of them may be one for the whole batch; other
+                keys are ignored.
             state: Ignored; there is no recurrent state.
             episode_start: Ignored, likewise.
             deterministic: Ignored: the policy has no noise, as Stable-Baselines3's DDPG.
@@ -125,16 +126,14 @@ class Actor(nn.Module):
             Actions (..., action_size) in [-1, 1], float32, and None.
 
         Raises:
-            ValueError: If a part is missing or has the wrong length.
+            ValueError: If a part is missing or has the wrong length, or their batches do not fit.
         """
         shape = self.shape
-        inputs = [
-            self._input(observation, 'observation', shape.observation_size),
-            self._input(observation, 'desired_goal', shape.goal_size),
-        ]
-        action = self(self.features(*inputs))
+        parts = observation_and_goal(observation, shape.observation_size, shape.goal_size)
+        action = self(self.features(*map(self._input, parts)))
         return action.cpu().numpy(), None
 
-    def _input(self, observation: Mapping[str, ArrayLike], key: str, size: int) -> Tensor:
-        values = np.ascontiguousarray(observation_part(observation, key, size))
+    def _input(self, values: NDArray[np.float32]) -> Tensor:
+        # Read-only ones are copied, about which torch would warn.
+        values = np.require(values, requirements=['C_CONTIGUOUS', 'WRITEABLE'])
         return torch.from_numpy(values).to(self.goal_normalizer.mean.device)

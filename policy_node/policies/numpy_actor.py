@@ -23,7 +23,7 @@ from threadpoolctl import ThreadpoolController
 from msgs_spec.arrays import Array
 from policy_node.policies import checkpoint
 from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
-from policy_node.policies.policy import LoadedPolicy, Observation, observation_part
+from policy_node.policies.policy import LoadedPolicy, Observation, observation_and_goal
 
 # As torch.nn.LayerNorm.
 _NORM_EPSILON = 1e-5
@@ -54,7 +54,8 @@ class NumpyActor:
 
         Args:
             observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
-                in the units of the task; other keys are ignored.
+                in the units of the task, where one of them may be one for the whole batch; other
+                keys are ignored.
             state: Ignored; there is no recurrent state.
             episode_start: Ignored, likewise.
             deterministic: Ignored: the policy has no noise.
@@ -63,13 +64,12 @@ class NumpyActor:
             Actions (..., action_size) in [-1, 1], float32, and None.
 
         Raises:
-            ValueError: If a part is missing or has the wrong length.
+            ValueError: If a part is missing or has the wrong length, or their batches do not fit.
         """
         del state, episode_start, deterministic
         shape = self.shape
         # Rounded to float32 first, as in training.
-        seen = observation_part(observation, 'observation', shape.observation_size)
-        goal = observation_part(observation, 'desired_goal', shape.goal_size)
+        seen, goal = observation_and_goal(observation, shape.observation_size, shape.goal_size)
         features = self._features(seen.astype(np.float64), goal.astype(np.float64))
         with _ONE_AT_A_TIME, _blas().limit(limits=1):
             return np.tanh(self._forward(features)).astype(np.float32), None

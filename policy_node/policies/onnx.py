@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from msgs_spec.command_line import one_line
 from policy_node.policies.checkpoint import ActorInfo, loaded_actor, parse_metadata
 from policy_node.policies.files import read_file, sha256
-from policy_node.policies.policy import LoadedPolicy, Observation, observation_part
+from policy_node.policies.policy import LoadedPolicy, Observation, observation_and_goal
 
 INPUTS = ('observation', 'desired_goal')
 OUTPUT = 'action'
@@ -68,9 +68,8 @@ class OnnxActor:
     ) -> tuple[NDArray[np.float32], None]:
         """Returns the action (..., action size) in [-1, 1] for one observation or a batch."""
         del state, episode_start, deterministic
-        sizes = (self.info.shape.observation_size, self.info.goal_size)
-        pairs = zip(INPUTS, sizes, strict=True)
-        parts = {name: observation_part(observation, name, size) for name, size in pairs}
+        sizes = self.info.shape.observation_size, self.info.goal_size
+        parts = dict(zip(INPUTS, observation_and_goal(observation, *sizes), strict=True))
         leading = parts['observation'].shape[:-1]
         flat = {name: part.reshape(-1, part.shape[-1]) for name, part in parts.items()}
         (action,) = self._session.run([OUTPUT], flat)

@@ -113,3 +113,31 @@ def observation_part(observation: Observation, key: str, size: int) -> NDArray[n
     if values.ndim == 0 or values.shape[-1] != size:
         raise ValueError(f'{key} has shape {values.shape}; allowed: (..., {size})')
     return values
+
+
+def observation_and_goal(
+    observation: Observation, observation_size: int, goal_size: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Returns observation and desired goal, (..., size) each, of as many rows.
+
+    One goal for a batch of observations, or one observation for several goals, is repeated.
+
+    Raises:
+        ValueError: If a part is missing or has the wrong length, or the batches do not fit.
+        TypeError: If the observation is no mapping, as one that was flattened.
+    """
+    seen = observation_part(observation, 'observation', observation_size)
+    goal = observation_part(observation, 'desired_goal', goal_size)
+    if seen.shape[:-1] == goal.shape[:-1]:
+        return seen, goal
+    try:
+        leading = np.broadcast_shapes(seen.shape[:-1], goal.shape[:-1])
+    except ValueError:
+        raise ValueError(
+            f'observation has shape {seen.shape}, desired_goal {goal.shape}: allowed are batches '
+            'of one size, or a batch and one of the other'
+        ) from None
+    return (
+        np.broadcast_to(seen, (*leading, observation_size)),
+        np.broadcast_to(goal, (*leading, goal_size)),
+    )

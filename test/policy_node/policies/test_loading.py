@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,11 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from msgs_spec.tasks import TASKS, task_spec
-from policy_node import load_policy
+from policy_node import load_actor, load_policy
 from policy_node.policies import checkpoint, loading
 from policy_node.policies.loading import TaskMissing
 from policy_node.policies.numpy_actor import NumpyActor
-from policy_node.policies.policy import RandomPolicy
+from policy_node.policies.policy import Policy, RandomPolicy
 from policy_node.policies.shipped import actor_path, shipped_actors
 from support.fresh_actor import fresh_actor, observations
 
@@ -67,6 +68,26 @@ def test_a_batch_is_answered_as_its_rows() -> None:
     rows = [policy.predict({k: v[i] for k, v in observation.items()})[0] for i in range(64)]
     # In float64 first: all but the rare last bit.
     np.testing.assert_allclose(batch, rows, rtol=2e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize('load', [load_actor, lambda task: load_policy(task).policy])
+def test_one_goal_may_be_that_of_a_whole_batch(load: Callable[[str], Policy]) -> None:
+    policy, batch = load('FetchPush'), observations(task_spec('FetchPush'), 5)
+    one = {**batch, 'desired_goal': batch['desired_goal'][2]}
+    each = {**batch, 'desired_goal': np.tile(one['desired_goal'], (5, 1))}
+    np.testing.assert_array_equal(policy.predict(one)[0], policy.predict(each)[0])
+    message = r'observation has shape \(5, 25\), desired_goal \(4, 3\): allowed are batches of one'
+    with pytest.raises(ValueError, match=message):
+        policy.predict({**batch, 'desired_goal': batch['desired_goal'][:4]})
+
+
+@pytest.mark.filterwarnings('error')
+def test_torch_does_not_warn_of_observations_that_cannot_be_written() -> None:
+    batch = observations(task_spec('FetchPush'), 5)
+    fixed = {name: np.asarray(values, np.float32) for name, values in batch.items()}
+    for values in fixed.values():
+        values.setflags(write=False)
+    assert load_actor('FetchPush').predict(fixed)[0].shape == (5, 4)
 
 
 def test_acting_takes_one_thread_and_leaves_the_rest_as_it_was() -> None:
