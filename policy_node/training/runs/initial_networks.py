@@ -33,6 +33,19 @@ _CRITICS = ('critic', 'target_critic')
 _PREFIXES = tuple(f'{part}.' for part in _CRITICS)
 
 
+def described(shape: NetworkShape, goal_features: str) -> dict[str, object]:
+    """Sizes and inputs of networks by name, for who compares two."""
+    return {
+        'observation': shape.observation_size,
+        'goal': shape.goal_size,
+        'action': shape.action_size,
+        'hidden_sizes': shape.hidden_sizes,
+        'layer_norm': shape.layer_norm,
+        'goal_features': goal_features,
+        'inputs': shape.feature_size,
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class InitialNetworks:
     """Weights and normalisers to start from.
@@ -64,19 +77,15 @@ class InitialNetworks:
         Raises:
             ValueError: One line names the sizes of both.
         """
-        ours, theirs = network_shape(config), self.shape
-        pairs = {
-            'observation': (theirs.observation_size, ours.observation_size),
-            'goal': (theirs.goal_size, ours.goal_size),
-            'action': (theirs.action_size, ours.action_size),
-            'hidden_sizes': (theirs.hidden_sizes, ours.hidden_sizes),
-            'layer_norm': (theirs.layer_norm, ours.layer_norm),
-            'goal_features': (self.goal_features, config.goal_features),
-            'inputs': (theirs.feature_size, ours.feature_size),
-        }
-        if can_widen(theirs.hidden_sizes, ours.hidden_sizes):
-            del pairs['hidden_sizes']
-        differing = [f'{name} {old}, now {new}' for name, (old, new) in pairs.items() if old != new]
+        ours = described(network_shape(config), config.goal_features)
+        theirs = described(self.shape, self.goal_features)
+        if can_widen(self.shape.hidden_sizes, config.hidden_sizes):
+            theirs['hidden_sizes'] = config.hidden_sizes
+        differing = [
+            f'{name} {old}, now {ours[name]}' for name, old in theirs.items() if old != ours[name]
+        ]
+        if theirs['hidden_sizes'] != ours['hidden_sizes']:
+            differing.append('allowed hidden_sizes: as many, each a whole multiple')
         if differing:
             origin = f'{self.origin["name"]} ({self.origin["task"]})'
             raise ValueError(f'{config.task} cannot start from {origin}: {"; ".join(differing)}')

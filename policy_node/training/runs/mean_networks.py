@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from msgs_spec.tasks import task_spec
-from policy_node.training.runs.initial_networks import InitialNetworks
+from policy_node.training.runs.initial_networks import InitialNetworks, described
 
 
 def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
@@ -25,10 +25,8 @@ def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
     first = parts[0]
     for part in parts:
         if _kind(part) != _kind(first):
-            raise ValueError(
-                f'no mean of {first.origin["name"]} and {part.origin["name"]}: they are '
-                f'{_described(first)} and {_described(part)}'
-            )
+            names = f'{first.origin["name"]} and {part.origin["name"]}'
+            raise ValueError(f'no mean of {names}: {"; ".join(_differing(first, part))}')
     kinds = [(part.norm, part.valued_by) for part in parts]
     if any(kind != kinds[0] for kind in kinds):
         parts = [part.without_critic() for part in parts]
@@ -78,6 +76,21 @@ def _kind(networks: InitialNetworks) -> tuple[object, ...]:
     return networks.shape, networks.goal_features, counts
 
 
-def _described(networks: InitialNetworks) -> str:
-    sizes = networks.shape.hidden_sizes
-    return f'{networks.origin["task"]} {sizes} {networks.goal_features}'
+def _differing(first: InitialNetworks, other: InitialNetworks) -> list[str]:
+    """What of their kinds differs, in words."""
+    ours, theirs = _described(first), _described(other)
+    both = [name for name in ours if name in theirs]
+    return [
+        f'{name} {ours[name]} and {theirs[name]}' for name in both if ours[name] != theirs[name]
+    ]
+
+
+def _described(networks: InitialNetworks) -> dict[str, object]:
+    spec = task_spec(networks.origin['task'])
+    found = described(networks.shape, networks.goal_features)
+    found['position_counts'] = spec.position_counts
+    if networks.goal_features != 'plain':
+        found['ignores_z_rotation'] = spec.ignores_z_rotation
+    if networks.goal_features == 'symmetric':
+        found['object_symmetry'] = spec.object_symmetry
+    return found

@@ -130,10 +130,18 @@ def test_a_mean_is_evaluated_and_shipped_as_it_is(tmp_path: Path, block_run: Pat
 
 
 def test_no_mean_of_networks_that_differ_in_kind(block_run: Path) -> None:
-    with pytest.raises(ValueError, match=r'no mean of .*: they are HandManipulateBlockRotateXYZ'):
+    with pytest.raises(ValueError, match=r'no mean of .*; goal_features relative and symmetric'):
         read_initial_networks(f'{block_run},HandManipulateEggFull')
-    with pytest.raises(ValueError, match=r'no mean of .*BlockFull: they are'):
+    with pytest.raises(ValueError, match=r'no mean of .*BlockFull: hidden_sizes \(256, 256, 256\)'):
         read_initial_networks('HandManipulateBlockRotateZ,HandManipulateBlockFull')
+    reach, push = 'FetchReach', 'FetchPush'
+    with pytest.raises(ValueError, match=f'{reach} and {push}: observation 10 and 25; inputs 13'):
+        read_initial_networks(f'{reach},{push}')
+    blocks, eggs = 'HandManipulateBlockRotateXYZ', read_initial_networks('HandManipulateEggRotate')
+    cubes = replace(eggs, origin=eggs.origin | {'task': blocks})
+    cubes = replace(cubes, shape=network_shape(tiny(blocks, goal_features='symmetric')))
+    with pytest.raises(ValueError, match='object_symmetry revolution and cube'):
+        mean_of([eggs, cubes])
     blocks = read_initial_networks('HandManipulateBlockRotateParallel,HandManipulateBlockRotateZ')
     assert blocks.origin['task'] == 'HandManipulateBlockRotateParallel'
     with pytest.raises(ValueError, match='nobody'):
@@ -407,7 +415,10 @@ def test_an_actor_alone_acts_from_the_first_cycle_while_its_critic_learns(
     ('arguments', 'message'),
     [
         (['--task', 'HandReach'], 'observation 10, now 63; goal 3, now 15; action 4, now 20'),
-        (['--task', 'FetchReach', '--set', 'hidden_sizes=9'], 'hidden_sizes (256, 256, 256), now'),
+        (
+            ['--task', 'FetchReach', '--set', 'hidden_sizes=9'],
+            'now (9,); allowed hidden_sizes: as many, each a',
+        ),
         (
             ['--task', 'FetchReach', '--set', 'goal_features=relative'],
             'goal_features plain, now rel',
