@@ -17,7 +17,6 @@ import shtab
 
 from fetch_hand_sim.commands.executables import find_executable
 from msgs_spec.command_line import (
-    EXIT_SUCCESS,
     EXIT_USAGE,
     CommandParser,
     run_command,
@@ -91,9 +90,10 @@ def _explain(words: Sequence[str]) -> int:
     """Help, the version, completion, or an error: the parser says it and exits."""
     try:
         make_parser().parse_args(words)
-    except SystemExit as end:
-        return int(end.code or EXIT_SUCCESS)
-    return EXIT_USAGE
+        return EXIT_USAGE
+    finally:
+        # Where nobody reads it, that is noticed before the end of the process.
+        sys.stdout.flush()
 
 
 def _split(words: Sequence[str]) -> tuple[Command | None, list[str], list[str]]:

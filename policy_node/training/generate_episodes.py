@@ -26,7 +26,6 @@ from msgs_spec.command_line import (
     CommandParser,
     UsageError,
     complain,
-    one_line,
     progress,
     run_command,
     say,
@@ -34,6 +33,7 @@ from msgs_spec.command_line import (
 )
 from msgs_spec.parameters import LARGEST_SEED
 from policy_node.training.policy_options import (
+    CheckedPolicy,
     add_batch_options,
     add_policy_options,
     add_reward_options,
@@ -69,8 +69,10 @@ def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simul
     context = RecordingContext(simulation, with_compiled_model=options.compiled_model)
     context.checkpoint_sha256 = loaded.sha256 or None
 
+    policy = CheckedPolicy(loaded)
+
     def act(observation: Observation) -> NDArray[Any]:
-        return loaded.policy.predict(observation, deterministic=True)[0]
+        return policy.predict(observation)[0]
 
     return EpisodeGenerator(simulation, options.output, act, context), simulation
 
@@ -101,9 +103,6 @@ def _run(options: argparse.Namespace) -> int:
                 advance(1)
     except EpisodeLogError as error:
         raise CommandError(str(error)) from None
-    except ValueError as error:
-        # What a policy of one's own answers may be anything.
-        raise CommandError(f'{options.policy}: {one_line(error)}') from None
     finally:
         wall, cpu = time.perf_counter() - began, time.process_time() - cpu_began
         simulated = steps * simulation.tick_duration

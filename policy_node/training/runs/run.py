@@ -34,7 +34,7 @@ from policy_node.training.runs.run_folder import (
     COMMAND_FILE,
     LOCK_FILE,
     STATE_FILE,
-    remove_former_run,
+    set_former_run_aside,
 )
 from policy_node.training.runs.run_log import Row, RunLog, draw_curve, read_progress
 from policy_node.training.runs.saving import NAME
@@ -195,8 +195,8 @@ def _train(
             trainer.stop('stopped by on_cycle')
 
     if trainer.workers.is_first:
-        if not resume:
-            remove_former_run(output)
+        if not resume and (said := set_former_run_aside(output)):
+            complain(NAME, said)
         # One line for each part; of a run that was killed before anything was saved there is none.
         with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
             file.write(command + '\n')

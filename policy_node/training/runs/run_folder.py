@@ -20,6 +20,7 @@ from policy_node.training.runs.training_state import Counters, save_state
 STATE_FILE = 'training_state.safetensors'
 LATEST_FILE = 'latest.safetensors'
 BEST_FILE = 'best.safetensors'
+FORMER_FILE = 'former_best.safetensors'
 REPLAY_FILE = 'replay.safetensors'
 LOCK_FILE = '.lock'
 COMMAND_FILE = 'command.txt'
@@ -36,20 +37,28 @@ def companion_file(actor: Path) -> Path:
     return actor.with_suffix('.training.safetensors')
 
 
-def remove_former_run(folder: Path) -> None:
-    """Removes what a run has left that was killed before its first checkpoint.
+def set_former_run_aside(folder: Path) -> str:
+    """Makes room for a run that begins in the folder of another, of which no state is left.
 
-    The run that begins in its folder would take its best actor for its own.
+    It would take the best actor for its own. That one may be all that somebody has kept, so it gets
+    another name; the rest goes.
+
+    Returns:
+        What to say of it; '' if nothing.
 
     Raises:
-        OSError: If a file cannot be removed.
+        OSError: If a file cannot be renamed or removed.
     """
-    files = [folder / name for name in (BEST_FILE, LATEST_FILE, REPLAY_FILE)]
+    best, said = folder / BEST_FILE, ''
+    if best.is_file():
+        said = f'the best actor of an earlier run is {best.replace(folder / FORMER_FILE)} now'
+    files = [folder / name for name in (LATEST_FILE, REPLAY_FILE)]
     replays = folder.glob(f'*.{REPLAY_FILE}')
     files += [file for file in replays if file.name.partition('.')[0].isdecimal()]
     files += folder.glob(f'{BOARD_FOLDER}/events.out.tfevents.*')
     for file in files:
         file.unlink(missing_ok=True)
+    return said
 
 
 @dataclass(frozen=True, slots=True)

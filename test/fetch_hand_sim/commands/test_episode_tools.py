@@ -621,7 +621,7 @@ def test_a_policy_that_answers_nonsense_on_the_way_is_one_line(tmp_path, monkeyp
     arguments = ['--policy', 'strange_policy:make', '--trust', '--task', 'FetchReach']
     arguments += ['--episodes', '1', '--threads', '1', '--output', str(tmp_path / 'out')]
     assert generate_episodes.main(arguments) == 1
-    assert capsys.readouterr().err.startswith('generate_episodes: strange_policy:make: ')
+    assert 'strange_policy:make fails: actions must be finite' in capsys.readouterr().err
 
 
 def test_equal_command_lines_give_equal_messages(tmp_path):

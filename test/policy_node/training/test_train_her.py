@@ -461,14 +461,19 @@ def test_a_run_that_began_anew_has_one_part(tmp_path: Path) -> None:
     assert (tmp_path / 'command.txt').read_text() == 'train_her of now\nmore\n'
 
 
-def test_a_run_that_begins_anew_leaves_nothing_of_the_one_before(tmp_path: Path) -> None:
+def test_a_run_that_begins_anew_sets_the_one_before_aside(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its best actor would be kept as this one's, of whatever task it is."""
     board = tmp_path / 'tensorboard'
     board.mkdir()
     names = 'best.safetensors', '1.replay.safetensors', 'tensorboard/events.out.tfevents.1.host.2.0'
     for name in (*names, 'mine.replay.safetensors', 'tensorboard/mine'):
-        (tmp_path / name).write_bytes(b'')
+        (tmp_path / name).write_bytes(name.encode())
     train_run(small_config(total_steps=400, learning_starts=1000), tmp_path)
+    # It may be all that somebody has kept of a run.
+    assert (tmp_path / 'former_best.safetensors').read_bytes() == b'best.safetensors'
+    assert 'former_best.safetensors now' in capsys.readouterr().err
     assert not [name for name in names if (tmp_path / name).exists()]
     assert (tmp_path / 'mine.replay.safetensors').exists() and (board / 'mine').exists()
 
