@@ -199,14 +199,15 @@ class Scene:
 
     def table_markers(self) -> list[Marker]:
         """What a task's object lies on and no robot moves: the table of a Fetch."""
-        model = self.model
+        model, data = self.model, mujoco.MjData(self.model)
+        mujoco.mj_kinematics(model, data)
         markers = []
         for geom in range(model.ngeom):
             body = int(model.geom_bodyid[geom])
             is_robot = model.body(body).name.startswith(JOINT_PREFIX)
             # The floor is the world's own.
             if body and not is_robot and int(model.body_weldid[body]) == 0:
-                pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
+                pose = np.concatenate([data.xpos[body], data.xquat[body]])
                 markers.append(self._geom_marker(geom, pose))
         return markers
 
@@ -329,7 +330,8 @@ def _dress(mjcf: mujoco.MjSpec) -> None:
             geom.material = 'view:floor'
             geom.rgba = [1.0, 1.0, 1.0, 1.0]
     for body in mjcf.bodies:
-        if body.mocap:
+        # What leads the robot; another one is somebody's obstacle.
+        if body.mocap and body.name.startswith(JOINT_PREFIX):
             for geom in body.geoms:
                 geom.group = 5
     for site in mjcf.sites:

@@ -21,11 +21,14 @@ class Curves:
         spec: The task.
         metric: Measures how far its goals are.
         length: Ticks that are kept.
+
+    Attributes:
+        metric: As given.
     """
 
     def __init__(self, spec: TaskSpec, metric: GoalMetric, length: int = 250) -> None:
         self._spec = spec
-        self._metric = metric
+        self.metric = metric
         commands = spec.robot.action_size
         # Columns: time, distance, rotation, reward, commands, positions.
         self._rows = np.full((length, 4 + 2 * commands), np.nan)
@@ -50,7 +53,7 @@ class Curves:
             reward: Its reward; None at a reset.
             command: (action size,) what was applied; None at a reset.
         """
-        distance, rotation = self._metric.distances(frame.achieved_goal, frame.desired_goal)
+        distance, rotation = self.metric.distances(frame.achieved_goal, frame.desired_goal)
         nothing = np.full(len(self._commanded), np.nan)
         row = self._rows[self._count % len(self._rows)]
         row[:4] = time, distance, rotation, np.nan if reward is None else reward

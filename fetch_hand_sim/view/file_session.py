@@ -7,6 +7,7 @@ import time
 
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.films.recording import find_playable
+from fetch_hand_sim.view.frame_rate import FrameRate
 from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.player import Player
 from fetch_hand_sim.view.session import Requests, Session
@@ -27,11 +28,11 @@ def run_files(options: argparse.Namespace) -> int:
     stop = StopSignals()
     try:
         paths = find_playable(options.path)
-        player = Player(paths)
+        player = Player(paths, may_act=not options.read_only)
     except EpisodeReadError as error:
         raise UsageError(str(error)) from None
     handle, address = open_page(
-        options.host, options.port, [Page(tuple(paths)), Requests(player.perform)]
+        options.host, options.port, [Page(tuple(paths)), Requests(player.perform)], FrameRate()
     )
     try:
         if not stop:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hmac
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from ipaddress import ip_address
@@ -19,7 +19,12 @@ from websockets.asyncio.server import serve
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-_SOCKETS = frozenset({'/ui', '/state'})
+from fetch_hand_sim.view.attendance import Attendance
+
+_IN_CONTROL = '/ui'
+_SOCKETS = frozenset({_IN_CONTROL, '/state'})
+# Seconds for a farewell to be confirmed.
+_FAREWELL = 3.0
 # Carries the token after the first request. Browsers give all ports of a host the same cookies, so
 # that the port is in the name.
 _COOKIE = 'fetch_hand_sim_view_{port}'
@@ -140,8 +145,13 @@ def _is_same_origin(origins: Sequence[str], host: str) -> bool:
         return False
 
 
-def guarded_serve(guard: Guard) -> Callable[..., Any]:
-    """Returns `websockets.serve` with a guard before it."""
+def guarded_serve(guard: Guard, attendance: Attendance) -> Callable[..., Any]:
+    """Returns `websockets.serve` with a guard before it.
+
+    Args:
+        guard: Decides about requests.
+        attendance: Hears of all that the page in control sends.
+    """
 
     def guarded(handler: Any, **options: Any) -> Any:
         process_request = options.pop('process_request')
@@ -167,9 +177,35 @@ def guarded_serve(guard: Guard) -> Callable[..., Any]:
                 changed.headers[name] = value
             return changed
 
-        return serve(handler, process_request=check, process_response=close, **options)
+        attended = _attended(handler, attendance)
+        return serve(attended, process_request=check, process_response=close, **options)
 
     return guarded
+
+
+def _attended(handler: Any, attendance: Attendance) -> Callable[[Any], Awaitable[None]]:
+    """A handler of web sockets that tells what is heard, and takes leave in time."""
+
+    async def handle(connection: Any) -> None:
+        # A browser that hangs confirms no farewell, and whoever takes over would wait for it.
+        connection.close_timeout = _FAREWELL
+        if urlsplit(connection.request.path).path == _IN_CONTROL:
+            _listen(connection, attendance)
+        await handler(connection)
+
+    return handle
+
+
+def _listen(connection: Any, attendance: Attendance) -> None:
+    """Notes what a connection receives; iterating over it calls `recv`, too."""
+    receive = connection.recv
+
+    async def recv(*arguments: Any, **options: Any) -> Any:
+        message = await receive(*arguments, **options)
+        attendance.note()
+        return message
+
+    connection.recv = recv
 
 
 def _answer(status: int, text: str, headers: dict[str, str] | None = None) -> Response:

@@ -114,11 +114,20 @@ class LiveRobot:
         ):
             self._show_goal(request.values)
 
+    def leave(self) -> None:
+        """Stops to command, as nobody is at the page."""
+        if self._facts.is_commanding:
+            self._requests.perform(SetCommanding(False))
+            self._update_facts(notice='nobody was at the page: its sliders no longer command')
+
     def _on_status(self, status: EpisodeStatus) -> None:
         self._hear()
         spec = task_spec(status.task, status.joint_prefix, status.control_hz)
-        if self._picture is None or self._picture.task != spec.name:
+        # One that waits has no episode yet: what is known is of another, that was here before.
+        is_waiting = status.phase == 'waiting'
+        if self._picture is None or self._picture.task != spec.name or is_waiting:
             self._picture, self._curves = Picture(spec.name), None
+            self._trail.clear()
         if self._curves is None or self._rule != status.success_rule:
             self._rule = status.success_rule
             self._curves = Curves(spec, GoalMetric(spec, success_rule=status.success_rule))
@@ -144,6 +153,9 @@ class LiveRobot:
             self._phase = 'running'
         goal = self._requests.shown_goal(tick.frame.desired_goal)
         frame = dataclasses.replace(tick.frame, desired_goal=goal)
+        if self._picture is not None and tick.stamp_ns < self._picture.stamp_ns:
+            # A replay that begins again, or a robot: curves go one way.
+            self._curves = Curves(spec, self._curves.metric)
         self._trail.append(tracked_position(frame))
         self._curves.add(tick.stamp_ns * 1e-9, frame, tick.reward, tick.command)
         if tick.status is not None:
@@ -168,6 +180,8 @@ class LiveRobot:
         if picture is not None and picture.frame is not None:
             frame = dataclasses.replace(picture.frame, desired_goal=goal)
             self._picture = dataclasses.replace(picture, frame=frame)
+            # A robot that stands still sends no tick with which it would be shown.
+            self._is_new = True
 
     def _on_commander(self, message: Any) -> None:
         self._commander = decode_status(message).get('commander', '')

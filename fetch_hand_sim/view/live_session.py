@@ -7,7 +7,7 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
@@ -17,9 +17,11 @@ from rclpy.node import Node
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.commands.node_processes import start_nodes, stop_node
+from fetch_hand_sim.view.attendance import Attendance
 from fetch_hand_sim.view.frame_rate import FrameRate
 from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page
+from fetch_hand_sim.view.requests import LatestRequest, Request
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import announce, open_page
 from msgs_spec.command_line import UsageError
@@ -54,16 +56,36 @@ def _run(options: argparse.Namespace, stop: StopSignals) -> None:
         robot = LiveRobot(node, may_command=not options.read_only)
         loop = EventLoop(node)
         stack.callback(loop.close)
-        plugins = [Page(), Requests(robot.perform)]
+        attendance = Attendance()
+        plugins = [Page(), Requests(_attended(robot, attendance))]
         frame_rate = FrameRate(lambda: robot.picture_period)
-        handle, address = open_page(options.host, options.port, plugins, frame_rate)
+        handle, address = open_page(options.host, options.port, plugins, frame_rate, attendance)
         stack.callback(handle.close)
         nodes = stack.enter_context(_nodes(options, node, robot, loop, stop))
         if stop:
             return
         _give_way()
         announce(address, options.browser)
-        _serve(Session(handle, robot), frame_rate, loop, nodes, stop)
+        session = Session(handle, robot)
+        while not stop and all(process.poll() is None for process in nodes):
+            if not attendance.is_there:
+                robot.leave()
+            _serve(session, frame_rate, loop)
+
+
+def _attended(
+    robot: LiveRobot, attendance: Attendance
+) -> Callable[[Request | LatestRequest], None]:
+    """Passes on to a robot what is asked for while somebody is at the page.
+
+    The page is drawn, and goes on asking for what was held, as long as it is connected.
+    """
+
+    def perform(request: Request | LatestRequest) -> None:
+        if attendance.is_there:
+            robot.perform(request)
+
+    return perform
 
 
 @contextmanager
@@ -161,16 +183,9 @@ def _give_way() -> None:
             os.setpriority(os.PRIO_PROCESS, int(thread), _NICENESS)
 
 
-def _serve(
-    session: Session,
-    frame_rate: FrameRate,
-    loop: EventLoop,
-    nodes: list[subprocess.Popen[str]],
-    stop: StopSignals,
-) -> None:
-    is_new = False
-    while not stop and all(node.poll() is None for node in nodes):
-        # Asleep, not waiting for messages: a robot in lockstep sends thousands a second.
-        time.sleep(frame_rate.period() if is_new else _FRAME_TIME)
-        loop.serve_pending(_SERVED_FIRST)
-        is_new = session.update()
+def _serve(session: Session, frame_rate: FrameRate, loop: EventLoop) -> None:
+    """Shows what is new, and then lets the time of a picture pass."""
+    is_new = session.update()
+    # Asleep, not waiting for messages: a robot in lockstep sends thousands a second.
+    time.sleep(frame_rate.period() if is_new else _FRAME_TIME)
+    loop.serve_pending(_SERVED_FIRST)

@@ -34,13 +34,20 @@ class Player:
     Args:
         paths: Episodes, at least one.
         clock: A steady clock, seconds.
+        may_act: Whether the page may stop, seek and choose.
 
     Raises:
         EpisodeReadError: If none can be read.
     """
 
-    def __init__(self, paths: Sequence[Path], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        clock: Callable[[], float] = time.monotonic,
+        may_act: bool = True,
+    ) -> None:
         self._paths = list(paths)
+        self._may_act = may_act
         self._clock = clock
         self._number = 0
         self._speed = 1.0
@@ -68,7 +75,10 @@ class Player:
         return self._make_picture()
 
     def perform(self, request: Request | LatestRequest) -> None:
-        """Plays as the page asks for."""
+        """Plays as the page asks for, unless it may only watch."""
+        if not self._may_act:
+            self._notice = 'this page may only watch (--read-only)'
+            return
         match request:
             case SetPaused():
                 self._set_paused(request.is_paused)
@@ -188,4 +198,5 @@ class Player:
             is_paused=self._is_paused,
             speed=self._speed,
             notice=self._notice,
+            may_command=self._may_act,
         )

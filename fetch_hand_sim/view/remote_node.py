@@ -27,6 +27,7 @@ class RemoteNode:
         self._name = name
         self._notice = notice
         self._clients: dict[str, Any] = {}
+        self._asked: dict[str, Any] = {}
 
     def is_there(self) -> bool:
         """Whether it answers services."""
@@ -66,9 +67,12 @@ class RemoteNode:
                     then(value)
 
         client = self._client('get_parameters', _GET_PARAMETERS)
-        if client.service_is_ready():
+        # One at a time: a node that hangs would find all of them when it goes on.
+        pending = self._asked.get(name)
+        if client.service_is_ready() and (pending is None or pending.done()):
             request = ros_service_class(_GET_PARAMETERS).Request(names=[name])
-            client.call_async(request).add_done_callback(answered)
+            self._asked[name] = future = client.call_async(request)
+            future.add_done_callback(answered)
 
     def set_parameter(
         self, name: str, value: str | int | float, then: Callable[[], None] | None = None
@@ -93,6 +97,7 @@ class RemoteNode:
         for client in self._clients.values():
             self._node.destroy_client(client)
         self._clients.clear()
+        self._asked.clear()
 
     def _call(
         self,

@@ -11,6 +11,7 @@ from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.view.page.body_drag import pulls
 from fetch_hand_sim.view.picture import Picture, ShowScene
 from fetch_hand_sim.view.requests import LatestRequest, Push, Request
+from msgs_spec.command_line import CommandError, one_line
 
 
 class Source(Protocol):
@@ -104,9 +105,21 @@ class Session:
 
     def _show(self, picture: Picture) -> None:
         if self._scene is None or self._scene.spec.name != picture.task:
-            self._scene = scene = Scene(picture.task)
+            self._scene = scene = _scene_of(picture.task)
             self._handle.send_to_viewer(ShowScene(scene))
             self._handle.set_model(scene.model, data=scene.data)
         if picture.frame is not None:
             self._scene.show(picture.frame)
         self._handle.send_to_viewer(picture)
+
+
+def _scene_of(task: str) -> Scene:
+    """The scene of a task.
+
+    Raises:
+        CommandError: If it cannot be made, as of a robot whose package is not installed here.
+    """
+    try:
+        return Scene(task)
+    except ValueError as error:
+        raise CommandError(f'{task} cannot be shown: {one_line(error)}') from None

@@ -28,6 +28,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.web import web_server
 from websockets.exceptions import ConnectionClosed
 
+from fetch_hand_sim.view.attendance import Attendance
 from fetch_hand_sim.view.frame_rate import FrameRate, Touch
 from fetch_hand_sim.view.guard import Guard, guarded_serve, is_loopback, new_token
 from msgs_spec.command_line import CommandError
@@ -152,6 +153,7 @@ def open_page(
     port: int,
     plugins: Sequence[plugin.Plugin],
     frame_rate: FrameRate | None = None,
+    attendance: Attendance | None = None,
 ) -> tuple[viewer_handle.ViewerHandle, Address]:
     """Binds, serves the page from a thread and checks that the guard stands; once per process.
 
@@ -160,6 +162,7 @@ def open_page(
         port: A port, or 0 for the first free one from 8080.
         plugins: Of the page and of the robot's side.
         frame_rate: How often to build the page; None is 60 times a second.
+        attendance: Hears of the page in control.
 
     Raises:
         CannotServe: If the port is taken or the host is not ours.
@@ -170,7 +173,7 @@ def open_page(
     address = Address(host, listening.getsockname()[1], guard.token)
     # The two places where the viewer meets the network; it offers no option for either.
     web_server.bind_public_socket = lambda *_: listening
-    web_server.serve = guarded_serve(guard)
+    web_server.serve = guarded_serve(guard, attendance or Attendance())
     web_viewer._print_url_banner = lambda *_: None
     logging.getLogger('WebServer').setLevel(logging.WARNING)
     logging.getLogger('asyncio').addFilter(is_no_farewell)

@@ -52,7 +52,7 @@ class Transforms:
             self._between(
                 joint.parent,
                 joint.child,
-                joint.pose(float(frame.joint_position[self._index[joint.name]])),
+                joint.pose(self._position(joint.name, frame)),
             )
             for joint in self.description.joints
             if joint.kind != 'fixed'
@@ -60,6 +60,11 @@ class Transforms:
         if frame.object_pose is not None and self._spec.object_name is not None:
             found.append(self._pose(self._spec.object_name, frame.object_pose))
         return [*found, *self._goal(frame.desired_goal)]
+
+    def _position(self, joint: str, frame: Frame) -> float:
+        """Of a joint; one that the robot does not report stays where it is drawn without it."""
+        index = self._index.get(joint)
+        return 0.0 if index is None else float(frame.joint_position[index])
 
     def _goal(self, goal: Array) -> list[Transform]:
         if self._spec.goal is GoalKind.POSE:

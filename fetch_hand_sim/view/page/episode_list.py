@@ -37,7 +37,8 @@ class EpisodeList:
         self._paths = paths
         self._send = send
         self._describe = cache(describe)
-        self._shown = -1
+        # Played last time, and clicked since.
+        self._played = self._clicked = -1
 
     def __len__(self) -> int:
         """How many there are."""
@@ -49,16 +50,16 @@ class EpisodeList:
         Args:
             number: Which one is being played.
         """
-        if number != self._shown:
+        if number != self._played and number != self._clicked:
             # What was changed to elsewhere on the page comes into view.
             height = imgui.GetTextLineHeightWithSpacing()
             imgui.SetScrollY(max(0.0, (number - 3) * height))
-            self._shown = number
+        self._played = number
         clipper = imgui.ListClipper()
         clipper.Begin(len(self._paths))
         while clipper.Step():
             for index in range(clipper.DisplayStart, clipper.DisplayEnd):
                 label = f'{self._describe(self._paths[index])}##{index}'
                 if imgui.Selectable(label, index == number):
-                    self._shown = index
+                    self._clicked = index
                     self._send(OpenEpisode(index))

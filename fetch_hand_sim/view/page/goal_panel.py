@@ -72,14 +72,19 @@ def _draw_position(spec: TaskSpec, position: Array) -> None:
 
 
 def _draw_angles(spec: TaskSpec, quaternion: Array) -> Array:
-    """Sliders for the angles about the world's axes; the quaternion as it was if none moved."""
+    """Sliders for the Euler angles of a goal; the quaternion as it was if none moved.
+
+    Turned about x of the world, then about y and z as they are by then: `rotations.py`.
+    """
     angles = quaternion_to_euler(quaternion)
     axes = (2,) if spec.looks_like == 'HandManipulateBlockRotateZ' else (0, 1, 2)
     has_changed = False
     for axis in axes:
         imgui.SetNextItemWidth(ITEM_WIDTH)
         degrees = float(np.degrees(angles[axis]))
-        moved, degrees = imgui.SliderFloat(f'about {"xyz"[axis]} (deg)', degrees, -180.0, 180.0)
+        # Beyond a right angle about y the same turn has other angles, to which sliders would jump.
+        end = 90.0 if axis == 1 else 180.0
+        moved, degrees = imgui.SliderFloat(f'about {"xyz"[axis]} (deg)', degrees, -end, end)
         if moved:
             angles[axis], has_changed = np.radians(degrees), True
     return euler_to_quaternion(angles) if has_changed else quaternion

@@ -12,6 +12,7 @@ from fetch_hand_sim.view.requests import ChangeEpisode, Seek
 
 def draw_timeline(timeline: Timeline, facts: Facts, send: Send) -> None:
     """Draws buttons, the speed and the slider over all frames."""
+    imgui.BeginDisabled(not facts.may_command)
     if imgui.Button('<< Episode'):
         send(ChangeEpisode(-1))
     imgui.SameLine()
@@ -33,3 +34,4 @@ def draw_timeline(timeline: Timeline, facts: Facts, send: Send) -> None:
     moved, index = imgui.SliderInt('##timeline', timeline.index, 0, last, 'frame %d')
     if moved:
         send(Seek(index))
+    imgui.EndDisabled()

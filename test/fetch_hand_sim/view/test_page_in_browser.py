@@ -359,16 +359,31 @@ def test_a_robot_is_pulled_with_control_and_the_mouse(browser, start_process, ro
     )
 
 
-def test_arrow_keys_command_where_nobody_else_does(browser, start_process, robot):
-    browser.open(address_of(start_process(*VIEW)))
+def take_over(browser: Browser, robot: Client) -> tuple[float, float]:
+    """Lets the page command; returns where it is switched on and off."""
     wait_for_scene(browser)
     picture = wait_for(browser, lambda picture: len(headers(picture)) == 3, 'panel')
     _goal, commands, _push = headers(picture)
     open_section(browser, commands, picture)
-    browser.click(25.0, commands + 22.0)
+    switch = 25.0, commands + 22.0
+    browser.click(*switch)
     robot.spin_until(
         lambda: robot.node.count_publishers('/commands') == 1, 'page that commands', PATIENCE
     )
+    return switch
+
+
+def wait_for_no_commander(robot: Client) -> None:
+    robot.spin_until(
+        lambda: robot.node.count_publishers('/commands') == 0,
+        'page that commands no more',
+        PATIENCE,
+    )
+
+
+def test_arrow_keys_command_where_nobody_else_does(browser, start_process, robot):
+    browser.open(address_of(start_process(*VIEW)))
+    switch = take_over(browser, robot)
     wait_for_moves(robot, [0.0, 0.0, 0.0])
     for key, wanted in (('ArrowRight', 1.0), ('ArrowLeft', -1.0)):
         browser.press_key(key)
@@ -381,12 +396,30 @@ def test_arrow_keys_command_where_nobody_else_does(browser, start_process, robot
     wait_for_moves(robot, [0.0, 1.0, 0.0])
     keep('keys', browser.screenshot())
     browser.release_key('ArrowRight')
-    browser.click(25.0, commands + 22.0)
-    robot.spin_until(
-        lambda: robot.node.count_publishers('/commands') == 0,
-        'page that commands no more',
-        PATIENCE,
-    )
+    browser.click(*switch)
+    wait_for_no_commander(robot)
+
+
+def test_a_page_that_is_no_longer_seen_lets_go_of_the_robot(browser, start_process, robot):
+    """And whoever comes next does not go on where the first visitor was."""
+    address = address_of(start_process(*VIEW))
+    browser.open(address)
+    take_over(browser, robot)
+    browser.press_key('ArrowRight')
+    wait_for_moves(robot, [1.0, 0.0, 0.0])
+    # As long as it is seen, silence is a hand that holds still.
+    robot.spin(8.0)
+    wait_for_moves(robot, [1.0, 0.0, 0.0])
+    assert robot.node.count_publishers('/commands') == 1
+    browser.call('Page.setWebLifecycleState', state='frozen')
+    wait_for_no_commander(robot)
+    browser.close()
+    with closing(Browser()) as next_one:
+        next_one.open(address)
+        wait_for_scene(next_one)
+        next_one.wait_for_frames(10)
+        robot.spin(1.0)
+        assert robot.node.count_publishers('/commands') == 0
 
 
 def test_dragging_the_goal_moves_it_and_the_actor_gets_there(browser, start_process, robot):

@@ -160,6 +160,16 @@ def test_the_first_that_can_be_read_is_opened(folder, tmp_path, clock):
         Player(damaged, clock)
 
 
+def test_where_a_page_may_only_watch_nothing_stops_the_film(folder, clock):
+    player = Player(find_playable(folder), clock, may_act=False)
+    for request in (SetPaused(True), Seek(3), ChangeEpisode(1), OpenEpisode(2)):
+        player.perform(request)
+    clock.now += 0.4
+    picture = player.picture()
+    assert (picture.timeline.number, picture.timeline.index) == (0, 10)
+    assert not picture.facts.may_command and '--read-only' in picture.facts.notice
+
+
 def test_an_episode_is_chosen_by_its_number(player):
     player.perform(OpenEpisode(2))
     assert player.picture().timeline.number == 2

@@ -15,7 +15,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rendering import simulation_frame
-from fetch_hand_sim.simulation.scene import Scene
+from fetch_hand_sim.simulation.scene import Scene, _dress
 from fetch_hand_sim.simulation.urdf import ROOT
 from fetch_hand_sim.view.page.ray import MousePlace, mouse_ray
 from fetch_hand_sim.visualization_node.camera import Camera
@@ -113,6 +113,34 @@ def test_the_table_of_a_fetch_is_drawn(task):
         np.testing.assert_allclose(marker.position, scene.data.body('table0').xpos)
         # Its top, metres above the floor.
         assert marker.position[2] + marker.size[2] == pytest.approx(0.4)
+
+
+def test_obstacles_that_mocap_moves_are_drawn():
+    """But not what leads the gripper."""
+    world = mujoco.MjSpec()
+    for name in ('robot0:mocap', 'obstacle'):
+        body = world.worldbody.add_body(name=name, mocap=True)
+        body.add_geom(name=name, size=[0.1, 0.1, 0.1])
+    _dress(world)
+    assert [world.geom(name).group for name in ('robot0:mocap', 'obstacle')] == [5, 0]
+
+
+def test_a_shelf_on_a_table_is_marked_where_it_is(monkeypatch):
+    world = mujoco.MjSpec()
+    table = world.worldbody.add_body(name='table', pos=[1.0, 0.0, 0.4], quat=[0.0, 0.0, 0.0, 1.0])
+    table.add_body(name='shelf', pos=[0.1, 0.0, 0.5]).add_geom(size=[0.1, 0.1, 0.1])
+    scene = Scene('FetchReach')
+    monkeypatch.setattr(scene, 'model', world.compile())
+    (marker,) = scene.table_markers()
+    np.testing.assert_allclose(marker.position, [0.9, 0.0, 0.9], atol=1e-9)
+
+
+def test_a_joint_that_the_robot_does_not_report_stays_at_rest():
+    transforms, frame = Transforms('FetchReach'), moved_frame('FetchReach')
+    name = transforms._spec.robot.joints[4]
+    before = len(transforms.moving(frame))
+    del transforms._index[name]
+    assert len(transforms.moving(frame)) == before
 
 
 def test_an_image_keeps_its_pixels():

@@ -1,0 +1,146 @@
+"""Who left the page, or sleeps, holds nothing any more."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+
+import numpy as np
+import pytest
+import rclpy
+from websockets.asyncio.client import connect
+
+from fetch_hand_sim.simulation.scene import Frame
+from fetch_hand_sim.view import guard
+from fetch_hand_sim.view.attendance import Attendance
+from fetch_hand_sim.view.guard import Guard, guarded_serve
+from fetch_hand_sim.view.live import LiveRobot
+from fetch_hand_sim.view.remote_node import RemoteNode
+from fetch_hand_sim.view.requests import SetCommanding, SetGoal
+from fetch_hand_sim.view.robot_watch import SeenTick
+from msgs_spec.tick import EpisodeStatus
+
+
+def test_silence_says_that_nobody_is_there():
+    now = [100.0]
+    attendance = Attendance(lambda: now[0])
+    assert not attendance.is_there
+    attendance.note()
+    now[0] += 2.9
+    assert attendance.is_there
+    now[0] += 0.2
+    assert not attendance.is_there
+
+
+@pytest.mark.parametrize('path', ['/ui', '/state'])
+def test_the_page_in_control_is_heard_and_a_hanging_one_is_left_in_time(path, monkeypatch):
+    attendance, took = Attendance(), []
+
+    async def handle(connection):
+        async for _ in connection:
+            began = time.monotonic()
+            await connection.close()
+            took.append(time.monotonic() - began)
+
+    async def visit():
+        own = socket.create_server(('127.0.0.1', 0))
+        port = own.getsockname()[1]
+        rules = {name: lambda *_: None for name in ('process_request', 'process_response')}
+        serve = guarded_serve(Guard(), attendance)
+        async with serve(handle, sock=own, close_timeout=None, **rules):
+            url, origin = f'ws://127.0.0.1:{port}{path}?sid=1', f'http://127.0.0.1:{port}'
+            async with connect(url, origin=origin) as visitor:
+                assert not attendance.is_there
+                # Hangs: what comes is not read, and no farewell confirmed.
+                visitor.transport.pause_reading()
+                await visitor.send(b'x')
+                while not took:
+                    await asyncio.sleep(0.05)
+                visitor.transport.abort()
+
+    monkeypatch.setattr(guard, '_FAREWELL', 0.3)
+    asyncio.run(asyncio.wait_for(visit(), 20.0))
+    assert took[0] < 10.0 and attendance.is_there == (path == '/ui')
+
+
+@pytest.fixture
+def robot():
+    rclpy.init()
+    node = rclpy.create_node('page')
+    yield LiveRobot(node, may_command=True)
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def status(**changes):
+    fields = {'task': 'FetchReach', 'episode': 0, 'seed': 0, 'tick': 0, 'phase': 'reset'}
+    fields |= {'control_hz': 25.0, 'reward_type': 'sparse', 'success_rule': 'gymnasium'}
+    return EpisodeStatus(**fields | {'episode_return': 0.0, 'is_success': False} | changes)
+
+
+def follow(robot, said, stamps=()):
+    """Lets a page see a robot without one."""
+    robot._watch.status = said
+    robot._on_status(said)
+    for stamp in stamps:
+        goal = np.array([1.3, 0.7, 0.5])
+        frame = Frame(np.zeros(15), goal, goal, None, is_success=True)
+        robot._on_tick(SeenTick(stamp, frame, -1.0, np.zeros(4), None))
+
+
+def test_a_robot_is_left_alone_by_a_page_that_nobody_sees(robot):
+    follow(robot, status(), [10])
+    robot.perform(SetCommanding(True))
+    assert robot.picture().facts.is_commanding
+    robot.leave()
+    facts = robot.picture().facts
+    assert not facts.is_commanding and 'nobody was at the page' in facts.notice
+    robot.leave()
+    assert robot.picture() is None
+
+
+def test_a_goal_is_seen_at_once_also_of_a_robot_that_stands_still(robot):
+    follow(robot, status(), [10])
+    robot.picture()
+    goal = np.array([1.4, 0.8, 0.6])
+    robot.perform(SetGoal(goal))
+    np.testing.assert_array_equal(robot.picture().frame.desired_goal, goal)
+
+
+def test_curves_begin_again_where_time_goes_back(robot):
+    follow(robot, status(), [10**9, 2 * 10**9, 3 * 10**9])
+    assert len(robot.picture().graphs.reward.times) == 3
+    follow(robot, status(episode=1), [10**9])
+    assert robot.picture().graphs.reward.times.tolist() == [1.0]
+
+
+def test_a_robot_that_waits_shows_nothing_of_the_one_before(robot):
+    follow(robot, status(), [10**9])
+    assert robot.picture().frame is not None
+    follow(robot, status(phase='waiting'))
+    picture = robot.picture()
+    assert picture.frame is None and picture.facts.phase == 'waiting'
+
+
+def test_a_node_that_hangs_is_asked_once(robot, monkeypatch):
+    del robot
+    node = rclpy.create_node('asks')
+    try:
+        asked = []
+
+        class Hanging:
+            def service_is_ready(self):
+                return True
+
+            def call_async(self, request):
+                asked.append(request)
+                return rclpy.task.Future()
+
+        remote = RemoteNode(node, 'sim_node', print)
+        monkeypatch.setattr(remote, '_client', lambda *_: Hanging())
+        for name in ('rate', 'rate', 'policy', 'rate'):
+            remote.get_parameter(name, print)
+        assert [request.names for request in asked] == [['rate'], ['policy']]
+    finally:
+        node.destroy_node()
