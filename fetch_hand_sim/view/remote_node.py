@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,8 @@ from msgs_spec.ros import ros_service_class
 
 _SET_PARAMETERS = 'rcl_interfaces/srv/SetParameters'
 _GET_PARAMETERS = 'rcl_interfaces/srv/GetParameters'
+# Seconds for an answer.
+_PATIENCE = 3.0
 
 
 class RemoteNode:
@@ -27,7 +30,7 @@ class RemoteNode:
         self._name = name
         self._notice = notice
         self._clients: dict[str, Any] = {}
-        self._asked: dict[str, Any] = {}
+        self._asked: dict[str, tuple[Any, float]] = {}
 
     def is_there(self) -> bool:
         """Whether it answers services."""
@@ -67,12 +70,20 @@ class RemoteNode:
                     then(value)
 
         client = self._client('get_parameters', _GET_PARAMETERS)
-        # One at a time: a node that hangs would find all of them when it goes on.
-        pending = self._asked.get(name)
-        if client.service_is_ready() and (pending is None or pending.done()):
+        if client.service_is_ready() and not self._awaits(name):
             request = ros_service_class(_GET_PARAMETERS).Request(names=[name])
-            self._asked[name] = future = client.call_async(request)
+            future = client.call_async(request)
+            self._asked[name] = future, time.monotonic()
             future.add_done_callback(answered)
+
+    def _awaits(self, name: str) -> bool:
+        """Whether an answer is on its way.
+
+        A node that hangs would find all questions when it goes on; one that is gone answers none,
+        and another in its place has not heard them.
+        """
+        future, asked = self._asked.get(name, (None, 0.0))
+        return future is not None and not future.done() and time.monotonic() - asked < _PATIENCE
 
     def set_parameter(
         self, name: str, value: str | int | float, then: Callable[[], None] | None = None
