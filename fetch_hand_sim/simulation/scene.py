@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -199,6 +200,10 @@ class Scene:
 
     def table_markers(self) -> list[Marker]:
         """What a task's object lies on and no robot moves: the table of a Fetch."""
+        return self._table
+
+    @cached_property
+    def _table(self) -> list[Marker]:
         model, data = self.model, mujoco.MjData(self.model)
         mujoco.mj_kinematics(model, data)
         markers = []

@@ -16,7 +16,7 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import TRAIL_TICKS, tracked_position
 from fetch_hand_sim.view.curves import Curves
 from fetch_hand_sim.view.frame_rate import FOLLOWING, OVERLOOKING
-from fetch_hand_sim.view.picture import Facts, Graphs, Picture
+from fetch_hand_sim.view.picture import ONLY_WATCHED, Facts, Graphs, Picture
 from fetch_hand_sim.view.replay_watch import ReplayWatch
 from fetch_hand_sim.view.requests import LatestRequest, Request, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_requests import RobotRequests
@@ -104,7 +104,7 @@ class LiveRobot:
     def perform(self, request: Request | LatestRequest) -> None:
         """Does what the page asks for, unless it may only watch."""
         if not self._may_command:
-            self._update_facts(notice='this page may only watch (--read-only)')
+            self._update_facts(notice=ONLY_WATCHED)
             return
         self._requests.perform(request)
         if (

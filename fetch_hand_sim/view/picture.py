@@ -12,6 +12,9 @@ from mujoco.studio import messages
 from fetch_hand_sim.simulation.scene import Frame, Scene
 from msgs_spec.arrays import Array
 
+# Where nobody may act.
+ONLY_WATCHED = 'this page may only watch (--read-only)'
+
 
 @dataclass(frozen=True, slots=True)
 class Facts:

@@ -12,7 +12,7 @@ from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.films.recording import load_recording, none_readable
 from fetch_hand_sim.simulation.scene import trail_of
 from fetch_hand_sim.view.curves import Curves
-from fetch_hand_sim.view.picture import Facts, Picture, Timeline
+from fetch_hand_sim.view.picture import ONLY_WATCHED, Facts, Picture, Timeline
 from fetch_hand_sim.view.requests import (
     ChangeEpisode,
     LatestRequest,
@@ -77,7 +77,7 @@ class Player:
     def perform(self, request: Request | LatestRequest) -> None:
         """Plays as the page asks for, unless it may only watch."""
         if not self._may_act:
-            self._notice = 'this page may only watch (--read-only)'
+            self._notice = ONLY_WATCHED
             return
         match request:
             case SetPaused():

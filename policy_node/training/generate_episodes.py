@@ -68,8 +68,7 @@ def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simul
     simulation = make_chosen_simulation(options, loaded)
     context = RecordingContext(simulation, with_compiled_model=options.compiled_model)
     context.checkpoint_sha256 = loaded.sha256 or None
-
-    policy = CheckedPolicy(loaded)
+    policy = CheckedPolicy(loaded, is_clipped=True)
 
     def act(observation: Observation) -> NDArray[Any]:
         return policy.predict(observation)[0]

@@ -92,10 +92,12 @@ class CheckedPolicy:
 
     Args:
         loaded: The policy.
+        is_clipped: Whether who asks clips actions beyond [-1, 1], as a robot does.
     """
 
-    def __init__(self, loaded: LoadedPolicy) -> None:
+    def __init__(self, loaded: LoadedPolicy, *, is_clipped: bool = False) -> None:
         self._loaded = loaded
+        self._is_clipped = is_clipped
         self._size = task_spec(loaded.task).robot.action_size
 
     def predict(
@@ -110,7 +112,7 @@ class CheckedPolicy:
             answer, state = self._loaded.policy.predict(observation, deterministic=deterministic)
             shape = len(np.asarray(observation['observation'])), self._size
             actions = finite_numbers('actions', answer, shape, self._loaded.task)
-            if (np.abs(actions) > 1.0).any():
+            if not self._is_clipped and (np.abs(actions) > 1.0).any():
                 raise ValueError(f'actions lie in [-1, 1], not at {np.abs(actions).max():g}')
         except Exception as error:
             # Libraries raise types of their own.

@@ -624,6 +624,18 @@ def test_a_policy_that_answers_nonsense_on_the_way_is_one_line(tmp_path, monkeyp
     assert 'strange_policy:make fails: actions must be finite' in capsys.readouterr().err
 
 
+def test_what_a_policy_answers_beyond_its_range_is_clipped_as_on_the_robot(tmp_path, monkeypatch):
+    (tmp_path / 'strong_policy.py').write_text(
+        'import numpy as np\ndef make(spec):\n    return lambda _: np.full(4, 1.5)\n'
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    arguments = ['--policy', 'strong_policy:make', '--trust', '--task', 'FetchReach']
+    arguments += ['--episodes', '1', '--threads', '1', '--output', str(tmp_path / 'out')]
+    assert generate_episodes.main(arguments) == 0
+    (episode,) = load_episodes(tmp_path / 'out')
+    assert (episode.commands == 1.0).all()
+
+
 def test_equal_command_lines_give_equal_messages(tmp_path):
     runs = [generate(tmp_path / name, 'FetchReach', episodes=2) for name in ('a', 'b')]
     for first, second in zip(*runs, strict=True):

@@ -133,6 +133,8 @@ def test_a_shelf_on_a_table_is_marked_where_it_is(monkeypatch):
     monkeypatch.setattr(scene, 'model', world.compile())
     (marker,) = scene.table_markers()
     np.testing.assert_allclose(marker.position, [0.9, 0.0, 0.9], atol=1e-9)
+    # Asked for at every tick that is shown.
+    assert scene.table_markers() is scene.table_markers()
 
 
 def test_a_joint_that_the_robot_does_not_report_stays_at_rest():
