@@ -211,6 +211,11 @@ def _exit_code(name: str, run: Callable[[], int], stopping: Sequence[int]) -> in
         if not stopping:
             raise
         return EXIT_INTERRUPTED
+    except RuntimeError as error:
+        # And in `__set_name__` of what a class holds, before Python 3.12.
+        if not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
+        return EXIT_INTERRUPTED
     return code
 
 

@@ -117,6 +117,17 @@ def test_ctrl_c_may_come_out_of_an_import_as_its_failure_but_hides_no_other(erro
         assert process.returncode == 1 and said.endswith('ZeroDivisionError: unfit\n')
 
 
+def test_ctrl_c_while_a_class_is_made_is_ctrl_c():
+    """As of NumPy's `finfo`, while it is imported; Python 3.11 makes RuntimeError of it."""
+    process = run_script(
+        'class Slow:\n    def __set_name__(self, owner, name):\n'
+        '        print(1, flush=True)\n        time.sleep(60)\nclass Owner:\n    part = Slow()'
+    )
+    process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    assert (process.communicate(timeout=20)[1], process.returncode) == ('tool: stopping\n', 130)
+
+
 def test_a_handler_of_others_stays():
     before = signal.getsignal(signal.SIGINT)
     seen: list[int] = []
