@@ -38,7 +38,6 @@ _SKILLED_PUSH = {
 }
 _SLIDE = {**_LONG, 'total_steps': 2_000_000, 'evaluate_every': 64_000}
 HAND: dict[str, Any] = {**_LONG, 'total_steps': 1_000_000, 'evaluate_every': 64_000}
-_ROTATE_XYZ = {**HAND, 'total_steps': 2_000_000}
 _SCREENED = {'evaluate_every': 64_000, 'evaluation_episodes': 128}
 # Sparse, with settings that the dense recipe of the task does not have.
 _SPARSE_HAND_REACH = {
@@ -254,7 +253,7 @@ STUDIES: dict[str, Study] = {
             'Do subgoals get the actor to its goals in fewer steps?',
             {
                 'FetchPickAndPlace': _PICK,
-                'HandManipulateBlockRotateXYZ': _ROTATE_XYZ,
+                'HandManipulateBlockRotateXYZ': HAND,
                 'FetchReach': _REACH,
                 'FetchPush': _PUSH,
                 'FetchSlide': _SLIDE,
