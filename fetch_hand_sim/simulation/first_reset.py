@@ -17,7 +17,7 @@ from fetch_hand_sim.simulation.tasks.task import Ids
 from msgs_spec.arrays import Array
 from msgs_spec.command_line import CommandError, one_line
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
-from msgs_spec.tasks import TaskSpec
+from msgs_spec.tasks import GoalKind, RewardType, SuccessRule, TaskSpec
 from msgs_spec.topics import sensor_topics
 
 _Given = TypeVar('_Given')
@@ -27,20 +27,52 @@ _APART = 1e-6
 _ROUNDING = 1e-9
 # The same number where one of two is of single precision.
 _SINGLE = 1e-5
+# By how much the length of a quaternion may differ from 1.
+_UNIT = 1e-6
 
 
 class SpecificationError(CommandError, ValueError):
     """A task does not give what its specification says; the message is one line."""
 
 
+def require_metric(
+    spec: TaskSpec, metric: Any, success_rule: SuccessRule, reward_type: RewardType
+) -> GoalMetric:
+    """Refuses a metric of `goal_metric` that is none, or another than was asked for.
+
+    Raises:
+        SpecificationError: If it is; the message says what is allowed.
+    """
+    if not isinstance(metric, GoalMetric):
+        kind = type(metric).__name__
+        raise SpecificationError(
+            f'{spec.name}: goal_metric() gives {kind}; allowed: a GoalMetric of success_rule and '
+            'reward_type'
+        )
+    given, asked = (metric.success_rule, metric.reward_type), (success_rule, reward_type)
+    if given != asked:
+        raise SpecificationError(
+            f'{spec.name}: goal_metric{asked} gives a metric of {given}; it passes on both '
+            'arguments'
+        )
+    return metric
+
+
 def require_goals(spec: TaskSpec, goals: Any, count: int) -> None:
-    """Refuses goals of `reset` that are not (count, goal size) finite numbers.
+    """Refuses goals of `reset` that are not (count, goal size) finite numbers, turns of length 1.
 
     Raises:
         SpecificationError: If they are not; the message says what is wrong.
     """
     _require_shape(spec, 'what reset returns', goals, (count, spec.goal.size))
     _require_finite(spec, 'what reset returns', goals)
+    if spec.goal is GoalKind.POSE:
+        lengths = np.linalg.norm(np.asarray(goals)[:, 3:], axis=1)
+        if not np.allclose(lengths, 1.0, rtol=0.0, atol=_UNIT):
+            raise SpecificationError(
+                f'{spec.name}: a quaternion that reset returns has length {lengths.max():.4g}; '
+                'allowed: 1'
+            )
 
 
 def require_as_declared(task: Task, metric: GoalMetric, goals: Array, ids: Ids) -> None:
@@ -91,6 +123,9 @@ def _require_vectors(task: Task, readings: Readings, leading: tuple[int, ...]) -
 
     found = _asked(spec, f'what formulas make {where}', made)
     for name, size in (('observation', spec.observation_size), ('achieved_goal', spec.goal.size)):
+        if not isinstance(found[name], np.ndarray):
+            kind = type(found[name]).__name__
+            raise SpecificationError(f'{spec.name}: {name} {where} is no array but {kind}')
         _require_shape(spec, f'{name} {where}', found[name], (*leading, size))
     return found
 
@@ -136,8 +171,10 @@ def _require_rewards(metric: GoalMetric, achieved: Array, desired: Array) -> Non
     for goals in ((achieved, desired), (achieved[0], desired[0]), (achieved[None], desired[None])):
         shape = goals[0].shape[:-1]
         where = f'of goals {goals[0].shape}'
-        for name, function in (('reward', metric.reward), ('success', metric.success)):
-            values = _asked(spec, f'{name} {where}', partial(function, *goals))
+        # As libraries ask, with the info that a reward must not depend on.
+        reward = partial(metric.reward, goals[0], goals[1], None)
+        for name, asked in (('reward', reward), ('success', partial(metric.success, *goals))):
+            values = _asked(spec, f'{name} {where}', asked)
             _require_shape(spec, f'{name} {where}', values, shape)
             _require_finite(spec, f'{name} {where}', values)
 

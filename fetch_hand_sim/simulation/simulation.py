@@ -30,9 +30,14 @@ from fetch_hand_sim.simulation.arguments import (
     selected_simulations,
 )
 from fetch_hand_sim.simulation.divergence import DivergenceWatch
-from fetch_hand_sim.simulation.first_reset import require_as_declared, require_goals
+from fetch_hand_sim.simulation.first_reset import (
+    require_as_declared,
+    require_goals,
+    require_metric,
+)
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
+from fetch_hand_sim.simulation.trial import TRIED, try_out
 from msgs_spec.actions import command_from_action
 from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings
@@ -133,7 +138,9 @@ class Simulation:
         self.num_envs = num_envs
         self.control_hz = control_hz
         self.timing = timing
-        self.metric = self._task.goal_metric(success_rule, reward_type)
+        self.metric = require_metric(
+            self.spec, self._task.goal_metric(success_rule, reward_type), success_rule, reward_type
+        )
         self.divergences = 0
         self._divergence = DivergenceWatch(self._task.batch)
         self.goals = np.zeros((num_envs, self.spec.goal.size))
@@ -445,10 +452,21 @@ class Simulation:
         if not self._is_as_declared:
             require_goals(self.spec, goals, ids.size)
             require_as_declared(self._task, self.metric, goals, ids)
+            self._try_out()
             self._is_as_declared = True
         self.goals[ids] = goals
         self._divergence.forget()
         self._is_started[ids] = True
+
+    def _try_out(self) -> None:
+        """Tries the task out once in a process, with two simulations of its own."""
+        if (kind := type(self._task)) in TRIED:
+            return
+        trial = Simulation(self.spec.name, 2, 1, control_hz=self.control_hz, timing=self.timing)
+        trial._is_as_declared = True
+        for wrong in try_out(trial):
+            _LOGGER.warning('%s: %s', self.spec.name, wrong)
+        TRIED.add(kind)
 
     def _require_threads(self) -> None:
         """Refuses to wait for ever for threads that a forked process does not have."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import weakref
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation.first_reset import require_goals
 from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.rendering import simulation_frame
 from fetch_hand_sim.simulation.rewards import GoalMetric
@@ -224,6 +226,11 @@ class Flat(GoalMetric):
         return -1.0
 
 
+class WithoutInfo(GoalMetric):
+    def reward(self, achieved_goal, desired_goal):
+        return np.zeros(np.shape(achieved_goal)[:-1])
+
+
 class Difference(GoalMetric):
     def reward(self, achieved_goal, desired_goal, info=None):
         return np.asarray(achieved_goal) - np.asarray(desired_goal)
@@ -312,6 +319,11 @@ def test_other_types_of_numbers_are_taken_as_before(make, changes):
             r'reward of goals \(3,\) cannot be computed: AxisError',
         ),
         (rewarded_by(Nothing), 'reward of goals .* is not finite'),
+        (rewarded_by(WithoutInfo), 'reward of goals .* cannot be computed: TypeError'),
+        (
+            with_formulas(achieved_goal=lambda readings: achieve(readings).tolist()),
+            'achieved_goal of readings .* is no array but list',
+        ),
     ],
 )
 def test_what_does_not_fit_the_specification_is_said_at_the_first_reset(make, changes, line):
@@ -322,6 +334,77 @@ def test_what_does_not_fit_the_specification_is_said_at_the_first_reset(make, ch
     assert isinstance(error.value, CommandError)
     assert '\n' not in str(error.value)
     assert not simulation.is_started.any()
+
+
+def test_a_turn_that_is_asked_for_has_length_one():
+    spec, goals = TASKS['HandManipulateBlockFull'], np.zeros((2, 7))
+    goals[:, 3] = 1.0
+    require_goals(spec, goals, 2)
+    goals[1, 4] = 0.5
+    with pytest.raises(ValueError, match=r'quaternion that reset returns has length 1.118; .*: 1$'):
+        require_goals(spec, goals, 2)
+
+
+def test_a_metric_is_the_one_that_was_asked_for(make):
+    with pytest.raises(ValueError, match=r'goal_metric\(\) gives NoneType; allowed: a GoalMetric'):
+        make(**with_method('goal_metric', lambda task, *_: None))
+    make(**with_method('goal_metric', lambda task, *_: GoalMetric(task.spec)))
+    with pytest.raises(ValueError, match=r"gives a metric of \('gymnasium', 'sparse'\); it passes"):
+        Simulation('ArmReach', reward_type='dense')
+
+
+def stale(task, ids, generators):
+    task.batch.state[ids] = task.start_state
+    return task.sample_goals(ids, generators)
+
+
+def of_all(task, ids, generators):
+    task.batch.state[:] = task.start_state
+    task.batch.forward()
+    return task.sample_goals(ids, generators)
+
+
+def with_another_ball(task, spec, batch):
+    mjcf = load_spec(task.ASSET)
+    mjcf.worldbody.add_geom(size=[0.1, 0.1, 0.1])
+    Task.__init__(task, spec, mjcf.compile(), batch)
+    task._ctrl = task.batch.bind('ctrl')
+    task._tip = task.output('site_xpos')[:, 0]
+    task._turned = task.output('xquat')[:, 2]
+    task.start_state = task.batch.state[0].copy()
+    task.add_sensors()
+
+
+@pytest.mark.parametrize(
+    ('changes', 'lines'),
+    [
+        ({}, []),
+        (with_method('reset', stale), [r'after reset with the same seed .*forward\(ids\)$']),
+        (with_method('reset', of_all), ['reset changes simulations that are not among its ids$']),
+        (
+            with_method('__init__', with_another_ball),
+            [r'what is simulated is not what .*arm.xml says \(5 and 4 geoms, or others\), and pic'],
+        ),
+    ],
+)
+def test_what_no_error_tells_is_said_in_one_line_once(make, caplog, changes, lines):
+    make(**changes).reset(seed=0)
+    # Once in a process, however many there are.
+    simulation = Simulation('ArmReach', num_envs=2, num_threads=1)
+    simulation.reset(seed=0)
+    assert len(caplog.messages) == len(lines)
+    for message, line in zip(caplog.messages, lines, strict=True):
+        assert re.match(f'ArmReach: {line}', message)
+        assert '\n' not in message
+
+
+def test_commands_that_cannot_be_applied_are_said_at_the_first_reset(make):
+    def wide(task, commands):
+        task._ctrl[:] = np.zeros((2, 5))
+
+    simulation = make(**with_method('apply_commands', wide))
+    with pytest.raises(ValueError, match=r'ArmReach: 3 ticks cannot be made: ValueError: could'):
+        simulation.reset(seed=0)
 
 
 def test_one_simulation_says_it_too_and_later_resets_do_not_ask(make):
