@@ -9,13 +9,20 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
 from msgs_spec.arrays import Array
 from msgs_spec.foreign_tasks import foreign_tasks
 from msgs_spec.hints import did_you_mean
-from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, RobotSpec
+from msgs_spec.robots import (
+    FETCH,
+    FINGERTIPS,
+    JOINT_PREFIX,
+    SHADOW_HAND,
+    CommandPart,
+    RobotSpec,
+)
 
 # One physics substep, seconds, and the paper's 20 substeps per action (25 Hz).
 PHYSICS_TIMESTEP = 0.002
@@ -276,7 +283,8 @@ def task_spec(
         raise ValueError(f'unknown task {name!r}; allowed: {", ".join(TASKS)}{hint}') from None
     if control_hz != DEFAULT_CONTROL_HZ:
         substeps = task.episode_ticks * substeps_per_tick(DEFAULT_CONTROL_HZ)
-        task = replace(task, episode_ticks=round(substeps / substeps_per_tick(control_hz)))
+        ticks = round(substeps / substeps_per_tick(control_hz))
+        task = replace(task, episode_ticks=max(1, ticks))
     return task.with_joint_prefix(joint_prefix)
 
 
@@ -349,20 +357,56 @@ def _require_sound(spec: TaskSpec) -> None:
         hash(spec)
     except TypeError as error:
         raise ValueError(f'{error}: its fields take tuples, not lists or arrays') from None
-    for part in spec.robot.command:
-        if not -float('inf') < part.lower < part.upper < float('inf'):
-            raise ValueError(
-                f'command {part.name} has limits {part.lower:g} ... {part.upper:g}; allowed: '
-                'finite, the lower below the upper'
-            )
+    _require_parts('observation', spec.observation)
+    _require_robot(spec.robot)
     positive = {
         'distance_threshold': spec.distance_threshold,
         'rotation_threshold': 1.0 if spec.rotation_threshold is None else spec.rotation_threshold,
         'episode_ticks': spec.episode_ticks,
     }
     for name, value in positive.items():
+        kind = 'whole number' if name == 'episode_ticks' else 'number'
+        if not isinstance(value, Integral if kind == 'whole number' else Real):
+            raise ValueError(f'{name} {value!r}; allowed: a {kind} of more than 0')
         if not 0.0 < value < float('inf'):
             raise ValueError(f'{name} {value}; allowed: more than 0')
+    choices = {'object_symmetry': (None, 'cube', 'revolution'), 'looks_like': (None, *TASKS)}
+    for name, allowed in choices.items():
+        if (given := getattr(spec, name)) not in allowed:
+            hint = did_you_mean(str(given), filter(None, allowed))
+            raise ValueError(f'{name} {given!r}; allowed: {", ".join(map(str, allowed))}{hint}')
+    if not isinstance(spec.formulas, TaskFormulas | None):
+        raise ValueError(f'formulas is no TaskFormulas but {type(spec.formulas).__name__}')
+
+
+def _require_parts(name: str, parts: Any) -> None:
+    """Refuses what is not a tuple of `VectorPart` with whole sizes."""
+    for part in parts:
+        if not isinstance(part, VectorPart):
+            raise ValueError(f'{name} has {part!r:.60}, which is no VectorPart')
+        if not isinstance(part.size, Integral) or part.size < 1:
+            raise ValueError(f'{name} {part.name} has size {part.size!r}; allowed: 1 or more')
+
+
+def _require_robot(robot: RobotSpec) -> None:
+    """Refuses a robot without joints, or whose units or limits are none."""
+    units = robot.joint_units
+    if not robot.joints or len(units) != len(robot.joints) or not {'m', 'rad'}.issuperset(units):
+        raise ValueError(
+            f'{robot.name} has {len(robot.joints)} joints with units {units!r:.60}; allowed: one '
+            "joint or more, and 'm' or 'rad' for each"
+        )
+    for part in robot.command:
+        if not isinstance(part, CommandPart):
+            raise ValueError(f'command has {part!r:.60}, which is no CommandPart')
+        limits = part.lower, part.upper
+        if not all(isinstance(limit, Real) for limit in limits):
+            raise ValueError(f'command {part.name} has limits {limits}; allowed: two numbers')
+        if not -float('inf') < part.lower < part.upper < float('inf'):
+            raise ValueError(
+                f'command {part.name} has limits {part.lower:g} ... {part.upper:g}; allowed: '
+                'finite, the lower below the upper'
+            )
 
 
 def _is_observed_as(spec: TaskSpec, known: TaskSpec) -> bool:

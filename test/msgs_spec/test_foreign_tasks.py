@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from msgs_spec import foreign_tasks
-from msgs_spec.tasks import TASKS, _accept
+from msgs_spec.tasks import TASKS, VectorPart, _accept, task_spec
 
 PUSH = replace(TASKS['FetchPush'], name='Pushed')
 FIRST = replace(PUSH.robot.command[0], lower=1.0, upper=1.0)
@@ -25,6 +25,30 @@ FIRST = replace(PUSH.robot.command[0], lower=1.0, upper=1.0)
         ({'distance_threshold': -1.0}, 'distance_threshold -1.0; allowed: more than 0'),
         ({'distance_threshold': float('nan')}, 'distance_threshold nan; allowed: more than 0'),
         ({'episode_ticks': 0}, 'episode_ticks 0; allowed: more than 0'),
+        ({'distance_threshold': None}, 'distance_threshold None; allowed: a number of more than 0'),
+        ({'rotation_threshold': '5'}, "rotation_threshold '5'; allowed: a number of more than 0"),
+        ({'episode_ticks': 30.5}, 'episode_ticks 30.5; allowed: a whole number of more than 0'),
+        ({'observation': (('tip', 3, 'm'),)}, r"observation has \('tip', 3, 'm'\), which is no Ve"),
+        ({'observation': (VectorPart('tip', 3.0, 'm'),)}, 'tip has size 3.0; allowed: 1 or more'),
+        ({'formulas': (1, 2)}, 'formulas is no TaskFormulas but tuple'),
+        (
+            {'looks_like': 'FetchPsh'},
+            "looks_like 'FetchPsh'; allowed: None, .*did you mean 'FetchP",
+        ),
+        (
+            {'object_symmetry': 'sphere'},
+            "object_symmetry 'sphere'; allowed: None, cube, rev",
+        ),
+        ({'robot': replace(PUSH.robot, joints=())}, 'fetch has 0 joints with units .*; allowed'),
+        ({'robot': replace(PUSH.robot, joint_units=('rad',))}, r"15 joints with units \('rad',\)"),
+        (
+            {'robot': replace(PUSH.robot, command=('x',))},
+            "command has 'x', which is no Comma",
+        ),
+        (
+            {'robot': replace(PUSH.robot, command=(replace(FIRST, lower='-1'),))},
+            r"command x has limits \('-1', 1.0\); allowed: two numbers",
+        ),
         ({'robot': replace(PUSH.robot, command=(FIRST,))}, 'command x has limits 1 ... 1'),
         ({'robot': replace(PUSH.robot, joints=list(PUSH.robot.joints))}, 'unhashable .*tuples'),
     ],
@@ -33,6 +57,11 @@ def test_what_would_fail_far_away_is_refused(change: dict[str, Any], line: str) 
     spec = replace(PUSH, **change)
     with pytest.raises(ValueError, match=line):
         _accept(spec.name, spec)
+
+
+def test_an_episode_has_a_tick_at_any_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(TASKS, PUSH.name, replace(PUSH, episode_ticks=1))
+    assert task_spec(PUSH.name, control_hz=12.5).episode_ticks == 1
 
 
 def test_a_task_made_from_a_twin_is_none() -> None:
