@@ -41,6 +41,8 @@ class Film:
     """
 
     def __init__(self, pictures: Iterable[Picture], fps: float = 25.0) -> None:
+        if not isinstance(fps, int | float | np.number):
+            raise ValueError(f'fps {fps!r}; allowed: a number')
         if not _RATES[0] <= fps <= _RATES[1]:
             raise ValueError(f'fps {fps:g}; allowed: {_RATES[0]:g} ... {_RATES[1]:g}')
         self.fps = fps
@@ -142,9 +144,11 @@ def film_episode(env: gymnasium.Env[Any, Any], policy: Any, seed: int | None = N
         seed: Of the reset; None lets the random generator go on.
 
     Raises:
-        ValueError: If the environment does not render pictures.
+        ValueError: If the environment does not render pictures, or the policy is none.
         RuntimeError: If there is no OpenGL.
     """
+    if not isinstance(env, gymnasium.Env):
+        raise ValueError(f'env {env!r:.60}; allowed: an environment, as make(...) gives it')
     if env.render_mode != 'rgb_array':
         raise ValueError(f"render_mode {env.render_mode!r}; allowed: 'rgb_array'")
     return Film(_played(env, _act(policy), seed), float(env.metadata.get('render_fps', 25)))
@@ -153,6 +157,11 @@ def film_episode(env: gymnasium.Env[Any, Any], policy: Any, seed: int | None = N
 def _act(policy: Any) -> Callable[[Any], Any]:
     if hasattr(policy, 'predict'):
         return lambda observation: policy.predict(observation, deterministic=True)[0]
+    if not callable(policy):
+        raise ValueError(
+            f'policy {policy!r:.60}; allowed: what has predict(observation, deterministic=True), '
+            'as load_policy gives it, or a function from observation to action'
+        )
     act: Callable[[Any], Any] = policy
     return act
 

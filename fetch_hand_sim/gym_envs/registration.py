@@ -63,14 +63,31 @@ def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
 
     Raises:
         ValueError: If an argument is not allowed.
+        gymnasium.error.NameNotFound: If there is no such task or id.
     """
     name = _id_of(name)
     return gymnasium.make(name, **_with_length(name, arguments))
 
 
 def _id_of(name: str | EnvSpec) -> str | EnvSpec:
-    """The id of a task that is called by its own name; anything else as it is."""
-    return environment_id(name) if isinstance(name, str) and name in TASKS else name
+    """The id of a task that is called by its own name; any other id or a spec as it is.
+
+    Raises:
+        gymnasium.error.NameNotFound: If there is no such task or id; the message lists the tasks.
+    """
+    # A package of another task that imports this one before the tasks are known leaves it out.
+    register_environments()
+    if not isinstance(name, str) or '/' in name or ':' in name or name in gymnasium.registry:
+        return name
+    if name in TASKS:
+        return environment_id(name)
+    if find_highest_version(None, name) is not None:
+        return name
+    reference = '; register_gymnasium_robotics() brings it' if name in reference_ids() else ''
+    try:
+        return environment_id(task_spec(name).name)
+    except ValueError as error:
+        raise gymnasium.error.NameNotFound(f'{error}{reference}') from None
 
 
 def _with_length(name: str | EnvSpec, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -116,8 +133,11 @@ def make_vec(
 
     Raises:
         ValueError: If a wrapper is for single environments only, or an argument is not allowed.
+        gymnasium.error.NameNotFound: If there is no such task or id.
     """
     name = _id_of(name)
+    if callable(wrappers):
+        raise ValueError(f'wrappers {wrappers!r}; allowed: a list of them')
     batch = VectorizeMode.VECTOR_ENTRY_POINT
     mode = arguments.pop('vectorization_mode', None)
     if mode not in (None, batch, batch.value):

@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Simulation
-from fetch_hand_sim.simulation.arguments import finite_goals, nearest_quaternions
+from fetch_hand_sim.simulation.arguments import finite_goals, nearest_quaternions, numbers
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import GoalKind, RewardType, TaskSpec
 
@@ -183,8 +183,9 @@ def goals_of_options(options: Any, mask: NDArray[np.bool_], spec: TaskSpec) -> A
     """
     if not options or 'goal' not in options:
         return None
-    given, one = np.asarray(options['goal']), (spec.goal.size,)
+    one = (spec.goal.size,)
     shape = (mask.size, *one)
+    given = numbers(options['goal'], f'a goal of {spec.name}', f'{one} or {shape}')
     if given.shape not in (one, shape):
         raise ValueError(f'a goal of {spec.name} has shape {one} or {shape}, not {given.shape}')
     goals = finite_goals(np.broadcast_to(given, shape)[mask], int(mask.sum()), spec)

@@ -26,6 +26,21 @@ def require_whole(name: str, value: object) -> None:
         raise ValueError(f'{name} must be a whole number, not {value!r}')
 
 
+def numbers(values: ArrayLike, what: str, shape: str) -> NDArray[Any]:
+    """Values as an array, whatever its shape.
+
+    Raises:
+        ValueError: If they are none, such as None, a dictionary or rows of different lengths.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        array = np.array(None)
+    if array.dtype == object:
+        raise ValueError(f'{what}: {shape} numbers, not {values!r:.80}')
+    return array
+
+
 def finite_numbers(
     name: str, values: ArrayLike, shape: tuple[int, ...], owner: str
 ) -> NDArray[np.floating]:
@@ -40,7 +55,7 @@ def finite_numbers(
     Raises:
         ValueError: If the shape is another, or something is no finite number.
     """
-    array = np.asarray(values)
+    array = numbers(values, f'{name} of {owner}', f'{shape}')
     if array.shape != shape:
         raise ValueError(f'{name} of {owner} have shape {shape}, not {array.shape}')
     if array.dtype.kind not in 'iuf':

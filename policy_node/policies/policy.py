@@ -49,6 +49,12 @@ class LoadedPolicy:
     control_hz: float | None = None
     sha256: str = ''
 
+    def predict(
+        self, observation: Observation, *, deterministic: bool = True
+    ) -> tuple[NDArray[Any], Any]:
+        """Acts as `policy` does, so that it is a policy wherever one is asked for."""
+        return self.policy.predict(observation, deterministic=deterministic)
+
 
 class RandomPolicy:
     """Uniformly random actions, alike for equal seeds."""

@@ -94,6 +94,8 @@ def train(
         KeyboardInterrupt: After Ctrl-C.
         SystemExit: After SIGTERM or SIGHUP, with code 143 or 129.
     """
+    if on_cycle is not None and not callable(on_cycle):
+        raise ValueError(f'on_cycle {on_cycle!r}; allowed: None or a function')
     fields = typed_fields(fields)
     if resume:
         if output is None:

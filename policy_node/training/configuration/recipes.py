@@ -48,6 +48,7 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     """
     if recipe not in RECIPES:
         raise ValueError(f'recipe {recipe!r}; allowed: {", ".join(RECIPES)}')
+    task_spec(task)
     values = {'paper': _paper, 'best': _best, 'finetune': _finetune}[recipe](task)
     if recipe == 'best':
         values |= _at_rate(task, values, overrides)

@@ -439,6 +439,7 @@ def test_a_film_in_memory_gives_back_every_picture_and_plays_in_a_notebook(tmp_p
     [
         ([], 25.0, 'no pictures; allowed: one or more'),
         (PICTURES, 0.0, 'fps 0; allowed: 0.001 ... 1000'),
+        (PICTURES, '25', "fps '25'; allowed: a number"),
         (PICTURES, float('nan'), 'fps nan'),
         (PICTURES, float('inf'), 'fps inf'),
         ([*PICTURES, np.zeros((5, 8, 3), np.uint8)], 25.0, 'picture 5 is uint8 (5, 8, 3)'),
@@ -498,6 +499,10 @@ def test_film_episode_plays_to_the_end_with_a_policy_or_a_function(opengl):
     assert not all((a == b).all() for a, b in zip(film, film_episode(env, Resting()), strict=True))
     with pytest.raises(ValueError, match=re.escape("render_mode None; allowed: 'rgb_array'")):
         film_episode(fetch_hand_sim.make('FetchReach'), Resting())
+    with pytest.raises(ValueError, match="policy 'FetchReach'; allowed: what has predict"):
+        film_episode(env, 'FetchReach')
+    with pytest.raises(ValueError, match="env 'FetchReach'; allowed: an environment"):
+        film_episode('FetchReach', Resting())
 
 
 @pytest.mark.parametrize('lost', [0, 50, -1])

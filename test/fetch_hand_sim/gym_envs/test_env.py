@@ -592,3 +592,34 @@ def test_a_task_is_made_by_its_name_alone():
     assert batch.num_envs == 2 and batch.spec.id == env.spec.id
     with pytest.raises(gymnasium.error.NameNotFound, match='Did you mean: `FetchReach'):
         fetch_hand_sim.make('fetch_hand_sim/FetchReech-v0')
+
+
+def test_a_name_that_is_none_is_answered_with_those_that_there_are(monkeypatch):
+    monkeypatch.delitem(gymnasium.registry, 'HandReach-v3', raising=False)
+    for name, line in (
+        ('FetchPsh', r"unknown task 'FetchPsh'; allowed: FetchReach, .*; did you mean 'FetchPush'"),
+        ('FetchPush-v0', r"unknown task 'FetchPush-v0'; .*; did you mean 'FetchPush'\?$"),
+        (
+            'HandReach-v3',
+            r"unknown task 'HandReach-v3'; .*; register_gymnasium_robotics\(\) br",
+        ),
+    ):
+        for made in (fetch_hand_sim.make, fetch_hand_sim.make_vec):
+            with pytest.raises(gymnasium.error.NameNotFound, match=line):
+                made(name)
+    assert fetch_hand_sim.make('CartPole').spec.id == 'CartPole-v1'
+    with pytest.raises(ValueError, match=r"class .*FlattenObservation'>; allowed: a list"):
+        fetch_hand_sim.make_vec('FetchPush', wrappers=gymnasium.wrappers.FlattenObservation)
+
+
+def test_a_task_that_was_not_known_at_first_is_registered_when_it_is_made(monkeypatch):
+    """As where its package imports this one before its specification is read."""
+    monkeypatch.delitem(gymnasium.registry, environment_id('FetchPush'))
+    assert fetch_hand_sim.make('FetchPush').spec.id == environment_id('FetchPush')
+
+
+@pytest.mark.parametrize('goal', [[1, [2], 3], {'x': 1}, None])
+def test_a_goal_that_is_no_numbers_is_named(goal):
+    env = fetch_hand_sim.make('FetchReach')
+    with pytest.raises(ValueError, match=r'a goal of FetchReach: \(3,\) or \(1, 3\) numbers, not '):
+        env.reset(options={'goal': goal})

@@ -202,3 +202,10 @@ def test_an_observation_that_was_flattened_is_said_to_be_no_mapping(name: str) -
     policy = load_policy(name, 'FetchReach').policy
     with pytest.raises(TypeError, match=r"is a mapping with 'observation', not of type ndarray"):
         policy.predict(np.zeros(16))  # type: ignore[arg-type]
+
+
+def test_what_is_loaded_acts_itself() -> None:
+    loaded = load_policy('resting', 'FetchReach')
+    observation = {'observation': np.zeros(10), 'achieved_goal': np.zeros(3)}
+    observation['desired_goal'] = np.zeros(3)
+    assert loaded.predict(observation)[0].tolist() == [0.0] * 4
