@@ -8,6 +8,7 @@ the class that simulates it. A package that is broken costs one warning and its 
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
@@ -19,6 +20,8 @@ SIMULATIONS = 'fetch_hand_sim_tasks.simulation'
 
 _Spec = TypeVar('_Spec')
 _LOGGER = logging.getLogger(__name__)
+# What policies do without; it asks for the tasks itself.
+_SIMULATOR = 'fetch_hand_sim'
 # Whose the tasks are that were taken.
 _PACKAGES: dict[str, str] = {}
 
@@ -36,11 +39,26 @@ def foreign_tasks(accept: Callable[[str, Any], _Spec]) -> dict[str, _Spec]:
         try:
             if name in tasks:
                 raise ValueError('another package has a task of this name')
-            tasks[name] = accept(name, entry_point.load())
+            tasks[name] = accept(name, _loaded(entry_point))
             _PACKAGES[name] = _package(entry_point)
         except (Exception, SystemExit) as error:  # whatever a package of somebody else does
             _LOGGER.warning('task %s is left out: %s', name, _what_failed(entry_point, error))
     return tasks
+
+
+def _loaded(entry_point: EntryPoint) -> Any:
+    """What an entry point gives; a warning where that brings the simulation with it."""
+    is_there = _SIMULATOR in sys.modules
+    given = entry_point.load()
+    if not is_there and _SIMULATOR in sys.modules:
+        _LOGGER.warning(
+            'task %s: %s: %s imports %s, which only its simulation may',
+            entry_point.name,
+            _package(entry_point),
+            entry_point.value,
+            _SIMULATOR,
+        )
+    return given
 
 
 def foreign_simulation(name: str) -> Any:

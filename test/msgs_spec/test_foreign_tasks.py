@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -134,3 +135,24 @@ def test_a_task_is_simulated_by_the_package_that_it_is_of(
     foreign_tasks.foreign_tasks(_accept)
     assert foreign_tasks.foreign_simulation('Pushed') == 'the class'
     assert foreign_tasks.foreign_simulation('Alone') == 'another class'
+
+
+def test_a_specification_that_brings_the_simulation_is_named(
+    installed: dict[str, list[Point]],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It asks for the tasks while they are being read, and leaves all of them unregistered."""
+
+    class Heavy(Point):
+        def load(self) -> object:
+            monkeypatch.setitem(sys.modules, 'fetch_hand_sim', logging)
+            return super().load()
+
+    monkeypatch.delitem(sys.modules, 'fetch_hand_sim', raising=False)
+    other = replace(PUSH, name='Other')
+    installed[foreign_tasks.SPECS] += [Heavy('heavy', 'Pushed', PUSH), Heavy('b', 'Other', other)]
+    assert list(foreign_tasks.foreign_tasks(_accept)) == ['Pushed', 'Other']
+    assert caplog.messages == [
+        'task Pushed: heavy: heavy:Pushed imports fetch_hand_sim, which only its simulation may'
+    ]

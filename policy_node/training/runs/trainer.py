@@ -224,6 +224,7 @@ class Trainer:
             if collected is None:
                 self.save()
                 return self._stop_reason or 'another worker stopped'
+            self._warn_of_rewards(collected.episodes)
             while True:
                 before = time.monotonic()
                 self._absorb(collected)
@@ -250,6 +251,20 @@ class Trainer:
                     self.save()
                     return reason
                 self._saver.save_when_due(self.learner, self.experience, self.counters)
+
+    def _warn_of_rewards(self, episodes: Episodes) -> None:
+        """Says that values of a task's own rewards are clipped where these are above 0."""
+        metric = self.simulation.metric
+        if self.config.algorithm == 'ppo' or not metric.has_own_reward:
+            return
+        achieved = episodes.achieved_goal[:, -1].astype(np.float64)
+        highest = metric.reward(achieved, episodes.desired_goal.astype(np.float64)).max()
+        if highest > 0.0 and self.workers.is_first:
+            complain(
+                NAME,
+                f'rewards of {self.spec.name} are up to {highest:g}; values are clipped to those '
+                'of rewards within -1 ... 0, so that nothing is learnt of more',
+            )
 
     def _collect_first(self, submit: Callable[..., Future[Collected]]) -> Collected | None:
         """Fills the replay of a resumed run that has lost it, then collects the first cycle.

@@ -14,6 +14,9 @@ import numpy as np
 import pytest
 import torch
 
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from fetch_hand_sim.simulation.tasks import registry
+from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
 from policy_node import load_policy
 from policy_node.training import Run, train
 from policy_node.training.runs.trainer import _collecting_thread
@@ -33,6 +36,27 @@ def test_a_run_leaves_an_actor_and_its_curve(tmp_path, capfd):
     assert [row['env_steps'] for row in run.progress()] == [400.0, 800.0, 1_200.0]
     assert (tmp_path / 'run/curve.png').is_file()
     assert capfd.readouterr() == ('', '')
+
+
+class Rich(GoalMetric):
+    def reward(self, achieved_goal, desired_goal, info=None):
+        return super().reward(achieved_goal, desired_goal) + 100.0
+
+
+class RichReach(FetchTask):
+    def __init__(self, spec, batch):
+        super().__init__(spec, batch, FETCH_CONFIGS['FetchReach'])
+
+    def goal_metric(self, success_rule, reward_type):
+        return Rich(self.spec, success_rule, reward_type)
+
+
+def test_rewards_that_values_cannot_say_are_named_once(tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(registry, '_family', lambda spec: RichReach)
+    train('FetchReach', tmp_path / 'run', total_steps=800, reward_type='dense', **SMALL)
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith('train_her: rewards of FetchReach are up to 99.')
+    assert 'within -1 ... 0' in line
 
 
 def test_the_record_says_all_that_was_given(tmp_path):
