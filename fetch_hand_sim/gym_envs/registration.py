@@ -81,7 +81,8 @@ def _id_of(name: str | EnvSpec) -> str | EnvSpec:
         return name
     if name in TASKS:
         return environment_id(name)
-    if find_highest_version(None, name) is not None:
+    # Gymnasium finds the version, or says which ones there are.
+    if find_highest_version(None, name.partition('-v')[0]) is not None:
         return name
     reference = '; register_gymnasium_robotics() brings it' if name in reference_ids() else ''
     try:

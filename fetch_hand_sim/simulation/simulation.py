@@ -460,13 +460,14 @@ class Simulation:
 
     def _try_out(self) -> None:
         """Tries the task out once in a process, with two simulations of its own."""
-        if (kind := type(self._task)) in TRIED:
+        tried = self.spec.name, type(self._task)
+        if tried in TRIED:
             return
         trial = Simulation(self.spec.name, 2, 1, control_hz=self.control_hz, timing=self.timing)
         trial._is_as_declared = True
         for wrong in try_out(trial):
             _LOGGER.warning('%s: %s', self.spec.name, wrong)
-        TRIED.add(kind)
+        TRIED.add(tried)
 
     def _require_threads(self) -> None:
         """Refuses to wait for ever for threads that a forked process does not have."""

@@ -26,8 +26,8 @@ _TICKS = 3
 _ACTION = 0.5
 # A reset computes in another order than the last one did, at most.
 _ROUNDING = 1e-9
-# Kinds of tasks that this process has tried out.
-TRIED: set[type[Task]] = set()
+# Tasks that this process has tried out, by name and what simulates them.
+TRIED: set[tuple[str, type[Task]]] = set()
 
 
 def try_out(simulation: Simulation) -> Iterator[str]:

@@ -595,7 +595,8 @@ def test_a_task_is_made_by_its_name_alone():
 
 
 def test_a_name_that_is_none_is_answered_with_those_that_there_are(monkeypatch):
-    monkeypatch.delitem(gymnasium.registry, 'HandReach-v3', raising=False)
+    for each in [each for each in gymnasium.registry if 'FetchPush' in each or 'HandRea' in each]:
+        monkeypatch.delitem(gymnasium.registry, each)
     for name, line in (
         ('FetchPsh', r"unknown task 'FetchPsh'; allowed: FetchReach, .*; did you mean 'FetchPush'"),
         ('FetchPush-v0', r"unknown task 'FetchPush-v0'; .*; did you mean 'FetchPush'\?$"),
@@ -608,6 +609,8 @@ def test_a_name_that_is_none_is_answered_with_those_that_there_are(monkeypatch):
             with pytest.raises(gymnasium.error.NameNotFound, match=line):
                 made(name)
     assert fetch_hand_sim.make('CartPole').spec.id == 'CartPole-v1'
+    with pytest.raises(gymnasium.error.VersionNotFound, match='v1'):
+        fetch_hand_sim.make('CartPole-v7')
     with pytest.raises(ValueError, match=r"class .*FlattenObservation'>; allowed: a list"):
         fetch_hand_sim.make_vec('FetchPush', wrappers=gymnasium.wrappers.FlattenObservation)
 
