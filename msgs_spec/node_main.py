@@ -211,7 +211,13 @@ def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any
         init(args=args, signal_handler_options=handlers)
     except Exception as error:
         # rclpy raises several unrelated types for malformed `--ros-args`.
-        raise UsageError(one_line(error, longest=1000)) from None
+        line = one_line(error, longest=1000)
+        if type(error).__name__ == 'UnknownROSArgsError':
+            line = (
+                f'unknown after --ros-args: {line.strip("[]")}; a parameter is -p <name>:=<value>, '
+                'a remapping -r <from>:=<to>'
+            )
+        raise UsageError(line) from None
 
 
 def _refuse_arguments(args: Sequence[str]) -> None:

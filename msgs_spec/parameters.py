@@ -144,7 +144,7 @@ SIM_NODE = (
         'command_timeout',
         'double',
         0.5,
-        'Seconds without a command after which the robot holds; 0 never.',
+        'Seconds without a command after which the robot holds; 0 never within an episode.',
         lower=0.0,
         upper=3600.0,
         read_only=False,

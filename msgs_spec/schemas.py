@@ -15,6 +15,9 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+# The longest message that a robot sends or understands has 3 KB; what is longer than this is
+# dropped before it is decoded or logged.
+MAX_MESSAGE_BYTES = 64 * 2**10
 # What the type store raises for bytes that are not such a message; asserts find bytes left over.
 _UNREADABLE = (AssertionError, IndexError, MemoryError, SerdeError, struct.error)
 

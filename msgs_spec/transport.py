@@ -19,6 +19,7 @@ _PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
 # Who sets one of these has decided; the last two count only where the range is left to ROS.
 _DECISIONS = (_PROFILES, _TRANSPORTS, 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS')
+_LAST_DOMAIN = '232'
 _UDP_ONLY = Path(__file__).with_name('fastdds_udp.xml')
 
 
@@ -34,6 +35,9 @@ def leave_out_shared_memory(environment: MutableMapping[str, str] = os.environ) 
     """
     middleware = environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp'
     if not middleware.startswith('rmw_fastrtps') or any(map(environment.get, _DECISIONS)):
+        return
+    # The last domain has no ports for as many participants as the profile looks for.
+    if environment.get('ROS_DOMAIN_ID') == _LAST_DOMAIN:
         return
     if environment.get(_RANGE) == 'LOCALHOST':
         # For this range rmw_fastrtps adds shared memory whatever the variables say: the profile

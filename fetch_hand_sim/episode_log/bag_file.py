@@ -15,11 +15,11 @@ from mcap.writer import CompressionType, IndexType, Writer
 from fetch_hand_sim.episode_log.bag_metadata import BagInfo, ChannelSpec
 from fetch_hand_sim.episode_log.limits import (
     MAX_CHUNKS,
-    MAX_MESSAGE_BYTES,
     MAX_MESSAGES,
     MAX_TOPICS,
     MAX_UNPACKED_BYTES,
 )
+from msgs_spec.schemas import MAX_MESSAGE_BYTES
 
 Compression = Literal['none', 'lz4', 'zstd']
 COMPRESSIONS = {

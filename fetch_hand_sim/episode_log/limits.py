@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from collections import Counter
 
-# A message: the longest a robot sends or understands has 3 KB. A robot drops what is longer before
-# it decodes or logs it.
-MAX_MESSAGE_BYTES = 64 * 2**10
+from msgs_spec.schemas import MAX_MESSAGE_BYTES
+
 # Messages of a file, and the topics they belong to.
 MAX_MESSAGES = 50_000
 MAX_TOPICS = 64

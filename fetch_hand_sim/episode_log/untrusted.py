@@ -26,7 +26,6 @@ from mcap.stream_reader import StreamReader
 from fetch_hand_sim.episode_log.limits import (
     MAX_CHUNK_BYTES,
     MAX_FILE_BYTES,
-    MAX_MESSAGE_BYTES,
     MAX_MESSAGES,
     MAX_METADATA_RECORDS,
     MAX_RECORD_BYTES,
@@ -34,6 +33,7 @@ from fetch_hand_sim.episode_log.limits import (
     MAX_TOPICS,
     MAX_UNPACKED_BYTES,
 )
+from msgs_spec.schemas import MAX_MESSAGE_BYTES
 
 # Opcode and length of a record; channel, sequence, log time and publish time of a message.
 RECORD = struct.Struct('<BQ')

@@ -60,4 +60,6 @@ def accept_perturbation(
 
 def _sizes(wrench: Array) -> tuple[float, float]:
     """Sizes of the force, N, and of the torque, N m."""
-    return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
+    # Whatever is too large to be squared is beyond every limit.
+    with np.errstate(over='ignore'):
+        return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))

@@ -16,6 +16,8 @@ from msgs_spec.tick import EpisodeStatus, Tick
 
 # Simulated time of the first tick. Not 0, because ROS takes a time of 0 for "no time yet".
 FIRST_STAMP_NS = 1_000_000_000
+# How many seeds there are; the first follows the last.
+_SEEDS = 2**32
 
 
 class EpisodeRunner:
@@ -80,9 +82,10 @@ class EpisodeRunner:
     @property
     def seed(self) -> int:
         """Seed of the running or next episode."""
+        first = self._first_seed
         if self.is_between_episodes and self._new_first_seed is not None:
-            return self._new_first_seed + self.episode
-        return self._first_seed + self.episode
+            first = self._new_first_seed
+        return (first + self.episode) % _SEEDS
 
     @property
     def has_started(self) -> bool:

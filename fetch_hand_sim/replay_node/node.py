@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool
 
@@ -18,6 +17,7 @@ from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplayS
 from msgs_spec.command_line import UsageError
 from msgs_spec.listeners import Listeners
 from msgs_spec.node_main import StopSignals
+from msgs_spec.parameter_requests import CheckedNode
 from msgs_spec.parameters import REPLAY_NODE
 from msgs_spec.ros import (
     await_acknowledgements,
@@ -32,7 +32,7 @@ _SPIN = 0.1
 _CLOCK = '/clock'
 
 
-class ReplayNode(Node):
+class ReplayNode(CheckedNode):
     """Publishes an episode, once or in a loop.
 
     Raises:

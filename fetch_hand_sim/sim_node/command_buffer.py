@@ -63,6 +63,11 @@ class CommandBuffer:
         self._received_at: float | None = None
         self.has_fresh_command = False
 
+    @property
+    def has_command(self) -> bool:
+        """Whether a valid command came in this episode."""
+        return self._command is not None
+
     def age(self) -> float | None:
         """Seconds since the last valid command of any episode, or None if none ever came."""
         return None if self._received_at is None else self._clock() - self._received_at

@@ -184,7 +184,8 @@ def lasting_problems(robot: Robot, surroundings: Surroundings) -> list[tuple[Lev
         problems.append((Level.ERROR, f'{line}robots but one with publish_clock:=false'))
     problems += [(Level.WARN, line) for line in surroundings.commander_problems]
     if robot.misses_commands and not robot.schedule.waits_for_commands:
-        does = 'holds' if robot.buffer.timeout else 'repeats the last one'
+        repeats = robot.buffer.has_command and not robot.buffer.timeout
+        does = 'repeats the last one' if repeats else 'holds'
         who = _who_commands(surroundings)
         problems.append((Level.WARN, f'commands have stopped, the robot {does}; {who}'))
     return problems

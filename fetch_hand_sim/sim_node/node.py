@@ -12,7 +12,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
@@ -35,6 +34,7 @@ from msgs_spec.command_line import UsageError
 from msgs_spec.diagnostics import REPORT_PERIOD, next_report
 from msgs_spec.event_loop import BEAT, EventLoop
 from msgs_spec.node_main import NodeFailure, StopSignals
+from msgs_spec.parameter_requests import CheckedNode
 from msgs_spec.parameters import SIM_NODE
 from msgs_spec.robots import require_joint_prefix
 from msgs_spec.ros import (
@@ -57,7 +57,7 @@ _OF_A_DISK = (errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO)
 _INTRODUCTION_TIME = 1.0
 
 
-class SimNode(Node):
+class SimNode(CheckedNode):
     """Publishes the state of one robot at every tick and applies the commands it receives.
 
     Raises:
@@ -248,7 +248,9 @@ class SimNode(Node):
         if remaining > 0.0:
             loop.wait(min(remaining, BEAT))
             return
-        loop.serve_pending(_SERVED_FIRST)
+        # In lockstep every command is a tick, so that the next one waits for its own.
+        if self._robot.schedule.mode != 'lockstep':
+            loop.serve_pending(_SERVED_FIRST)
         # A callback may have paused the robot.
         if not stop and self._robot.wait() <= 0.0:
             self._robot.tick_when_due()

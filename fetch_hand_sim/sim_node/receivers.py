@@ -6,10 +6,9 @@ import re
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from fetch_hand_sim.episode_log.limits import MAX_MESSAGE_BYTES
 from fetch_hand_sim.sim_node.robot import Robot
 from msgs_spec.codecs import decode_status
-from msgs_spec.schemas import deserialize, serialize
+from msgs_spec.schemas import MAX_MESSAGE_BYTES, deserialize, serialize
 from msgs_spec.topics import TopicSpec
 
 

@@ -220,7 +220,9 @@ class Robot:
             return Answer(True, f'{ends}; it was the last')
         starts = f'starts episode {runner.episode} with seed {runner.seed}'
         if not self.stands_still:
-            return Answer(True, f'{ends}; the next tick {starts}')
+            return Answer(
+                True, f'{ends}; the next tick {starts}; commands and goals count from then on'
+            )
         self._reset_due = self._time_of_silence()
         return Answer(True, f'{ends}; a tick of its own {starts}')
 

@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.node import Node
-
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.view.robot_watch import RobotWatch, SeenTick
 from fetch_hand_sim.visualization_node import NODE_NAME
@@ -30,6 +28,7 @@ from msgs_spec.arrays import Picture
 from msgs_spec.event_loop import BEAT, EventLoop
 from msgs_spec.listeners import Listeners
 from msgs_spec.node_main import NodeFailure, StopSignals
+from msgs_spec.parameter_requests import CheckedNode
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.ros import (
     count_publishers,
@@ -54,7 +53,7 @@ _STILL = 0.5
 _SERVED_FIRST = 200
 
 
-class VisualizationNode(Node):
+class VisualizationNode(CheckedNode):
     """Publishes the topics of `msgs_spec.view_topics`.
 
     Raises:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
@@ -18,11 +17,12 @@ from msgs_spec.command_line import UsageError
 from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports, next_report
 from msgs_spec.event_loop import BEAT, EventLoop
 from msgs_spec.node_main import NodeFailure, StopSignals
+from msgs_spec.parameter_requests import CheckedNode
 from msgs_spec.parameters import POLICY_NODE
 from msgs_spec.ros import rclpy_profile, ros_message_class, seldom
 from msgs_spec.ros_parameters import declare_parameters, set_callback
-from msgs_spec.schemas import serialize
-from msgs_spec.tasks import TASKS
+from msgs_spec.schemas import MAX_MESSAGE_BYTES, deserialize, serialize
+from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, STATE, QosSpec, TopicSpec, topic
 from policy_node.node import NODE_NAME
@@ -44,7 +44,7 @@ _REMEMBERED = 7
 _ANY_TASK = next(iter(TASKS.values()))
 
 
-class PolicyNode(Node):
+class PolicyNode(CheckedNode):
     """Waits for a robot, checks that the policy fits it, then answers every tick with a command.
 
     A robot that comes back with another task or rate is a new robot.
@@ -73,8 +73,9 @@ class PolicyNode(Node):
         self._report_due = time.monotonic() + REPORT_PERIOD
         self._elsewhere_from = time.monotonic() + _PATIENCE
         self._status_name = self.resolve_topic_name('episode_status')
-        self._subscribe(topic(_ANY_TASK, 'episode_status'), self._on_status)
-        self._subscribe(DIAGNOSTICS, self._on_diagnostics)
+        status = topic(_ANY_TASK, 'episode_status')
+        self._subscribe(status, self._reader(status, self._on_status))
+        self._subscribe(DIAGNOSTICS, self._reader(DIAGNOSTICS, self._on_diagnostics))
         self.add_on_set_parameters_callback(self._take_policy)
 
     def run(self, stop: StopSignals) -> None:
@@ -132,7 +133,7 @@ class PolicyNode(Node):
             raise NodeFailure(str(error)) from None
         self._responder, self._answered_status = responder, status
         state = [
-            self._subscribe(source, self._receiver(responder, source.name), STATE, raw=True)
+            self._subscribe(source, self._receiver(responder, source.name), STATE)
             for source in responder.topics
         ]
         self._of_robot += state
@@ -242,17 +243,15 @@ class PolicyNode(Node):
     def _subscribe(
         self,
         spec: TopicSpec,
-        callback: Callable[[Any], None],
+        callback: Callable[[bytes], None],
         qos: QosSpec | None = None,
-        *,
-        raw: bool = False,
     ) -> Subscription:
         return self.create_subscription(
             ros_message_class(spec.type_name),
             spec.name,
             callback,
             rclpy_profile(qos or spec.qos),
-            raw=raw,
+            raw=True,
         )
 
     def _publisher(self, spec: TopicSpec) -> Publisher:
@@ -260,9 +259,26 @@ class PolicyNode(Node):
             ros_message_class(spec.type_name), spec.name, rclpy_profile(spec.qos)
         )
 
+    def _reader(self, spec: TopicSpec, callback: Callable[[Any], None]) -> Callable[[bytes], None]:
+        """What hands readable messages on; diagnostics are of anybody, and no others are missed."""
+
+        def on_message(data: bytes) -> None:
+            try:
+                _require_short(data)
+                message = deserialize(spec.type_name, data)
+            except ValueError as error:
+                if spec is not DIAGNOSTICS:
+                    line = f'{spec.name} ignored: {error}'
+                    self.get_logger().warning(line, **seldom(_WARN_PERIOD))
+                return
+            callback(message)
+
+        return on_message
+
     def _receiver(self, responder: Responder, name: str) -> Callable[[bytes], None]:
         def on_message(data: bytes) -> None:
             try:
+                _require_short(data)
                 responder.receive(name, data)
             except ValueError as error:
                 self.get_logger().warning(f'state dropped: {error}', **seldom(_WARN_PERIOD))
@@ -279,6 +295,7 @@ class PolicyNode(Node):
     def _on_status(self, message: Any) -> None:
         try:
             status = EpisodeStatus.from_values(decode_status(message))
+            task_spec(status.task)
         except ValueError as error:
             self.get_logger().warning(f'ignored: {error}', **seldom(_WARN_PERIOD))
             return
@@ -344,3 +361,9 @@ class PolicyNode(Node):
             if last == wanted.name and wanted.type_name in types and self.count_publishers(name):
                 found.append(namespace or '/')
         return sorted(found)
+
+
+def _require_short(data: bytes) -> None:
+    """Refuses what takes longer to read than a tick lasts."""
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise ValueError(f'{len(data)} bytes given; allowed: up to {MAX_MESSAGE_BYTES}')

@@ -185,6 +185,10 @@ def test_quality_of_service_that_is_fixed_is_not_ignored_without_a_word():
         (['task:=FetchPush'], "sim_node: unknown argument 'task:=FetchPush'; parameters are given"),
         (['--ros-args', '-p', 'task:=FetchPush', '--', 'x'], "sim_node: unknown argument 'x'; "),
         (['--ros-args', '-p', 'joint_prefix:='], 'sim_node: joint_prefix:= has no value; '),
+        (
+            ['--ros-args', 'seed:=3'],
+            "sim_node: unknown after --ros-args: 'seed:=3'; a parameter is -p <name>:=<value>",
+        ),
     ],
 )
 def test_what_rclpy_ignores_or_does_not_explain_is_one_line(arguments, message):

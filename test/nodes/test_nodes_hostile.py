@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from std_msgs.msg import Float64MultiArray
 
 from msgs_spec.cdr import TopicCodec
@@ -129,7 +129,9 @@ def random_value(generator: np.random.Generator) -> ParameterValue:
             type=ParameterType.PARAMETER_DOUBLE_ARRAY, double_array_value=[number] * 1000
         ),
         ParameterValue(),
-    ][generator.integers(6)]
+        # No type that there is, which rclpy raises for.
+        ParameterValue(type=200, string_value='x'),
+    ][generator.integers(7)]
 
 
 def test_random_parameters_are_answered_and_only_allowed_ones_applied(
@@ -154,6 +156,12 @@ def test_random_parameters_are_answered_and_only_allowed_ones_applied(
             if name not in ('', 'no_such'):
                 assert result.successful == settable, (name, value.type, result)
             assert result.successful or result.reason
+        odd = Parameter(name='real_time_factor', value=ParameterValue(type=200))
+        together = robot.call(
+            SetParametersAtomically, 'sim_node/set_parameters_atomically', parameters=[odd]
+        )
+        assert not together.result.successful
+        assert together.result.reason.startswith('real_time_factor: type 200 given; allowed: 0 (NO')
         count = len(robot.received['joint_states'])
         robot.spin_until(lambda: len(robot.received['joint_states']) > count + 20, 'ticks')
     end(sim)

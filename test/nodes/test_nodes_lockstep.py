@@ -148,6 +148,22 @@ def test_resets_leave_a_policy_no_tick_behind(start_process: Start, tmp_path: Pa
             assert [message.data for message in messages] == undisturbed[number][name], number
 
 
+def test_every_command_of_a_burst_has_a_tick_of_its_own(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(mode='lockstep'))
+    with client(REACH) as robot:
+        robot.subscribe('applied_command', 'joint_states')
+        robot.connect('commands')
+        robot.spin_until(lambda: bool(robot.received['joint_states']), 'the reset')
+        applied = robot.received['applied_command']
+        sent = [0.125 * number for number in range(1, 8)]
+        for value in sent:
+            robot.publish('commands', Float64MultiArray(data=[value, 0.0, 0.0, 0.0]))
+        robot.spin_until(lambda: len(applied) >= len(sent), 'a tick for each')
+        robot.spin(0.3)
+        assert [message.data[0] for message in applied] == sent
+    end(sim)
+
+
 def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
     sim = start_process(*SIM_NODE, *ros_args(mode='lockstep'))
     with client(REACH) as robot:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import time
@@ -242,6 +243,22 @@ def test_a_robot_of_a_rate_that_physics_has_not_is_none(start_process: Start) ->
     output = end(policy)
     for control_hz in ('0', '30'):
         assert f'ignored: episode_status with control_hz {control_hz} is not' in output
+    assert 'Traceback' not in output
+
+
+def test_words_that_nobody_can_act_on_end_nothing(start_process: Start) -> None:
+    """Before there is a robot, when nothing is known that they could be held against."""
+    policy = start_process(*POLICY_NODE)
+    with client(REACH) as robot:
+        robot.connect('episode_status')
+        publish_status(robot, task='NoSuchTask')
+        robot.spin(1.2)
+        publish_status(robot, reason='x' * 100_000)
+        robot.spin(0.5)
+    end(_answered_robot(start_process, REACH))
+    output = end(policy)
+    assert "ignored: unknown task 'NoSuchTask'; allowed: FetchReach, " in output
+    assert re.search(r'episode_status ignored: 100\d\d\d bytes given; allowed: up to 65536', output)
     assert 'Traceback' not in output
 
 

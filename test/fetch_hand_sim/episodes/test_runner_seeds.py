@@ -31,6 +31,12 @@ def test_a_seed_holds_from_the_next_episode_on(simulation):
     assert seen == [3, 4, 100, 101]
 
 
+def test_the_first_seed_follows_the_last(simulation):
+    """So that every episode can be run again: no parameter takes more."""
+    runner = EpisodeRunner(simulation, first_seed=2**32 - 1)
+    assert [run_episode(runner)[0].status.seed for _ in range(2)] == [2**32 - 1, 0]
+
+
 def test_the_running_episode_keeps_its_own(simulation):
     runner = EpisodeRunner(simulation, first_seed=3)
     runner.advance(runner.resting_command())

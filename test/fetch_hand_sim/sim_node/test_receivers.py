@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fetch_hand_sim.episode_log.limits import MAX_MESSAGE_BYTES
 from fetch_hand_sim.sim_node.receivers import Receivers
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_message
-from msgs_spec.schemas import message_class, serialize
+from msgs_spec.schemas import MAX_MESSAGE_BYTES, message_class, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics
 from support.hostile_messages import hostile_bytes, introduction

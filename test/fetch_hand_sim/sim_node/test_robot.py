@@ -64,11 +64,13 @@ def test_step_ends_with_the_last_episode(make):
 def test_a_running_robot_says_what_follows_a_reset_and_does_it(make):
     case = make()
     assert case.robot.reset().message == (
-        'no episode is running; the next tick starts episode 0 with seed 0'
+        'no episode is running; the next tick starts episode 0 with seed 0; '
+        'commands and goals count from then on'
     )
     case.robot.tick()
     assert case.robot.reset().message == (
-        'episode 0 ends; the next tick starts episode 1 with seed 1'
+        'episode 0 ends; the next tick starts episode 1 with seed 1; '
+        'commands and goals count from then on'
     )
     case.robot.tick()
     status = case.ticks[-1][0].status
