@@ -90,7 +90,7 @@ class TopicCodec:
         if self._is_bool:
             return 0, np.array([float(data[_BODY] != 0)])
         floats = np.frombuffer(data, '<f8', self._floats, _BODY)
-        return seconds * 10**9 + nanoseconds, floats[self._slots]
+        return codecs.stamp_of(seconds, nanoseconds), floats[self._slots]
 
     def decode_many(self, messages: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array]:
         """Decodes messages of this project's layout at array speed.

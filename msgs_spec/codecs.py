@@ -23,9 +23,24 @@ _NANOSECONDS = 10**9
 
 
 def message_stamp(message: Any) -> int:
-    """Returns the stamp of a message with a header, or of a Clock, in nanoseconds."""
+    """Returns the stamp of a message with a header, or of a Clock, in nanoseconds.
+
+    Raises:
+        ValueError: If it has a second or more of nanoseconds.
+    """
     stamp = message.header.stamp if hasattr(message, 'header') else message.clock
-    return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
+    return stamp_of(int(stamp.sec), int(stamp.nanosec))
+
+
+def stamp_of(seconds: int, nanoseconds: int) -> int:
+    """Returns a stamp in nanoseconds; with a second or more of these it could not be sent again.
+
+    Raises:
+        ValueError: If there are as many.
+    """
+    if nanoseconds >= _NANOSECONDS:
+        raise ValueError(f'stamp with nanosec {nanoseconds}; allowed: less than {_NANOSECONDS}')
+    return seconds * _NANOSECONDS + nanoseconds
 
 
 def build_message(topic: TopicSpec, stamp: int, values: ArrayLike) -> Any:

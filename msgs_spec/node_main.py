@@ -52,10 +52,13 @@ class StopSignals:
 
     Attributes:
         received: Name of the signal that came, None if none did.
+        second_ends: Whether another one, a second or more after it, ends the process at once: of
+            nodes that call code of somebody else's, which may never come back.
     """
 
     def __init__(self) -> None:
         self.received: str | None = None
+        self.second_ends = False
         self._received_at = -math.inf
         for number in heard([signal.SIGINT, signal.SIGTERM, signal.SIGHUP]):
             signal.signal(number, self._handle)
@@ -66,6 +69,10 @@ class StopSignals:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
+        is_second = self.received is not None
+        if self.second_ends and is_second and time.monotonic() - self._received_at > _AT_ONCE:
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
         self.received = signal.Signals(number).name
         self._received_at = time.monotonic()
 
@@ -94,6 +101,7 @@ def node_main(
     load: Callable[[], Callable[[], RunnableNode]],
     args: list[str] | None = None,
     shared_memory: bool = False,
+    second_signal_ends: bool = False,
 ) -> int:
     """Runs a node of `NODES` as a process, or prints its help; returns the exit code of `run_node`.
 
@@ -103,11 +111,17 @@ def node_main(
         load: Imports the class of the node, which may take long.
         args: Command line; None for that of the process.
         shared_memory: As in `run_node`.
+        second_signal_ends: As `StopSignals.second_ends`.
     """
     given = sys.argv[1:] if args is None else args
     if '-h' in given or '--help' in given:
         return run_command(name, lambda: _print_usage(name, summary))
-    return run_node(name, lambda stop: _run(load, stop), args, shared_memory)
+
+    def run(stop: StopSignals) -> None:
+        stop.second_ends = second_signal_ends
+        _run(load, stop)
+
+    return run_node(name, run, args, shared_memory)
 
 
 def _print_usage(name: str, summary: str) -> int:

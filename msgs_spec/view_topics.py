@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 
 from msgs_spec.tasks import TaskSpec, VectorPart
 from msgs_spec.topics import LATCHED, WORLD, TopicSpec
 
+# Robots that are remembered: whoever publishes chooses names of joints.
+_ROBOTS = 256
 # Before the scalars of a tick, so that tools group them.
 _SCALARS = 'scalars/'
 
@@ -43,7 +45,7 @@ def _scalar(name: str, unit: str, text: str) -> TopicSpec:
     return TopicSpec(f'{_SCALARS}{name}', 'geometry_msgs/msg/Vector3Stamped', text, layout)
 
 
-@cache
+@lru_cache(maxsize=_ROBOTS)
 def scalar_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Returns the numbers of a tick that are worth a plot, stamped with it."""
     found = []
@@ -65,7 +67,7 @@ def scalar_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     )
 
 
-@cache
+@lru_cache(maxsize=_ROBOTS)
 def view_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Returns all topics of the node, for a robot that does a task."""
     return (*SHOWN, *scalar_topics(task))

@@ -29,6 +29,8 @@ from msgs_spec.ros_parameters import declare_parameters, set_callback
 
 # Seconds between looks at the stop flag while nothing is due.
 _SPIN = 0.1
+# Seconds of a stall after which a replay goes on from where it was.
+_LONGEST_STALL = 0.5
 _CLOCK = '/clock'
 
 
@@ -160,8 +162,13 @@ class ReplayNode(CheckedNode):
             self._publishers_by_topic[_CLOCK].publish(self._last_clock)
 
     def _publish_due(self) -> None:
-        position = self._playhead.position_ns(time.monotonic())
-        messages = self._schedule.messages
+        now, messages = time.monotonic(), self._schedule.messages
+        if self._next < len(messages):
+            due = messages[self._next].time_ns
+            # Nobody could take all of it at once: time that was lost is not made up for.
+            if self._playhead.remaining(due, now) < -_LONGEST_STALL:
+                self._playhead.jump(due, now)
+        position = self._playhead.position_ns(now)
         while (
             not self._playhead.is_paused
             and self._next < len(messages)

@@ -23,4 +23,5 @@ def main(args: list[str] | None = None) -> int:
 
         return PolicyNode
 
-    return node_main(NODE_NAME, SUMMARY, load, args)
+    # A policy may be code of the user's own, which may hang.
+    return node_main(NODE_NAME, SUMMARY, load, args, second_signal_ends=True)

@@ -296,10 +296,10 @@ class PolicyNode(CheckedNode):
         try:
             status = EpisodeStatus.from_values(decode_status(message))
             task_spec(status.task)
+            stamp = message_stamp(message)
         except ValueError as error:
             self.get_logger().warning(f'ignored: {error}', **seldom(_WARN_PERIOD))
             return
-        stamp = message_stamp(message)
         if not self._may_follow(status):
             line = f'ignored: another robot here, {status.task} at {status.control_hz:g} Hz'
             self.get_logger().warning(line, **seldom(_WARN_PERIOD))
@@ -343,6 +343,9 @@ class PolicyNode(CheckedNode):
             return
         self._report_due = next_report(self._report_due, now)
         robots = self.count_publishers(self._status_name)
+        if not robots and self._responder is not None:
+            # Whoever comes next begins anew, also where its first stamp is the last one heard.
+            self._responder.forget()
         elsewhere = [] if robots or now < self._elsewhere_from else self._robots_elsewhere()
         pace = self._pace if now < self._pace_until else None
         state = [each for each in self._of_robot if isinstance(each, Subscription)]

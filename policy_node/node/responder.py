@@ -71,7 +71,7 @@ class Responder:
         self._ask_again_at = 0.0
         self._unsent: bytes | None = None
         self.topics = self._assembler.topics
-        self.join = StampJoin(source.name for source in self.topics)
+        self.join = StampJoin((source.name for source in self.topics), clock=clock)
         self.answered = 0
         self.overtaken = 0
         self.unusable = 0

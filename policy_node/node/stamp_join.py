@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+import time
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,8 @@ Vectors = dict[str, NDArray[np.float64]]
 
 # Nanoseconds: a stamp further back is no late message but a simulation started anew.
 _LONGEST_DELAY = 1_000_000_000
+# Seconds after which no message is late any more.
+_LATEST = 1.0
 
 
 class StampJoin:
@@ -18,22 +22,31 @@ class StampJoin:
 
     Stamps that are incomplete when a later one completes are dropped, and so is everything that
     arrives for a stamp no later than the last complete one: an actor wants the newest state, not
-    every state. A stamp of long before is a simulation started anew as soon as it is complete; a
-    stranger's message on one of the topics, with a stamp from anywhere, is never.
+    every state. A stamp of long before, or before one that completed long ago, is a simulation
+    started anew as soon as it is complete; a stranger's message on one of the topics, with a stamp
+    from anywhere, is never.
 
     Args:
         topics: Names of the topics to join.
         max_pending: Incomplete stamps kept; the one that came first goes first.
+        clock: A steady clock, seconds.
 
     Attributes:
         dropped: Incomplete stamps that were given up.
     """
 
-    def __init__(self, topics: Iterable[str], max_pending: int = 8) -> None:
+    def __init__(
+        self,
+        topics: Iterable[str],
+        max_pending: int = 8,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._topics = frozenset(topics)
         self._max_pending = max_pending
         self._pending: dict[int, Vectors] = {}
         self._last: int | None = None
+        self._clock = clock
+        self._completed_at = -math.inf
         self.dropped = 0
 
     def add(self, topic: str, stamp: int, vector: NDArray[np.float64]) -> Vectors | None:
@@ -47,7 +60,7 @@ class StampJoin:
         Returns:
             The vectors of all topics if they are complete for this stamp, else None.
         """
-        if self._last is not None and 0 <= self._last - stamp <= _LONGEST_DELAY:
+        if self._last is not None and self._is_late(self._last - stamp):
             return None
         vectors = self._pending.setdefault(stamp, {})
         vectors[topic] = vector
@@ -64,8 +77,15 @@ class StampJoin:
         self._last = None
         self._pending.clear()
 
+    def _is_late(self, delay: int) -> bool:
+        """Whether a stamp that is so much earlier than the last one is of the same simulation."""
+        if delay == 0:
+            return True
+        is_recent = self._clock() - self._completed_at < _LATEST
+        return 0 < delay <= _LONGEST_DELAY and is_recent
+
     def _complete(self, stamp: int) -> None:
-        self._last = stamp
+        self._last, self._completed_at = stamp, self._clock()
         del self._pending[stamp]
         # Late by now, or of the time before a new beginning.
         lost = [other for other in self._pending if not stamp < other <= stamp + _LONGEST_DELAY]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -197,7 +198,7 @@ def test_a_robot_whose_topics_have_other_names_is_found(start_process: Start) ->
     end(policy)
 
 
-def publish_status(robot: Client, **values: str) -> None:
+def publish_status(robot: Client, nanosec: int = 0, **values: str) -> None:
     """What a robot says of itself that publishes nothing else."""
     status = topic(REACH, 'episode_status')
     said = EpisodeStatus(
@@ -213,6 +214,7 @@ def publish_status(robot: Client, **values: str) -> None:
         is_success=False,
     )
     message = build_status(status, 0, 'episode', said.to_values() | values)
+    message.header.stamp.nanosec = nanosec
     robot.publish(status.name, serialize(status.type_name, message))
 
 
@@ -254,12 +256,47 @@ def test_words_that_nobody_can_act_on_end_nothing(start_process: Start) -> None:
         publish_status(robot, task='NoSuchTask')
         robot.spin(1.2)
         publish_status(robot, reason='x' * 100_000)
+        robot.spin(1.2)
+        # More nanoseconds than can be sent again.
+        publish_status(robot, nanosec=10**9)
         robot.spin(0.5)
     end(_answered_robot(start_process, REACH))
     output = end(policy)
     assert "ignored: unknown task 'NoSuchTask'; allowed: FetchReach, " in output
+    assert 'ignored: stamp with nanosec 1000000000; allowed: less than 1000000000' in output
     assert re.search(r'episode_status ignored: 100\d\d\d bytes given; allowed: up to 65536', output)
     assert 'Traceback' not in output
+
+
+HANGING = """
+import time
+
+
+class Hanging:
+    def predict(self, observation, *, deterministic=True):
+        print('asked', flush=True)
+        time.sleep(600.0)
+
+
+def make(task):
+    return Hanging()
+"""
+
+
+def test_a_policy_that_hangs_is_ended_by_the_second_ctrl_c(
+    start_process: Start, tmp_path: Path
+) -> None:
+    (tmp_path / 'hanging_policy.py').write_text(HANGING)
+    parameters = {'policy': 'hanging_policy:make', 'trust': True, 'task': 'FetchReach'}
+    policy = start_process(*POLICY_NODE, *ros_args(**parameters), cwd=tmp_path)
+    assert policy.stdout is not None
+    while 'asked' not in policy.stdout.readline():
+        assert policy.poll() is None
+    policy.send_signal(signal.SIGINT)
+    time.sleep(1.2)
+    assert policy.poll() is None
+    policy.send_signal(signal.SIGINT)
+    assert policy.wait(timeout=10) == -signal.SIGINT
 
 
 def test_a_robot_that_does_not_fit_ends_nothing_that_works(start_process: Start) -> None:

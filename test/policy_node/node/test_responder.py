@@ -166,6 +166,19 @@ def test_join_keeps_a_bounded_number_of_incomplete_stamps():
     assert join.dropped == 10_000 - 8
 
 
+def test_an_earlier_stamp_is_late_only_for_a_while():
+    """A robot that was started again begins a little before the last stamp, too."""
+    now = [0.0]
+    join = StampJoin(['a'], clock=lambda: now[0])
+    assert join.add('a', 2_000_000_000, np.zeros(1)) is not None
+    assert join.add('a', 1_960_000_000, np.zeros(1)) is None
+    now[0] = 1.5
+    # Repeated for who comes late.
+    assert join.add('a', 2_000_000_000, np.zeros(1)) is None
+    assert join.add('a', 1_000_000_000, np.zeros(1)) is not None
+    assert join.add('a', 1_040_000_000, np.zeros(1)) is not None
+
+
 def test_random_commands_are_valid_and_start_alike():
     first, second = (Commander(load_policy('random', 'HandReach'), 25.0) for _ in range(2))
     commands = [first.command({'observation': np.zeros(63)}) for _ in range(3)]
