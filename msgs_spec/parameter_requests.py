@@ -6,46 +6,46 @@ request of anybody would.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParameters
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.parameter_service import ParameterService
+if TYPE_CHECKING:
+    from rcl_interfaces.msg import SetParametersResult
+    from rclpy.node import Node
 
 
-class ParameterRequests(ParameterService):
-    """The parameter services of a node that is made with `start_parameter_services=False`."""
+def serve_parameter_requests(node: Node) -> None:
+    """Offers the parameter services of a node made with `start_parameter_services=False`."""
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter_service import ParameterService
 
-    def _set_parameters_callback(self, request: Any, response: Any) -> Any:
-        for parameter in request.parameters:
-            refused = _refusal(parameter)
-            if refused is None:
-                one = SetParameters.Request(parameters=[parameter])
-                super()._set_parameters_callback(one, response)  # type: ignore[no-untyped-call]
-            else:
-                response.results.append(refused)
-        return response
-
-    def _set_parameters_atomically_callback(self, request: Any, response: Any) -> Any:
-        for refused in filter(None, map(_refusal, request.parameters)):
-            response.result = refused
+    class ParameterRequests(ParameterService):
+        def _set_parameters_callback(self, request: Any, response: Any) -> Any:
+            answer = super()._set_parameters_callback
+            for parameter in request.parameters:
+                refused = _refusal(parameter)
+                if refused is None:
+                    one = SetParameters.Request(parameters=[parameter])
+                    answer(one, response)  # type: ignore[no-untyped-call]
+                else:
+                    response.results.append(refused)
             return response
-        answer = super()._set_parameters_atomically_callback
-        return answer(request, response)  # type: ignore[no-untyped-call]
 
+        def _set_parameters_atomically_callback(self, request: Any, response: Any) -> Any:
+            for refused in filter(None, map(_refusal, request.parameters)):
+                response.result = refused
+                return response
+            answer = super()._set_parameters_atomically_callback
+            return answer(request, response)  # type: ignore[no-untyped-call]
 
-class CheckedNode(Node):
-    """A node that no request for a parameter ends."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__(name, start_parameter_services=False)
-        self._parameter_requests = ParameterRequests(self)  # type: ignore[no-untyped-call]
+    # Its services keep it alive.
+    ParameterRequests(node)  # type: ignore[no-untyped-call]
 
 
 def _refusal(message: Any) -> SetParametersResult | None:
     """Why no parameter can be made of a message; None if one can."""
+    from rcl_interfaces.msg import SetParametersResult
+    from rclpy.parameter import Parameter
+
     try:
         Parameter.from_parameter_msg(message)
     except ValueError:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from msgs_spec.command_line import UsageError
+from msgs_spec.parameter_requests import serve_parameter_requests
 from msgs_spec.parameters import ParameterSpec, unknown_parameter, validate
 
 if TYPE_CHECKING:
@@ -18,11 +19,14 @@ if TYPE_CHECKING:
 def declare_parameters(node: Node, specs: Sequence[ParameterSpec]) -> dict[str, Any]:
     """Declares parameters with description and range and returns their values.
 
+    Requests for them are answered from then on: the node is made without rclpy's services for them.
+
     Parameters that it was given and does not have, or that have a new name, are named in a warning.
 
     Raises:
         UsageError: If a value given at the start is not allowed.
     """
+    serve_parameter_requests(node)
     # rclpy has no public way to see what was given before it is declared.
     given: dict[str, Parameter] = node._parameter_overrides
     for spec in specs:

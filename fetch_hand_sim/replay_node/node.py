@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool
 
@@ -17,7 +18,6 @@ from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplayS
 from msgs_spec.command_line import UsageError
 from msgs_spec.listeners import Listeners
 from msgs_spec.node_main import StopSignals
-from msgs_spec.parameter_requests import CheckedNode
 from msgs_spec.parameters import REPLAY_NODE
 from msgs_spec.ros import (
     await_acknowledgements,
@@ -34,7 +34,7 @@ _LONGEST_STALL = 0.5
 _CLOCK = '/clock'
 
 
-class ReplayNode(CheckedNode):
+class ReplayNode(Node):
     """Publishes an episode, once or in a loop.
 
     Raises:
@@ -42,7 +42,7 @@ class ReplayNode(CheckedNode):
     """
 
     def __init__(self) -> None:
-        super().__init__(NODE_NAME)
+        super().__init__(NODE_NAME, start_parameter_services=False)
         self._settings = declare_parameters(self, REPLAY_NODE)
         self._schedule = self._read_schedule()
         self._start_ns = self._schedule.start_ns + round(self._settings['start_offset'] * 1e9)

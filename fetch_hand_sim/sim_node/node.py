@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
@@ -34,7 +35,6 @@ from msgs_spec.command_line import UsageError
 from msgs_spec.diagnostics import REPORT_PERIOD, next_report
 from msgs_spec.event_loop import BEAT, EventLoop
 from msgs_spec.node_main import NodeFailure, StopSignals
-from msgs_spec.parameter_requests import CheckedNode
 from msgs_spec.parameters import SIM_NODE
 from msgs_spec.robots import require_joint_prefix
 from msgs_spec.ros import (
@@ -57,7 +57,7 @@ _OF_A_DISK = (errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO)
 _INTRODUCTION_TIME = 1.0
 
 
-class SimNode(CheckedNode):
+class SimNode(Node):
     """Publishes the state of one robot at every tick and applies the commands it receives.
 
     Raises:
@@ -65,7 +65,7 @@ class SimNode(CheckedNode):
     """
 
     def __init__(self) -> None:
-        super().__init__(NODE_NAME)
+        super().__init__(NODE_NAME, start_parameter_services=False)
         self._settings = declare_parameters(self, SIM_NODE)
         self._refuse_simulated_time()
         self._robot = self._make_robot()

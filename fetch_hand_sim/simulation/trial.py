@@ -7,7 +7,7 @@ is not the one that is drawn go on for days before somebody sees them.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -17,9 +17,7 @@ from fetch_hand_sim.simulation.models import load_model
 from fetch_hand_sim.simulation.tasks import Task
 from msgs_spec.arrays import Array
 from msgs_spec.command_line import one_line
-
-if TYPE_CHECKING:
-    from fetch_hand_sim.simulation.simulation import Simulation
+from msgs_spec.tasks import TaskSpec
 
 # Long enough for everything to move.
 _TICKS = 3
@@ -30,7 +28,23 @@ _ROUNDING = 1e-9
 TRIED: set[tuple[str, type[Task]]] = set()
 
 
-def try_out(simulation: Simulation) -> Iterator[str]:
+class TwoSimulations(Protocol):
+    """What is asked of a `Simulation` with two copies."""
+
+    spec: TaskSpec
+
+    @property
+    def task(self) -> Task:
+        """The physics."""
+
+    def reset(self, seed: Any, ids: Any = None) -> Any:
+        """Starts copies again."""
+
+    def step(self, actions: Array) -> Any:
+        """Advances both by a tick."""
+
+
+def try_out(simulation: TwoSimulations) -> Iterator[str]:
     """Resets, steps and resets one of two simulations again, from the same seed.
 
     Args:
@@ -58,7 +72,7 @@ def try_out(simulation: Simulation) -> Iterator[str]:
         yield 'reset changes simulations that are not among its ids'
 
 
-def _move(simulation: Simulation) -> None:
+def _move(simulation: TwoSimulations) -> None:
     actions = np.full((2, simulation.spec.robot.action_size), _ACTION)
     try:
         for _ in range(_TICKS):
@@ -69,7 +83,7 @@ def _move(simulation: Simulation) -> None:
         raise SpecificationError(line) from error
 
 
-def _sensed(simulation: Simulation) -> Array:
+def _sensed(simulation: TwoSimulations) -> Array:
     """What all sensors say, (2, size)."""
     return np.concatenate(list(simulation.task.readings().values()), axis=1)
 

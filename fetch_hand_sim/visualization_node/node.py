@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.node import Node
+
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.view.robot_watch import RobotWatch, SeenTick
 from fetch_hand_sim.visualization_node import NODE_NAME
@@ -28,7 +30,6 @@ from msgs_spec.arrays import Picture
 from msgs_spec.event_loop import BEAT, EventLoop
 from msgs_spec.listeners import Listeners
 from msgs_spec.node_main import NodeFailure, StopSignals
-from msgs_spec.parameter_requests import CheckedNode
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.ros import (
     count_publishers,
@@ -53,7 +54,7 @@ _STILL = 0.5
 _SERVED_FIRST = 200
 
 
-class VisualizationNode(CheckedNode):
+class VisualizationNode(Node):
     """Publishes the topics of `msgs_spec.view_topics`.
 
     Raises:
@@ -61,7 +62,7 @@ class VisualizationNode(CheckedNode):
     """
 
     def __init__(self) -> None:
-        super().__init__(NODE_NAME)
+        super().__init__(NODE_NAME, start_parameter_services=False)
         settings = declare_parameters(self, VISUALIZATION_NODE)
         self._robot: tuple[str, str] | None = None
         self._scene: Scene | None = None

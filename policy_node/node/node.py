@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
@@ -17,7 +18,6 @@ from msgs_spec.command_line import UsageError
 from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports, next_report
 from msgs_spec.event_loop import BEAT, EventLoop
 from msgs_spec.node_main import NodeFailure, StopSignals
-from msgs_spec.parameter_requests import CheckedNode
 from msgs_spec.parameters import POLICY_NODE
 from msgs_spec.ros import rclpy_profile, ros_message_class, seldom
 from msgs_spec.ros_parameters import declare_parameters, set_callback
@@ -44,7 +44,7 @@ _REMEMBERED = 7
 _ANY_TASK = next(iter(TASKS.values()))
 
 
-class PolicyNode(CheckedNode):
+class PolicyNode(Node):
     """Waits for a robot, checks that the policy fits it, then answers every tick with a command.
 
     A robot that comes back with another task or rate is a new robot.
@@ -54,7 +54,7 @@ class PolicyNode(CheckedNode):
     """
 
     def __init__(self) -> None:
-        super().__init__(NODE_NAME)
+        super().__init__(NODE_NAME, start_parameter_services=False)
         self._settings = declare_parameters(self, POLICY_NODE)
         self._loaded = self._load_ahead()
         self._status: EpisodeStatus | None = None
