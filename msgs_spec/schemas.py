@@ -56,6 +56,16 @@ def type_hash(type_name: str) -> str:
     return _store().hash_rihs01(type_name)
 
 
+def require_short(data: bytes) -> None:
+    """Refuses what takes longer to read than a tick lasts.
+
+    Raises:
+        ValueError: If there are more than `MAX_MESSAGE_BYTES`.
+    """
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise ValueError(f'{len(data)} bytes given; allowed: up to {MAX_MESSAGE_BYTES}')
+
+
 def serialize(type_name: str, message: object) -> bytes:
     """Returns the CDR bytes (little endian, with encapsulation header) of a message.
 

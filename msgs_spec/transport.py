@@ -36,13 +36,11 @@ def leave_out_shared_memory(environment: MutableMapping[str, str] = os.environ) 
     middleware = environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp'
     if not middleware.startswith('rmw_fastrtps') or any(map(environment.get, _DECISIONS)):
         return
+    if environment.get(_RANGE) != 'LOCALHOST':
+        environment[_TRANSPORTS] = 'UDPv4'
     # The last domain has no ports for as many participants as the profile looks for.
-    if environment.get('ROS_DOMAIN_ID') == _LAST_DOMAIN:
-        return
-    if environment.get(_RANGE) == 'LOCALHOST':
+    elif environment.get('ROS_DOMAIN_ID') != _LAST_DOMAIN:
         # For this range rmw_fastrtps adds shared memory whatever the variables say: the profile
         # takes the place of the range.
         environment[_RANGE] = 'SYSTEM_DEFAULT'
         environment[_PROFILES] = str(_UDP_ONLY)
-    else:
-        environment[_TRANSPORTS] = 'UDPv4'

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from fetch_hand_sim.sim_node.robot import Robot
 from msgs_spec.codecs import decode_status
-from msgs_spec.schemas import MAX_MESSAGE_BYTES, deserialize, serialize
+from msgs_spec.schemas import deserialize, require_short, serialize
 from msgs_spec.topics import TopicSpec
 
 
@@ -76,9 +76,10 @@ class Receivers:
 
     def _read(self, spec: TopicSpec, data: bytes) -> Any:
         """The message, or None after a line and a count where there is none."""
-        if len(data) > MAX_MESSAGE_BYTES:
-            line = f'{len(data)} bytes given; allowed: up to {MAX_MESSAGE_BYTES}'
-            return self._drop(spec, 'too long', line)
+        try:
+            require_short(data)
+        except ValueError as error:
+            return self._drop(spec, 'too long', str(error))
         try:
             return deserialize(spec.type_name, data)
         except ValueError as error:

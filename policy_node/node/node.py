@@ -21,7 +21,7 @@ from msgs_spec.node_main import NodeFailure, StopSignals
 from msgs_spec.parameters import POLICY_NODE
 from msgs_spec.ros import rclpy_profile, ros_message_class, seldom
 from msgs_spec.ros_parameters import declare_parameters, set_callback
-from msgs_spec.schemas import MAX_MESSAGE_BYTES, deserialize, serialize
+from msgs_spec.schemas import deserialize, require_short, serialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, STATE, QosSpec, TopicSpec, topic
@@ -264,7 +264,7 @@ class PolicyNode(Node):
 
         def on_message(data: bytes) -> None:
             try:
-                _require_short(data)
+                require_short(data)
                 message = deserialize(spec.type_name, data)
             except ValueError as error:
                 if spec is not DIAGNOSTICS:
@@ -278,7 +278,7 @@ class PolicyNode(Node):
     def _receiver(self, responder: Responder, name: str) -> Callable[[bytes], None]:
         def on_message(data: bytes) -> None:
             try:
-                _require_short(data)
+                require_short(data)
                 responder.receive(name, data)
             except ValueError as error:
                 self.get_logger().warning(f'state dropped: {error}', **seldom(_WARN_PERIOD))
@@ -364,9 +364,3 @@ class PolicyNode(Node):
             if last == wanted.name and wanted.type_name in types and self.count_publishers(name):
                 found.append(namespace or '/')
         return sorted(found)
-
-
-def _require_short(data: bytes) -> None:
-    """Refuses what takes longer to read than a tick lasts."""
-    if len(data) > MAX_MESSAGE_BYTES:
-        raise ValueError(f'{len(data)} bytes given; allowed: up to {MAX_MESSAGE_BYTES}')

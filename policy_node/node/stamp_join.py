@@ -79,10 +79,9 @@ class StampJoin:
 
     def _is_late(self, delay: int) -> bool:
         """Whether a stamp that is so much earlier than the last one is of the same simulation."""
-        if delay == 0:
-            return True
-        is_recent = self._clock() - self._completed_at < _LATEST
-        return 0 < delay <= _LONGEST_DELAY and is_recent
+        if not 0 < delay <= _LONGEST_DELAY:
+            return delay == 0
+        return self._clock() - self._completed_at < _LATEST
 
     def _complete(self, stamp: int) -> None:
         self._last, self._completed_at = stamp, self._clock()

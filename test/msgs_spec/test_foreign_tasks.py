@@ -5,14 +5,17 @@ from __future__ import annotations
 import logging
 import sys
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
 
 from msgs_spec import foreign_tasks
-from msgs_spec.tasks import TASKS, VectorPart, _accept, task_spec
+from msgs_spec.task_checks import accept
+from msgs_spec.tasks import TASKS, VectorPart, task_spec
 
 PUSH = replace(TASKS['FetchPush'], name='Pushed')
+_accept = partial(accept, known=dict(TASKS))
 FIRST = replace(PUSH.robot.command[0], lower=1.0, upper=1.0)
 
 
@@ -23,12 +26,12 @@ FIRST = replace(PUSH.robot.command[0], lower=1.0, upper=1.0)
         ({'robot': None}, 'robot is no RobotSpec but NoneType'),
         ({'goal': 'point'}, 'goal is no GoalKind but str'),
         ({'observation': list(PUSH.observation)}, 'unhashable .*tuples, not lists or arrays'),
-        ({'distance_threshold': -1.0}, 'distance_threshold -1.0; allowed: more than 0'),
-        ({'distance_threshold': float('nan')}, 'distance_threshold nan; allowed: more than 0'),
-        ({'episode_ticks': 0}, 'episode_ticks 0; allowed: more than 0'),
+        ({'distance_threshold': -1.0}, 'distance_threshold -1.0; allowed: a number of more than 0'),
+        ({'distance_threshold': float('nan')}, 'distance_threshold nan; allowed: a number of'),
+        ({'episode_ticks': 0}, 'episode_ticks 0; allowed: a whole number, 1 or more'),
         ({'distance_threshold': None}, 'distance_threshold None; allowed: a number of more than 0'),
         ({'rotation_threshold': '5'}, "rotation_threshold '5'; allowed: a number of more than 0"),
-        ({'episode_ticks': 30.5}, 'episode_ticks 30.5; allowed: a whole number of more than 0'),
+        ({'episode_ticks': 30.5}, 'episode_ticks 30.5; allowed: a whole number, 1 or more'),
         ({'observation': (('tip', 3, 'm'),)}, r"observation has \('tip', 3, 'm'\), which is no Ve"),
         ({'observation': (VectorPart('tip', 3.0, 'm'),)}, 'tip has size 3.0; allowed: 1 or more'),
         ({'formulas': (1, 2)}, 'formulas is no TaskFormulas but tuple'),

@@ -32,6 +32,7 @@ def test_discovery_stays_on_this_machine_unless_asked(before, after):
         ({RANGE: 'LOCALHOST', MIDDLEWARE: 'rmw_cyclonedds_cpp'}, {}),
         ({RANGE: 'LOCALHOST', PROFILES: 'mine.xml'}, {}),
         ({RANGE: 'LOCALHOST', 'ROS_DOMAIN_ID': '232'}, {}),
+        ({RANGE: 'SUBNET', 'ROS_DOMAIN_ID': '232'}, {TRANSPORTS: 'UDPv4'}),
         ({RANGE: 'LOCALHOST', TRANSPORTS: 'DEFAULT'}, {}),
         ({RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '192.0.2.1'}, {}),
     ],
