@@ -115,7 +115,7 @@ def _require_robot(robot: RobotSpec) -> None:
 
 
 def _require_above_zero(name: str, value: Any) -> None:
-    if not isinstance(value, Real) or not 0.0 < value < _INFINITE:
+    if not isinstance(value, Real) or not 0.0 < float(value) < _INFINITE:
         raise ValueError(f'{name} {value!r}; allowed: a number of more than 0')
 
 
