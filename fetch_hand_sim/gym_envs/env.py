@@ -219,8 +219,8 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             camera plane. `human`: None, after drawing into a window. None without a render mode.
 
         Raises:
-            RuntimeError: If there is no OpenGL or, for `human`, no display, or another thread drew
-                the first picture.
+            RuntimeError: If there is no OpenGL or, for `human`, no display, or an OpenGL that draws
+                in the thread of the first picture only.
         """
         if self.render_mode is None:
             return None

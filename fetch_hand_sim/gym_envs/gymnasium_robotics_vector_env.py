@@ -66,7 +66,6 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
             default_camera_config=camera,
             **arguments,
         )
-        self.width, self.height = width, height
 
     def reset(
         self,

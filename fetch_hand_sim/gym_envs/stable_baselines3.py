@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from fetch_hand_sim.gym_envs.task_attributes import check_reset_options
+from fetch_hand_sim.gym_envs.task_attributes import check_reset_options, goals_of_options
 from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Observation
+from msgs_spec.arrays import Array
 
 
 class FetchHandVecEnv(VecEnv):
@@ -47,18 +48,33 @@ class FetchHandVecEnv(VecEnv):
         self._actions: NDArray[np.float32] | None = None
 
     def reset(self) -> Observation:
-        """Starts all episodes, with the seeds that `seed` set.
+        """Starts all episodes, with the seeds and goals that `seed` and `set_options` set.
 
         Raises:
-            ValueError: If `set_options` set any; there are none.
+            ValueError: If `set_options` set another option than `goal`, or a goal that is none. It
+                is forgotten then.
         """
-        for options in self._options:
-            check_reset_options(options, allowed=())
+        goals = self._asked_goals()
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         observation, _ = self.batch.reset(seed=seeds)
         self._reset_seeds()
-        self._reset_options()
+        if goals:
+            self.batch.simulation.set_goal(np.array(list(goals.values())), list(goals))
+            observation |= self.batch.simulation.observe()
         return observation
+
+    def _asked_goals(self) -> dict[int, Array]:
+        """The goals (goal size,) that options ask for, by environment; once."""
+        given = self._options
+        self._reset_options()
+        one = np.ones(1, dtype=bool)
+        goals = {}
+        for index, options in enumerate(given):
+            check_reset_options(options, allowed=('goal',))
+            goal = goals_of_options(options, one, self.batch.spec_of_task)
+            if goal is not None:
+                goals[index] = goal[0]
+        return goals
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Takes the actions (N, action size) of the next step."""

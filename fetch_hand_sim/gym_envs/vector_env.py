@@ -130,6 +130,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
         self._seeds: list[int | None] = [None] * num_envs
+        self.width, self.height = width, height
         self._pictures = Pictures(self.simulation, width, height, default_camera_config)
         self.set_thresholds(distance_threshold, rotation_threshold)
 
@@ -215,7 +216,11 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         if started.any() and wanted.shape == self.action_space.shape:
             # They only begin an episode, whatever their action is.
             wanted = np.where(started[:, None], wanted.dtype.type(0), wanted)
+        before = {i: self._random(i).state for i in np.flatnonzero(started).tolist()}
         result = self.simulation.step(wanted)
+        for index in np.flatnonzero(started & result.diverged).tolist():
+            # The episode that was drawn because MuJoCo lost it is nobody's.
+            self._random(index).state = before[index]
         observation, reward = result.observation, self._rewards(result)
         success, diverged = result.success, result.diverged & ~started
         if started.any():
@@ -232,6 +237,9 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             observation, info = self._start_next(observation, info, ended)
         return self._ordered(observation), reward, terminated, truncated, info
+
+    def _random(self, index: int) -> np.random.BitGenerator:
+        return self.simulation.generator(index).bit_generator
 
     def _ordered(self, observation: Observation) -> Observation:
         """An observation with its parts in the order of the space, as Gymnasium's batches."""
@@ -281,8 +289,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             if seed is None:
                 # Who holds it before the first episode finds that drawn from it, too.
                 fresh, self._seeds[index] = seeding.np_random()
-                held = self.simulation.generator(index)
-                held.bit_generator.state = fresh.bit_generator.state
+                self._random(index).state = fresh.bit_generator.state
         return tuple(self.simulation.generator(i) for i in range(self.num_envs))
 
     @property
@@ -294,10 +301,14 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         """Returns a picture of every environment; None without a render mode.
 
         Raises:
-            RuntimeError: If there is no OpenGL, or another thread drew the first picture.
+            RuntimeError: If there is no OpenGL, or one that draws in the thread of the first
+                picture only.
+            gymnasium.error.ResetNeeded: If one was never reset.
         """
         if self.render_mode is None:
             return None
+        if not self.simulation.is_started.all():
+            raise gymnasium.error.ResetNeeded('reset the environments before render')
         return tuple(self._pictures.render(self.render_mode, i) for i in range(self.num_envs))
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
@@ -392,6 +403,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             raise TypeError(f'reset_mask is a boolean array, not {mask!r}')
         if mask.shape != (self.num_envs,):
             raise ValueError(f'reset_mask has shape ({self.num_envs},), not {mask.shape}')
+        if not mask.any():
+            raise ValueError('reset_mask names no environment; allowed: one or more')
         return mask
 
 

@@ -45,6 +45,14 @@ def prepare_opengl() -> str:
     return backend
 
 
+def let_go() -> None:
+    """Leaves the context that this thread draws in to others: with EGL any thread may take it."""
+    egl = sys.modules.get('mujoco.egl')
+    if egl is not None and egl.EGL_DISPLAY is not None:
+        none = egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_CONTEXT
+        egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, *none)
+
+
 @functools.cache
 def _process_that_draws() -> int:
     """The process that asked first, in all that are forked from it."""

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation.opengl import ADVICE, prepare_opengl
+from fetch_hand_sim.simulation.opengl import ADVICE, let_go, prepare_opengl
 from fetch_hand_sim.simulation.scene import SHOWN_SITES, Frame, Scene
 from fetch_hand_sim.simulation.simulation import Simulation
 from msgs_spec.arrays import Array, Picture
@@ -25,7 +25,8 @@ LARGEST_SIDE = LARGEST_PICTURE_SIDE
 class SceneRenderer:
     """Draws frames of a scene without a display.
 
-    Opens an OpenGL context.
+    Opens an OpenGL context. With EGL any thread may draw and close, one at a time; with others only
+    that which opened it.
 
     Args:
         scene: What to draw.
@@ -63,6 +64,8 @@ class SceneRenderer:
             self._renderer = mujoco.Renderer(scene.model, height, width)
         except Exception as error:
             raise RuntimeError(f'{ADVICE} ({error})') from error
+        finally:
+            let_go()
 
     def render(self, frame: Frame, trail: Sequence[Array] = ()) -> Picture:
         """Returns the picture of a frame, (height, width, 3).
@@ -72,7 +75,7 @@ class SceneRenderer:
             trail: Where the object or gripper was before.
 
         Raises:
-            RuntimeError: If another thread opened the OpenGL context.
+            RuntimeError: If the OpenGL context is of another thread.
         """
         self._update(frame)
         scene = self._renderer.scene
@@ -88,7 +91,7 @@ class SceneRenderer:
         Markers are left out: they are no part of the world.
 
         Raises:
-            RuntimeError: If another thread opened the OpenGL context.
+            RuntimeError: If the OpenGL context is of another thread.
         """
         self._update(frame)
         self._renderer.enable_depth_rendering()
@@ -102,7 +105,7 @@ class SceneRenderer:
         """Frees the OpenGL context.
 
         Raises:
-            RuntimeError: If another thread opened it.
+            RuntimeError: If it is of another thread.
         """
         with self._in_its_thread():
             self._renderer.close()
@@ -119,6 +122,8 @@ class SceneRenderer:
                 'OpenGL draws in one thread only: render and close in the thread of the first '
                 f'picture, or make the environment where it is drawn ({type(error).__name__})'
             ) from error
+        finally:
+            let_go()
 
     def _update(self, frame: Frame) -> None:
         # Again: a forked process may have come by a renderer of its parent's.

@@ -16,6 +16,7 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.contact_pairs import ListedPairs
+from fetch_hand_sim.simulation.forked import keep_in_forks
 from fetch_hand_sim.simulation.models import prepare_engine
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array
@@ -112,6 +113,7 @@ class Task(ABC):
         self.model = model
         self.tick_duration = batch.substeps * float(model.opt.timestep)
         self.batch = Batch(model, batch.num_envs, batch.threads, batch.keeps_data)
+        keep_in_forks(self.batch)
         self.pairs = ListedPairs(model)
         self._outputs: dict[str, Array] = {}
         self._qpos: Array = self.batch.bind('qpos')

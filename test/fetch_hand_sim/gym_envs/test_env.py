@@ -19,7 +19,7 @@ from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv
 from fetch_hand_sim.gym_envs.registration import environment_id
 from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
-from fetch_hand_sim.simulation import Simulation
+from fetch_hand_sim.simulation import Simulation, rendering
 from msgs_spec.tasks import TASKS
 from support.hindsight import assert_goals_are_exchanged
 
@@ -411,8 +411,27 @@ def test_rendering_gives_a_picture_or_says_what_it_needs(
     assert result.stdout.strip() in (picture, reason[:80].strip()), result.stderr
 
 
-def test_another_thread_than_that_of_the_first_picture_is_told_so(monkeypatch):
+def test_any_thread_draws_with_egl(monkeypatch):
+    """One that draws and ends leaves an environment that others draw and close."""
     monkeypatch.setenv('MUJOCO_GL', 'egl')
+    env = make('FetchReach', render_mode='rgb_array', width=32, height=32)
+    env.reset(seed=0)
+    with ThreadPoolExecutor(1) as first:
+        try:
+            before = first.submit(env.render).result()
+        except RuntimeError as error:
+            pytest.skip(str(error))
+    assert (env.render() == before).all()
+    with ThreadPoolExecutor(1) as another:
+        assert (another.submit(env.render).result() == before).all()
+        another.submit(env.close).result()
+    assert (env.render() == before).all()
+    env.close()
+
+
+def test_a_thread_is_told_that_another_holds_the_context(monkeypatch):
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    monkeypatch.setattr(rendering, 'let_go', lambda: None)
     env = make('FetchReach', render_mode='rgb_array', width=32, height=32)
     env.reset(seed=0)
     try:
@@ -424,6 +443,7 @@ def test_another_thread_than_that_of_the_first_picture_is_told_so(monkeypatch):
             with pytest.raises(RuntimeError, match='render and close in the thread of the first'):
                 another.submit(call).result()
     assert (env.render() == before).all()
+    env.close()
 
 
 def test_pictures_show_the_threshold_that_holds(monkeypatch):

@@ -74,8 +74,35 @@ def test_what_concerns_all_environments_is_not_done_to_some():
     (reward,) = env.get_attr('compute_reward', indices=0)
     assert reward(first['achieved_goal'], first['achieved_goal']).tolist() == [0.0, 0.0]
     assert np.array_equal(env.batch.simulation.observe()['desired_goal'], first['desired_goal'])
-    env.set_options({'goal': [0.0, 0.0, 0.0]})
-    with pytest.raises(ValueError, match="reset option 'goal' is not known; allowed: none"):
+
+
+def test_goals_are_asked_for_once_as_of_a_dummy_vec_env():
+    pair = (
+        FetchHandVecEnv('FetchPush', 2),
+        DummyVecEnv([lambda: gymnasium.make(environment_id('FetchPush'))] * 2),
+    )
+    goal = [1.3, 0.7, 0.5]
+    for options in ({'goal': goal}, [{}, {'goal': goal}], None):
+        for env in pair:
+            env.seed(3)
+            env.set_options(options)
+        ours, theirs = (env.reset() for env in pair)
+        assert list(ours) == list(theirs)
+        for name, rows in theirs.items():
+            assert np.array_equal(ours[name], rows), name
+    ours, theirs = (env.reset() for env in pair)
+    assert np.array_equal(ours['desired_goal'], theirs['desired_goal'])
+
+
+def test_a_refused_option_is_forgotten():
+    env = FetchHandVecEnv('FetchReach', 2)
+    for options, line in (
+        ({'gaol': [0.0] * 3}, "'gaol' is not known; allowed: goal"),
+        ([{}, {'goal': [np.nan] * 3}], 'finite'),
+    ):
+        env.set_options(options)
+        with pytest.raises(ValueError, match=line):
+            env.reset()
         env.reset()
 
 

@@ -112,6 +112,25 @@ def test_actions_of_those_who_only_begin_count_for_nothing():
         env.step(np.full((2, 4), np.nan, np.float32))
 
 
+def test_what_is_lost_after_its_episode_ended_draws_nothing():
+    pair = [make_vec('FetchPush', 2, max_episode_steps=2) for _ in range(2)]
+    for env in pair:
+        env.reset(seed=0)
+        for _ in range(2):
+            env.step(np.zeros((2, 4), np.float32))
+    pair[0].unwrapped.simulation.task.batch.bind('qvel')[0, 0] = np.nan
+    lost, other = (env.step(np.zeros((2, 4), np.float32)) for env in pair)
+    assert pair[0].unwrapped.simulation.divergences == 1
+    assert_same(lost[0], other[0])
+    assert lost[3].tolist() == other[3].tolist() == [False, False]
+
+
+def test_nothing_is_drawn_before_the_first_reset():
+    env = make_vec('FetchReach', 2, render_mode='rgb_array')
+    with pytest.raises(gymnasium.error.ResetNeeded, match='before render'):
+        env.render()
+
+
 def test_without_autoreset_an_ended_episode_waits_for_its_reset():
     env = make_vec('FetchReach', 2, max_episode_steps=2, autoreset_mode='Disabled')
     env.reset(seed=0)
@@ -376,6 +395,11 @@ BAD_RESETS = {
         {'options': {'reset_mask': np.ones(3, dtype=bool)}},
         ValueError,
         r'shape \(2,\), not \(3,\)',
+    ),
+    'empty mask': (
+        {'options': {'reset_mask': np.zeros(2, dtype=bool)}},
+        ValueError,
+        'reset_mask names no environment',
     ),
     'negative seed': ({'seed': -5}, ValueError, 'must not be negative'),
     'seed that is none': ({'seed': True}, TypeError, 'a seed is an integer, a .* not True'),

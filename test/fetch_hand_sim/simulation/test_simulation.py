@@ -415,3 +415,30 @@ def test_threads_that_a_fork_leaves_behind_are_not_waited_for(threads, refused):
     result = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True)
     expected = ['this process was forked'] * refused + ['goes on'] * (4 - refused)
     assert result.stdout.splitlines() == expected, result.stderr
+
+
+LEFT_BEHIND = """
+import copy, os, signal
+import numpy as np
+from fetch_hand_sim.simulation import Simulation
+
+simulation = Simulation('FetchReach', num_envs=2, num_threads=2)
+simulation.reset(seed=0)
+if os.fork() == 0:
+    signal.alarm(60)
+    simulation = {replacement}
+    if simulation is not None:
+        simulation.reset(seed=1)
+        simulation.step(np.zeros((2, 4)))
+else:
+    assert os.wait()[1] == 0
+"""
+
+
+@pytest.mark.parametrize(
+    'replacement', ['None', 'copy.deepcopy(simulation)', 'Simulation("FetchReach", 2, 2)']
+)
+def test_a_forked_process_may_drop_a_batch(replacement):
+    script = LEFT_BEHIND.format(replacement=replacement)
+    result = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
