@@ -180,6 +180,9 @@ def _contradictions(config: ConfigFields, spec: TaskSpec) -> Iterator[str]:
     """Why fields exclude each other, or why nothing would look at them."""
     if config.goals and config.strategy == 'none':
         yield f'goals {config.goals!r} excludes strategy none'
+    if config.future_only_steps > 0 and (config.goals or config.strategy != 'futureactual'):
+        yield 'future_only_steps above 0 needs strategy futureactual, and no goals'
+    yield from _contradictions_of_noise(config)
     yield from _contradictions_of_rates(config)
     yield from _contradictions_of_subgoals(config)
     yield from _contradictions_of_values(config)
@@ -191,15 +194,21 @@ def _contradictions(config: ConfigFields, spec: TaskSpec) -> Iterator[str]:
     yield from _contradictions_of_task(config, spec)
 
 
+def _contradictions_of_noise(config: ConfigFields) -> Iterator[str]:
+    """Conflicts between kinds of exploration."""
+    if 0.0 < config.noise_seconds * config.control_hz < 1.0 - 1e-6:
+        tick = 1.0 / config.control_hz
+        yield f'noise_seconds {config.noise_seconds:g} is less than a tick of {tick:g} s'
+    if config.parameter_noise and config.noise_seconds > 0.0 and config.random_epsilon == 0.0:
+        yield 'parameter_noise with noise_seconds above 0 needs random_epsilon above 0'
+    if config.parameter_noise and config.noise_spread > 0.0:
+        yield 'parameter_noise excludes noise_spread: its copies are alike'
+
+
 def _contradictions_of_rates(config: ConfigFields) -> Iterator[str]:
     """Conflicts between fields for other rates than 25 Hz, and with other fields."""
     holds, several = config.longest_hold > 1, config.n_step > 1
     chosen, weighted = config.goal_choice != 'uniform', config.importance != 'none'
-    if 0.0 < config.noise_seconds * config.control_hz < 1.0 - 1e-6:
-        tick = 1.0 / config.control_hz
-        yield f'noise_seconds {config.noise_seconds:g} is less than a tick of {tick:g} s'
-    if config.parameter_noise and config.noise_spread > 0.0:
-        yield 'parameter_noise excludes noise_spread: its copies are alike'
     if holds and (several or config.noise_seconds > 0.0 or config.parameter_noise):
         yield 'longest_hold above 1 excludes n_step above 1, noise_seconds and parameter_noise'
     if holds and (config.condition == 'horizon' or weighted or chosen):
@@ -325,9 +334,18 @@ def _contradictions_of_importance(config: ConfigFields) -> Iterator[str]:
         yield f'importance {config.importance} needs goals chosen in hindsight'
     if (config.algorithm == 'ppo') != (config.importance == 'decision'):
         yield f'importance {config.importance} excludes algorithm {config.algorithm}'
-    if config.importance == 'density' and config.goals:
-        if set(parse_mixture(config.goals)) <= set(FROM_THE_EPISODE):
-            yield f'importance density needs other goals beside {config.goals!r}: actual, random'
+    if config.importance == 'density' and config.strategy == 'random' and not config.goals:
+        yield 'importance density excludes strategy random: no goal follows from the transition'
+    if not config.goals:
+        return
+    sources = set(parse_mixture(config.goals))
+    if sources == {'real'}:
+        yield f'importance {config.importance} needs goals chosen in hindsight'
+    if config.importance == 'density' and sources <= set(FROM_THE_EPISODE):
+        yield f'importance density needs other goals beside {config.goals!r}: actual, random'
+    if config.importance == 'density' and sources.isdisjoint(FROM_THE_EPISODE):
+        allowed = ', '.join(FROM_THE_EPISODE)
+        yield f'importance density needs goals of the episode beside {config.goals!r}: {allowed}'
 
 
 def _contradictions_of_algorithm(config: ConfigFields) -> Iterator[str]:

@@ -42,8 +42,8 @@ def episode_weights(kind: str, spec: TaskSpec, control_hz: float, gamble: bool =
 def episode_energy(episodes: Episodes, goal: GoalKind, control_hz: float) -> NDArray[np.float64]:
     """Energy given to what the goal is about, joules for unit mass and inertia, (episodes,).
 
-    The rises of potential, kinetic and rotational energy from tick to tick, each clipped, summed:
-    Zhao & Tresp 2018, "Energy-Based Hindsight Experience Prioritization" (arXiv 1810.01363).
+    The rises of potential, kinetic and rotational energy from tick to tick, from rest on, each
+    clipped, summed: Zhao & Tresp 2018, "Energy-Based Hindsight Experience Prioritization" (arXiv 1810.01363).
     """
     achieved = episodes.achieved_goal.astype(np.float64)
     poses = achieved.reshape(*achieved.shape[:2], -1, 7 if goal is GoalKind.POSE else 3)
@@ -55,14 +55,17 @@ def episode_energy(episodes: Episodes, goal: GoalKind, control_hz: float) -> NDA
         chords = [np.linalg.norm(after - sign * before, axis=-1) for sign in (1.0, -1.0)]
         angle = 4.0 * np.arcsin(np.minimum(np.minimum(*chords) / 2.0, 1.0))
         energy += 0.5 * np.square(angle * control_hz)
-    rises = np.clip(np.diff(energy.mean(axis=-1), axis=1), 0.0, _MOST_ENERGY[goal])
+    at_rest = _GRAVITY * poses[:, :1, :, 2]
+    energy = np.concatenate([at_rest, energy], axis=1).mean(axis=-1)
+    rises = np.clip(np.diff(energy, axis=1), 0.0, _MOST_ENERGY[goal])
     return np.asarray(rises.sum(axis=-1))
 
 
 def ticks_until_dropped(spec: TaskSpec, more: int) -> LastTicks | None:
     """Returns what counts the ticks of an episode until `more` ticks after its object fell.
 
-    An object has fallen once its centre is below the palm. None where there is nothing to drop, or
+    An object has fallen once its centre is below the palm; in the last `more` ticks that says
+    nothing. None where there is nothing to drop, or
     `more` is negative: every tick counts.
     """
     if spec.goal is not GoalKind.POSE or more < 0:

@@ -94,7 +94,8 @@ class InitialNetworks:
         """These networks for another run, in which other inputs may begin to count.
 
         A critic whose hidden layers are normalised otherwise, or whose values are of other rewards,
-        is left behind. Hidden layers may become wider.
+        is left behind; one of another `gamma` is kept, and `critic_first` gives its values time.
+        Hidden layers may become wider.
 
         Where the position of an object did not count, the goal's position was always about the
         object's own: networks have learnt nothing from it, and what they do elsewhere is chance (an

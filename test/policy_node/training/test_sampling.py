@@ -219,6 +219,15 @@ def test_an_actor_at_one_condition_is_an_actor_like_any_other() -> None:
         ({'widest_threshold': 0.5, 'condition': 'threshold'}, 'allowed: 1 ... 10000'),
         ({'condition': 'horizon', 'importance': 'density'}, 'excludes goal_choice and importance'),
         ({'importance': 'density', 'strategy': 'none'}, 'needs goals chosen in hindsight'),
+        ({'importance': 'density', 'goals': 'real=1'}, 'needs goals chosen in hindsight'),
+        ({'importance': 'density', 'goals': 'actual=.8'}, "episode beside 'actual=.8': future, fi"),
+        ({'importance': 'density', 'goals': 'future=1'}, "other goals beside 'future=1': actual"),
+        ({'importance': 'density', 'strategy': 'random'}, 'density excludes strategy random'),
+        ({'future_only_steps': 9}, 'needs strategy futureactual, and no goals'),
+        (
+            {'parameter_noise': True, 'noise_seconds': 0.04, 'random_epsilon': 0.0},
+            'parameter_noise with noise_seconds above 0 needs random_epsilon above 0',
+        ),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(
