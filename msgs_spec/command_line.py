@@ -80,6 +80,11 @@ class CommandParser(argparse.ArgumentParser):
         unknown = re.match(r'unrecognized arguments: (--[\w-]+)', message)
         if unknown:
             return did_you_mean(unknown[1], list(self._option_string_actions))
+        assigned = re.match(r'unrecognized arguments: (\w+=\S+)', message)
+        if assigned and '--set' in self._option_string_actions:
+            return f'; each has a --set of its own: --set {assigned[1]}'
+        if re.match(r'unrecognized arguments: (?:true|false|yes|no|on|off|0|1)\b', message, re.I):
+            return '; switches take no value: --name is on, --no-name is off'
         choice = re.match(r"argument (?:[^:]*/)?(--[\w-]+): invalid choice: '([^']*)'", message)
         choices = self._option_string_actions[choice[1]].choices if choice else None
         return did_you_mean(choice[2], map(str, choices)) if choice and choices else ''

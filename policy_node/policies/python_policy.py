@@ -6,10 +6,11 @@ Stable-Baselines3 have, or a function from one observation to one action.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
 
@@ -57,6 +58,21 @@ def is_python_name(name: str) -> bool:
     return _NAME.fullmatch(name) is not None
 
 
+@contextlib.contextmanager
+def working_directory_first() -> Iterator[None]:
+    """Has modules of the working directory found first; afterwards they are found last.
+
+    Executables have their own folder first; what is imported later finds its own module again.
+    """
+    here = os.getcwd()
+    sys.path.insert(0, here)
+    try:
+        yield
+    finally:
+        sys.path.remove(here)
+        sys.path.append(here)
+
+
 def load_python(name: str, task: str) -> LoadedPolicy:
     """Imports a module, also from the working directory, and has its function make a policy.
 
@@ -68,11 +84,9 @@ def load_python(name: str, task: str) -> LoadedPolicy:
         ValueError: If there is no such module or function, or it fails; one line says why.
     """
     module_name, _, function_name = name.partition(':')
-    # Executables have their own folder first; what is imported later finds its own module again.
-    here = os.getcwd()
-    sys.path.insert(0, here)
     try:
-        made = getattr(import_module(module_name), function_name)(task)
+        with working_directory_first():
+            made = getattr(import_module(module_name), function_name)(task)
         control_hz = getattr(made, 'control_hz', None)
         control_hz = None if control_hz is None else float(control_hz)
     except (Exception, SystemExit) as error:
@@ -80,9 +94,6 @@ def load_python(name: str, task: str) -> LoadedPolicy:
         raise ValueError(
             f'{name} makes no policy: {type(error).__name__}: {one_line(error)}'
         ) from None
-    finally:
-        sys.path.remove(here)
-        sys.path.append(here)
     if not (callable(made) or hasattr(made, 'predict')):
         raise ValueError(
             f'{name} makes {one_line(type(made).__name__)}; allowed: an object with predict, or a '

@@ -20,6 +20,7 @@ from policy_node.training.runs.run import Caller, Ending, OnCycle, train_run
 from policy_node.training.runs.run_folder import (
     BEST_FILE,
     LATEST_FILE,
+    PROGRESS_FILE,
     STATE_FILE,
     default_folder,
 )
@@ -57,7 +58,7 @@ class Run:
 
     def progress(self) -> list[dict[str, float]]:
         """A row per cycle: `env_steps`, `train_success`, `eval_success` where evaluated, ..."""
-        return read_progress(self.folder / 'progress.csv')
+        return read_progress(self.folder / PROGRESS_FILE)
 
 
 def train(

@@ -158,6 +158,8 @@ def test_what_is_not_there_is_bad_usage_in_one_line(name, arguments, run, tmp_pa
         ('generate_episodes', ['--first-seed', '9223372036854775808'], 'allowed: 0 ... 4294967295'),
         ('generate_episodes', [], 'the following arguments are required: --output'),
         ('list_episodes', ['--nosuch'], 'the following arguments are required: directory'),
+        ('train_her', ['--set', 'seed=1', 'gamma=.9'], 'a --set of its own: --set gamma=.9'),
+        ('benchmark', ['--seeds', '0,1'], "'0,1' given; allowed: whole numbers with spaces"),
         ('train_her', ['--nosuch', '\x1b[31m'], 'unrecognized arguments: --nosuch \\x1b[31m'),
     ],
 )

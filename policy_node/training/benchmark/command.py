@@ -12,6 +12,8 @@ with its critic, evaluation and curve into <output>/actors.
 task x arm x seed, measures each run on fresh episodes, and adds it to data, figure and table in
 docs/research/NAME. What these hold already, from whatever machine, is not run again.
 
+`--study module:NAME`: one of your own, a `Study` of a module that Python finds here.
+
 Finished jobs are skipped and interrupted ones continued, so the same command goes on where it
 stopped; given twice at once, it shares the work.
 """
@@ -41,6 +43,7 @@ from msgs_spec.tasks import TASKS
 from policy_node.policies.files import write_file
 from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.jobs import ARMS, Job
+from policy_node.training.benchmark.own_study import find_study
 from policy_node.training.benchmark.reporting import report, require_readable, ship_all
 from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.benchmark.shared_runs import (
@@ -59,6 +62,7 @@ from policy_node.training.benchmark.workers import (
 )
 from policy_node.training.configuration.config_options import with_assignments
 from policy_node.training.configuration.config_rules import FROM_NOTHING
+from policy_node.training.configuration.config_values import whole
 
 _NAME = 'benchmark'
 ACTORS_TABLE = 'actors.md'
@@ -70,19 +74,19 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         prog=_NAME, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    names = ('paper', 'best', *STUDIES)
-    add('--study', choices=names, default='paper', help='default: paper')
+    names = ', '.join(('paper', 'best', *STUDIES))
+    help_of_study = f'{names}, module:NAME; default: paper'
+    add('--study', type=_study_name, default='paper', metavar='NAME', help=help_of_study)
     default = 'default: FetchReach; all; the first of the study'
     add('--tasks', nargs='+', choices=list(TASKS), metavar='TASK', help=default)
-    add(
-        '--seeds', nargs='+', type=int, metavar='SEED', help='default: 0 to 4 (ingredients: 0 1); 0'
-    )
+    help_of_seeds = 'default: 0 to 4 (ingredients: 0 1); 0'
+    add('--seeds', nargs='+', type=_seed, metavar='SEED', help=help_of_seeds)
     add('--arms', nargs='+', metavar='ARM', help='default: all; not in study best')
     count = whole_number(1)
     add('--jobs', type=count, help='at once; default: 1; one per core')
-    add('--steps', type=int, help='environment steps of each job')
-    add('--threads', type=int, help='simulation threads of each job')
-    add('--torch-threads', type=int, help='tensor threads of each job')
+    add('--steps', type=_whole, help='environment steps of each job')
+    add('--threads', type=_whole, help='simulation threads of each job')
+    add('--torch-threads', type=_whole, help='tensor threads of each job')
     add('--set', action='append', default=[], metavar='NAME=VALUE', help='any field of TrainConfig')
     add('--output', type=Path, help='default: runs/benchmark; runs/best; runs/research/NAME')
     add('--report', type=Path, help='where figure and tables go')
@@ -97,6 +101,31 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def _study_name(text: str) -> str:
+    try:
+        find_study(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
+
+
+def _whole(text: str) -> int:
+    try:
+        return whole(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'{text[:80]!r} is no whole number') from None
+
+
+def _seed(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        allowed = 'whole numbers with spaces between them: 0 1 2'
+        raise argparse.ArgumentTypeError(f'{text[:80]!r} given; allowed: {allowed}') from None
+
+
+# What options of fields of `TrainConfig` are called.
+_OPTIONS = {'total_steps': '--steps', 'simulation_threads': '--threads'}
 _OF_STUDY = {'paper': ('recipe', 'full', 'page'), 'best': ('actors',)}
 
 
@@ -134,7 +163,7 @@ def _overrides(options: argparse.Namespace) -> dict[str, Any]:
         'torch_threads': options.torch_threads,
     }
     given = {name: value for name, value in chosen.items() if value is not None}
-    overrides = with_assignments(given, options.set)
+    overrides = with_assignments(given, options.set, _OPTIONS)
     decided: tuple[str, ...] = ('task', 'recipe', 'seed', 'init_from')
     if (study := _study(options)) is not None:
         decided = (*decided, *(name for arm in study.arms for name in arm.own))
@@ -184,18 +213,20 @@ def _research(study: Study, options: argparse.Namespace, overrides: dict[str, An
 
 def _study(options: argparse.Namespace) -> Study | None:
     """The study whose page is renewed; None renews none."""
-    return PAPER if options.page else STUDIES.get(options.study)
+    return PAPER if options.page else find_study(options.study)
 
 
 def _output(options: argparse.Namespace) -> Path:
     folders = {'paper': Path('benchmark'), 'best': Path('best')}
-    folder = Path('research') / options.study if _study(options) else folders[options.study]
+    study = _study(options)
+    folder = Path('research') / study.name if study else folders[options.study]
     return Path(options.output or Path('runs') / folder)
 
 
 def _report_folder(options: argparse.Namespace) -> Path:
-    pages = Path('docs') / 'research' / options.study
-    return Path(options.report or (pages if _study(options) else _output(options)))
+    study = _study(options)
+    page = Path('docs') / 'research' / study.name if study else _output(options)
+    return Path(options.report or page)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

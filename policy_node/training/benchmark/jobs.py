@@ -11,11 +11,10 @@ from typing import Any
 from policy_node.training.benchmark.final import read_final
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_values import config_from_dict
-from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.run_folder import PROGRESS_FILE, STATE_FILE
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import read_counters, read_state
 
-PROGRESS_FILE = 'progress.csv'
 # What may differ between two parts of a job without another result to be expected; where a run
 # started from is decided once, and its path depends on the working directory.
 _MAY_DIFFER = (
@@ -177,7 +176,10 @@ class Job:
         """
         if not self.has_checkpoint:
             return
-        stored = read_state(self.folder / STATE_FILE).extra['config']
+        try:
+            stored = read_state(self.folder / STATE_FILE).extra['config']
+        except ValueError as error:
+            raise ValueError(f'{error}; without {self.folder} it is run again') from None
         differing = differing_fields(stored, self.config)
         if differing:
             raise ValueError(

@@ -12,15 +12,35 @@ from msgs_spec.arrays import Array
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark.final import read_final
-from policy_node.training.benchmark.jobs import PROGRESS_FILE, Job
+from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.machines import machine
 from policy_node.training.benchmark.results import Curve, read_curve
 from policy_node.training.configuration.recipes import ticks_of_40_ms
-from policy_node.training.runs.run_folder import COMMAND_FILE, LATEST_FILE
+from policy_node.training.runs.run_folder import COMMAND_FILE, LATEST_FILE, PROGRESS_FILE
 from policy_node.training.runs.run_log import read_progress
 
 GOOD_SUCCESS = 0.9
 _SUMMED_UP = ('area', 'final_success')
+MEASURED = (
+    'task',
+    'arm',
+    'seed',
+    'env_steps',
+    'simulated_seconds',
+    'area',
+    f'steps_to_{GOOD_SUCCESS}',
+    'final_success',
+    'final_episodes',
+    'updates',
+    'seconds',
+    'processor_seconds',
+    'samples_per_processor_second',
+    'last_mean_value',
+    'parts',
+    'machine',
+    'revision',
+)
+"""Columns of `runs.csv`."""
 COMPARED = ('area', 'area_in_time', 'final_success')
 """What arms are compared by."""
 _CHANCE = 0.05

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
 from msgs_spec.command_line import CommandError, complain
+from msgs_spec.tasks import task_spec
 from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import curve_of, measure_run
@@ -13,7 +15,8 @@ from policy_node.training.benchmark.research_report import write_study
 from policy_node.training.benchmark.results import write_report
 from policy_node.training.benchmark.stored_runs import RUNS
 from policy_node.training.benchmark.study import Study
-from policy_node.training.runs.run_folder import BEST_FILE, LATEST_FILE
+from policy_node.training.runs.run_folder import BEST_FILE, LATEST_FILE, PROGRESS_FILE
+from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.shipping import ship
 
 
@@ -59,11 +62,24 @@ def _damage(job: Job) -> str:
         read_info(job.folder / LATEST_FILE)
         if job.final_episodes:
             measure_run(job, curve)
+        if (lost := _lost_rows(job)) is not None:
+            return f'{PROGRESS_FILE} lacks rows from {lost:,.0f} steps on'
     except KeyError as error:
         return f'its files lack {error}'
     except (OSError, ValueError) as error:
         return str(error)
     return ''
+
+
+def _lost_rows(job: Job) -> float | None:
+    """After which step the log of a finished job has lost rows, of which each cycle has one."""
+    config = job.config
+    cycle = config.num_envs * task_spec(config.task, control_hz=config.control_hz).episode_ticks
+    steps = [0.0, *(row['env_steps'] for row in read_progress(job.folder / PROGRESS_FILE))]
+    for before, after in itertools.pairwise(steps):
+        if after != before + cycle:
+            return before
+    return steps[-1] if steps[-1] < config.total_steps else None
 
 
 def ship_all(jobs: Sequence[Job], actors: Path, episodes: int) -> bool:

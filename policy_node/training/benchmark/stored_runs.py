@@ -15,9 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from msgs_spec.command_line import complain
 from policy_node.policies.files import to_json
 from policy_node.training.benchmark.jobs import Job, differing_runs, run_name
-from policy_node.training.benchmark.measures import curve_of, measure_run
+from policy_node.training.benchmark.measures import MEASURED, curve_of, measure_run
 from policy_node.training.benchmark.results import curve_rows, to_csv
 from policy_node.training.benchmark.study import Study
 from policy_node.training.configuration.config_values import config_from_dict
@@ -42,6 +43,8 @@ _NUMBERS = {
     ),
     CURVES: ('seed', 'env_steps', 'success'),
 }
+# What there is once in a file.
+_NAMES = {RUNS: RUN, CURVES: (*RUN, 'env_steps')}
 
 
 @dataclass(slots=True)
@@ -65,8 +68,10 @@ class StoredRuns:
     def read(cls, folder: Path) -> StoredRuns:
         """Reads a report; one that is not there holds nothing.
 
+        Evaluations of runs that `runs.csv` does not have are left out, and a line says so.
+
         Raises:
-            ValueError: If a file cannot be read, or the files do not fit each other.
+            ValueError: If a file cannot be read, tells of something twice, or does not fit another.
         """
         stored = cls(
             folder,
@@ -76,6 +81,8 @@ class StoredRuns:
         )
         for name, rows in ((RUNS, stored.runs), (CURVES, stored.curves)):
             _require_numbers(rows, folder / name, _NUMBERS[name])
+            _require_once(rows, folder / name, _NAMES[name])
+        stored._leave_out_unknown()
         evaluated = {run_of(row, folder / CURVES) for row in stored.curves}
         for row in stored.runs:
             task, arm, _ = run = run_of(row, folder / RUNS)
@@ -85,6 +92,16 @@ class StoredRuns:
                 raise ValueError(f'{folder / ABOUT} has no settings of {run_name(*run)}')
         stored._require_settings()
         return stored
+
+    def _leave_out_unknown(self) -> None:
+        """Leaves out evaluations of runs that are not there, which a figure would show."""
+        known = {run_of(row, self.folder / RUNS) for row in self.runs}
+        unknown = {run_of(row, self.folder / CURVES) for row in self.curves} - known
+        if unknown:
+            names = ', '.join(sorted(run_name(*run) for run in unknown))
+            line = f'{self.folder / RUNS} has no {names:.200}; their evaluations are left out'
+            complain('benchmark', line)
+            self.curves = [row for row in self.curves if run_of(row) not in unknown]
 
     def _require_settings(self) -> None:
         """Refuses settings that are no configuration."""
@@ -186,7 +203,9 @@ class StoredRuns:
             'question': study.question,
             'tasks': self.tasks,
         }
-        contents = {RUNS: to_csv(self.runs), CURVES: to_csv(self.curves), ABOUT: to_json(about)}
+        runs = [_in_order(row) for row in self.runs]
+        # The runs last: what is of none of them is left out by who reads.
+        contents = {ABOUT: to_json(about), CURVES: to_csv(self.curves), RUNS: to_csv(runs)}
         return {self.folder / name: content for name, content in contents.items()}
 
     def _sort(self, study: Study) -> None:
@@ -202,6 +221,11 @@ class StoredRuns:
         for told in self.tasks.values():
             ordered = sorted(told['arms'].items(), key=lambda item: _index(arms, item[0]))
             told['arms'] = dict(ordered)
+
+
+def _in_order(run: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of `runs.csv` with the columns of `MEASURED` first."""
+    return {name: run.get(name, '') for name in MEASURED} | dict(run)
 
 
 def own_fields(study: Study) -> set[str]:
@@ -242,6 +266,20 @@ def _require_numbers(rows: Rows, path: Path, names: Sequence[str]) -> None:
             raise ValueError(f'{path}, line {line}: seed {row["seed"]} is no whole number')
 
 
+def _require_once(rows: Rows, path: Path, names: Sequence[str]) -> None:
+    """Refuses what is told twice, as two versions of a file put together tell it.
+
+    Raises:
+        ValueError: The line names file, line and what there is twice.
+    """
+    seen = set()
+    for line, row in enumerate(rows, 2):
+        what = tuple(row.get(name) for name in names)
+        if what in seen:
+            raise ValueError(f'{path}, line {line}: {"/".join(map(str, what))} is there twice')
+        seen.add(what)
+
+
 def read_rows(path: Path) -> Rows:
     """Rows of a CSV file, numbers as numbers; none where there is no file.
 
@@ -251,7 +289,8 @@ def read_rows(path: Path) -> Rows:
     if not path.is_file():
         return []
     try:
-        rows = list(csv.DictReader(path.read_text().splitlines()))
+        # Spreadsheets begin a file with a mark of its encoding.
+        rows = list(csv.DictReader(path.read_text(encoding='utf-8-sig').splitlines()))
     except OSError as error:
         raise ValueError(f'{path} cannot be read: {error.strerror}') from None
     except (ValueError, csv.Error) as error:

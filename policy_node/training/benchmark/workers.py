@@ -212,8 +212,8 @@ class ThisProcess:
 class Processes:
     """Several jobs at once, each in a process of its own that prints into `log.txt` of its run.
 
-    Ctrl-C and SIGTERM reach them as SIGTERM, once: they finish their cycle and keep their state. So
-    they do if this process is killed.
+    Ctrl-C and SIGTERM reach them as SIGTERM: they finish their cycle and keep their state. So they
+    do if this process is killed. A second signal ends them at once.
     """
 
     def __init__(self, limit: int, command: str) -> None:
@@ -240,11 +240,11 @@ class Processes:
     def _stop(self, number: int, frame: FrameType | None) -> None:
         del frame
         if not self._stopped_by:
-            text = 'stopping; jobs finish their cycle and keep their state'
+            text = 'stopping; jobs finish their cycle and keep their state; once more stops at once'
             complain_from_handler('benchmark', text)
             self._stopped_by = number
-            for _, process in self._running.values():
-                process.terminate()
+        for _, process in self._running.values():
+            process.terminate()
 
     def start(self, job: Job) -> None:
         """Starts a process for the job."""

@@ -7,7 +7,7 @@ import ast
 import inspect
 import itertools
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from policy_node.training.configuration.config import TrainConfig
@@ -54,21 +54,24 @@ def given_fields(options: argparse.Namespace, without: tuple[str, ...]) -> dict[
     return {name: value for name, value in given if name in fields and value is not None}
 
 
-def with_assignments(given: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
+def with_assignments(
+    given: dict[str, Any], assignments: Iterable[str], options: Mapping[str, str] | None = None
+) -> dict[str, Any]:
     """Fields that a command line has options for, and those of its `--set`.
 
     Args:
         given: The former.
         assignments: The latter, `name=value`; the last one of a field counts.
+        options: What options of fields are called, where not as the field.
 
     Raises:
         ValueError: If an assignment is none, or says something else than the option of its field.
     """
     assigned = dict(parse_assignment(text) for text in assignments)
     for name, value in assigned.items():
-        if given.get(name, value) != value:
-            option = f'--{name.replace("_", "-")} {given[name]}'
-            raise ValueError(f'{option} excludes --set {name}={value}')
+        if name in given and given[name] != value:
+            option = (options or {}).get(name, f'--{name.replace("_", "-")}')
+            raise ValueError(f'{option} {given[name]} excludes --set {name}={value}')
     return {**given, **assigned}
 
 

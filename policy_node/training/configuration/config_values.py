@@ -12,6 +12,9 @@ import numpy as np
 from msgs_spec.hints import did_you_mean
 from policy_node.training.configuration.config import TrainConfig
 
+# Floats know all whole numbers up to here.
+_EXACT = 2**53
+
 
 def parse_assignment(text: str) -> tuple[str, Any]:
     """Parses `name=value` into a field of `TrainConfig` and a value of its type.
@@ -54,8 +57,23 @@ def _parse(value: str, kind: Any) -> Any:
     if isinstance(kind, types.GenericAlias):
         return tuple(int(part) for part in value.split(',') if part)
     if kind is int:
-        return int(value.replace('_', ''))
+        return whole(value)
     return kind(value)
+
+
+def whole(text: str) -> int:
+    """Reads a whole number, also as `1_000_000` and `1e6`.
+
+    Raises:
+        ValueError: If it is none, or one that a float may have rounded.
+    """
+    try:
+        return int(text)
+    except ValueError:
+        number = float(text)
+        if not number.is_integer() or abs(number) > _EXACT:
+            raise
+        return int(number)
 
 
 def config_from_dict(values: dict[str, Any]) -> TrainConfig:

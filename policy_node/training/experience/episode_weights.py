@@ -43,7 +43,8 @@ def episode_energy(episodes: Episodes, goal: GoalKind, control_hz: float) -> NDA
     """Energy given to what the goal is about, joules for unit mass and inertia, (episodes,).
 
     The rises of potential, kinetic and rotational energy from tick to tick, from rest on, each
-    clipped, summed: Zhao & Tresp 2018, "Energy-Based Hindsight Experience Prioritization" (arXiv 1810.01363).
+    clipped, summed: Zhao & Tresp 2018, "Energy-Based Hindsight Experience Prioritization" (arXiv
+    1810.01363).
     """
     achieved = episodes.achieved_goal.astype(np.float64)
     poses = achieved.reshape(*achieved.shape[:2], -1, 7 if goal is GoalKind.POSE else 3)

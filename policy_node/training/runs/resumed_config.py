@@ -17,7 +17,7 @@ _NETWORK_FIELDS = (
     'hidden_sizes layer_norm goal_features algorithm critics quantiles norm advantage condition '
     'longest_hold subgoal_every init_from'
 ).split()
-_EXPERIENCE_FIELDS = 'control_hz reward_type discount gamble'.split()
+_EXPERIENCE_FIELDS = 'seed control_hz reward_type discount gamble'.split()
 
 
 def resumed_config(

@@ -32,7 +32,9 @@ from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.read_networks import read_initial_networks
 from policy_node.training.runs.run_folder import (
     COMMAND_FILE,
+    CURVE_FILE,
     LOCK_FILE,
+    PROGRESS_FILE,
     STATE_FILE,
     set_former_run_aside,
 )
@@ -132,7 +134,7 @@ def train_run(
         if workers.is_first:
             title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
             try:
-                draw_curve(read_progress(output / 'progress.csv'), title, output / 'curve.png')
+                draw_curve(read_progress(output / PROGRESS_FILE), title, output / CURVE_FILE)
             except OSError as error:
                 complain(NAME, f'no curve, the run itself is saved: {error}')
         return ending
@@ -198,8 +200,9 @@ def _train(
         if not resume and (said := set_former_run_aside(output)):
             complain(NAME, said)
         # One line for each part; of a run that was killed before anything was saved there is none.
-        with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
-            file.write(command + '\n')
+        if not resume or counters.env_steps < config.total_steps:
+            with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
+                file.write(command + '\n')
         limits = config.total_steps, config.time_limit
         quiet = caller is not None and caller.quiet
         log = RunLog(output, *limits, counters.env_steps, quiet=quiet, on_row=tell)

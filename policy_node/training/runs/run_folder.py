@@ -20,11 +20,13 @@ from policy_node.training.runs.training_state import Counters, save_state
 STATE_FILE = 'training_state.safetensors'
 LATEST_FILE = 'latest.safetensors'
 BEST_FILE = 'best.safetensors'
-FORMER_FILE = 'former_best.safetensors'
 REPLAY_FILE = 'replay.safetensors'
 LOCK_FILE = '.lock'
 COMMAND_FILE = 'command.txt'
 BOARD_FOLDER = 'tensorboard'
+PROGRESS_FILE = 'progress.csv'
+CURVE_FILE = 'curve.png'
+_OF_FORMER_RUNS = (BEST_FILE, LATEST_FILE, PROGRESS_FILE, CURVE_FILE)
 
 
 def default_folder(config: TrainConfig) -> Path:
@@ -40,8 +42,8 @@ def companion_file(actor: Path) -> Path:
 def set_former_run_aside(folder: Path) -> str:
     """Makes room for a run that begins in the folder of another, of which no state is left.
 
-    It would take the best actor for its own. That one may be all that somebody has kept, so it gets
-    another name; the rest goes.
+    It would take the best actor for its own. Actors, log and curve may be all that somebody has
+    kept, so they get other names, `former_*`; the rest goes.
 
     Returns:
         What to say of it; '' if nothing.
@@ -49,10 +51,11 @@ def set_former_run_aside(folder: Path) -> str:
     Raises:
         OSError: If a file cannot be renamed or removed.
     """
-    best, said = folder / BEST_FILE, ''
-    if best.is_file():
-        said = f'the best actor of an earlier run is {best.replace(folder / FORMER_FILE)} now'
-    files = [folder / name for name in (LATEST_FILE, REPLAY_FILE)]
+    kept = [name for name in _OF_FORMER_RUNS if (folder / name).is_file()]
+    for name in kept:
+        (folder / name).replace(folder / f'former_{name}')
+    said = f'{", ".join(kept)} of an earlier run in {folder}: now former_*' if kept else ''
+    files = [folder / REPLAY_FILE]
     replays = folder.glob(f'*.{REPLAY_FILE}')
     files += [file for file in replays if file.name.partition('.')[0].isdecimal()]
     files += folder.glob(f'{BOARD_FOLDER}/events.out.tfevents.*')

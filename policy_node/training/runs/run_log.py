@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from msgs_spec.command_line import discard_unread_output
-from policy_node.training.runs.run_folder import BOARD_FOLDER
+from msgs_spec.command_line import complain, discard_unread_output
+from policy_node.training.runs.run_folder import BOARD_FOLDER, PROGRESS_FILE
 
 COLUMNS = (
     'seconds',
@@ -68,10 +68,16 @@ class RunLog:
         quiet: bool = False,
         on_row: Callable[[Row], None] | None = None,
     ) -> None:
-        self.path = output / 'progress.csv'
+        self.path = output / PROGRESS_FILE
         self._total_steps = total_steps
         self._time_limit = time_limit
         kept = _rows_until(self.path, resumed_steps)
+        logged = float(kept[-1]['env_steps']) if kept else 0.0
+        if logged < resumed_steps:
+            complain(
+                'train_her',
+                f'{self.path} has no rows from {logged:,.0f} to {resumed_steps:,} steps',
+            )
         partial = self.path.with_name(f'.{self.path.name}.partial')
         self._file: IO[str] = partial.open('w', newline='')
         # Logs from before a column was added leave it empty.

@@ -20,6 +20,7 @@ from policy_node.training.policy_options import require_writable
 from policy_node.training.runs.run_folder import (
     BEST_FILE,
     COMMAND_FILE,
+    PROGRESS_FILE,
     STATE_FILE,
     companion_file,
 )
@@ -225,7 +226,7 @@ def _evaluation_in(file: Path) -> dict[str, Any]:
 
 def _progress_of(run: Path) -> list[dict[str, float]]:
     """The log of a run, asked for before anything is evaluated or replaced."""
-    file = run / 'progress.csv'
+    file = run / PROGRESS_FILE
     try:
         progress = read_progress(file)
     except OSError as error:

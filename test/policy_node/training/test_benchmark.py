@@ -208,6 +208,28 @@ def test_a_benchmark_runs_reports_and_is_not_run_again(
 
 
 @pytest.mark.release
+def test_a_second_ctrl_c_ends_jobs_at_once(tmp_path: Path) -> None:
+    """Amid an evaluation that would take minutes."""
+    arguments = small(tmp_path, '--arms', 'her_sparse', 'her_dense', '--jobs', '2')
+    arguments += ['--set', 'evaluation_episodes=1000000', '--set', 'evaluate_every=400']
+    command = [sys.executable, '-m', 'policy_node.training.benchmark', *arguments]
+    benchmark = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    logs = [tmp_path / 'FetchReach' / arm / 'seed0' / 'progress.csv' for arm in ARMS][:2]
+    deadline = time.monotonic() + 120
+    while not all(log.is_file() for log in logs):
+        assert time.monotonic() < deadline and benchmark.poll() is None
+        time.sleep(0.05)
+    time.sleep(5.0)
+    benchmark.send_signal(signal.SIGINT)
+    with pytest.raises(subprocess.TimeoutExpired):
+        benchmark.wait(3.0)
+    benchmark.send_signal(signal.SIGINT)
+    assert benchmark.wait(30.0) == 130
+    assert benchmark.stderr is not None
+    assert 'once more stops at once' in benchmark.stderr.read()
+
+
+@pytest.mark.release
 def test_ctrl_c_keeps_what_there_is_and_the_same_command_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -304,7 +326,7 @@ def test_another_budget_in_the_same_folder_is_refused(
         (['--steps', '0'], 'total_steps 0; allowed: 1 ... '),
         (
             ['--steps', '9', '--set', 'total_steps=8'],
-            '--total-steps 9 excludes --set total_steps=8',
+            '--steps 9 excludes --set total_steps=8',
         ),
         (['--study', 'best', '--arms', 'her_sparse'], '--arms does not belong to --study best'),
         (['--study', 'best', '--full'], '--full belongs to --study paper'),

@@ -93,6 +93,54 @@ def test_a_run_that_cannot_be_told_of_is_named_and_its_report_kept(
     assert (study / 'told' / 'runs.csv').read_bytes() == before
 
 
+@pytest.mark.parametrize(('lost', 'steps'), [(1, 0), (2, 400)])
+def test_a_run_whose_log_lost_a_row_is_not_told_of(
+    study: Path, lost: int, steps: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An evaluation less is another area."""
+    log = study / 'runs' / 'FetchReach' / 'none' / 'seed0' / 'progress.csv'
+    lines = log.read_text().splitlines()
+    lines[lost] = lines[lost][:20]
+    log.write_text('\n'.join(lines))
+    before = (study / 'told' / 'runs.csv').read_bytes()
+    assert again(study) == 1
+    assert f'progress.csv lacks rows from {steps} steps on; without ' in capsys.readouterr().err
+    assert (study / 'told' / 'runs.csv').read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ('name', 'what'), [('runs.csv', 'FetchReach/none/1'), ('curves.csv', 'FetchReach/none/1/400')]
+)
+def test_what_a_table_has_twice_is_no_further_seed(
+    study: Path, name: str, what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = study / 'told' / name
+    head, first, *others = file.read_text().splitlines()
+    file.write_text('\n'.join([head, first, *others, first]))
+    assert again(study) == 2
+    assert f': {what} is there twice' in capsys.readouterr().err
+
+
+def test_evaluations_of_runs_that_are_not_there_are_left_out(
+    study: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = study / 'told' / 'runs.csv'
+    head, _ = file.read_text().splitlines()
+    # As a spreadsheet saves it.
+    file.write_text(f'{head}\n', encoding='utf-8-sig')
+    assert again(study) == 0
+    assert 'runs.csv has no FetchReach/none/seed1; their eval' in capsys.readouterr().err
+    for name in ('runs.csv', 'curves.csv'):
+        assert {row['seed'] for row in read_rows(study / 'told' / name)} == {0}
+
+
+def test_a_damaged_state_says_what_to_do(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = study / 'runs' / 'FetchReach' / 'none' / 'seed0'
+    (folder / 'training_state.safetensors').write_bytes(b'cut')
+    assert again(study) == 2
+    assert f'without {folder} it is run again' in capsys.readouterr().err
+
+
 def test_a_report_with_no_place_is_refused_before_anything_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

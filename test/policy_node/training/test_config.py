@@ -253,6 +253,11 @@ def test_options_become_fields_of_their_types_and_nothing_else_is_set() -> None:
     }
 
 
+@pytest.mark.parametrize('text', ['1000000', '1_000_000', '1e6', '1.0e6'])
+def test_steps_are_whole_however_they_are_written(text: str) -> None:
+    assert options_of('--steps', text) == {'total_steps': 1_000_000}
+
+
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
@@ -260,6 +265,10 @@ def test_options_become_fields_of_their_types_and_nothing_else_is_set() -> None:
         (['--gamma', 'high'], "gamma 'high' is not of type float"),
         (['--hidden-sizes', 'abc'], "hidden_sizes 'abc' is not whole numbers with commas"),
         (['--nosuchthing'], 'unrecognized arguments: --nosuchthing'),
+        (['--gamble', 'true'], 'switches take no value: --name is on, --no-name is off'),
+        (['--steps', '1e6.5'], "total_steps '1e6.5' is not of type int"),
+        (['--steps', '1.5'], "total_steps '1.5' is not of type int"),
+        (['--steps', '1e29'], "total_steps '1e29' is not of type int"),
     ],
 )
 def test_what_was_mistyped_is_answered_in_a_line(

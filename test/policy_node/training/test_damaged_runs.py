@@ -229,6 +229,7 @@ def test_a_curve_with_no_place_does_not_fail_the_run(
     ('options', 'message'),
     [
         (['--hidden-sizes', '8,8'], 'has networks of hidden_sizes (16, 16), which stay; not (8, 8'),
+        (['--seed', '9'], 'has experience of seed 0, which stay; not 9'),
         (['--critics', '2'], 'has networks of critics 1, which stay; not 2'),
         (['--goal-features', 'relative'], "has networks of goal_features 'plain', which stay"),
         (['--control-hz', '50'], 'has experience of control_hz 25.0, which stay; not 50.0'),

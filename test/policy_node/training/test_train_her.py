@@ -459,6 +459,17 @@ def test_a_run_that_began_anew_has_one_part(tmp_path: Path) -> None:
     assert (tmp_path / 'command.txt').read_text() == 'train_her of now\n'
     train_run(small_config(total_steps=1600), tmp_path, resume=True, command='more')
     assert (tmp_path / 'command.txt').read_text() == 'train_her of now\nmore\n'
+    train_run(small_config(total_steps=1600), tmp_path, resume=True, command='nothing to do')
+    assert (tmp_path / 'command.txt').read_text() == 'train_her of now\nmore\n'
+
+
+def test_a_run_that_goes_on_says_that_its_log_is_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train_run(small_config(total_steps=800), tmp_path)
+    (tmp_path / 'progress.csv').unlink()
+    train_run(small_config(total_steps=1200), tmp_path, resume=True)
+    assert 'progress.csv has no rows from 0 to 800 steps' in capsys.readouterr().err
 
 
 def test_a_run_that_begins_anew_sets_the_one_before_aside(
@@ -468,12 +479,15 @@ def test_a_run_that_begins_anew_sets_the_one_before_aside(
     board = tmp_path / 'tensorboard'
     board.mkdir()
     names = 'best.safetensors', '1.replay.safetensors', 'tensorboard/events.out.tfevents.1.host.2.0'
-    for name in (*names, 'mine.replay.safetensors', 'tensorboard/mine'):
+    others = 'mine.replay.safetensors', 'tensorboard/mine', 'progress.csv', 'curve.png'
+    for name in (*names, *others):
         (tmp_path / name).write_bytes(name.encode())
     train_run(small_config(total_steps=400, learning_starts=1000), tmp_path)
     # It may be all that somebody has kept of a run.
-    assert (tmp_path / 'former_best.safetensors').read_bytes() == b'best.safetensors'
-    assert 'former_best.safetensors now' in capsys.readouterr().err
+    kept = 'best.safetensors', 'progress.csv', 'curve.png'
+    for name in kept:
+        assert (tmp_path / f'former_{name}').read_bytes() == name.encode()
+    assert f'{", ".join(kept)} of an earlier run in {tmp_path}: now' in capsys.readouterr().err
     assert not [name for name in names if (tmp_path / name).exists()]
     assert (tmp_path / 'mine.replay.safetensors').exists() and (board / 'mine').exists()
 
@@ -549,6 +563,7 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
             [*'--task FetchReach --steps 1 --her --set strategy=none'.split()],
             '--her excludes strategy none: give another --strategy',
         ),
+        (['--task', 'FetchReach', '--set', 'gamma=nan'], 'gamma nan is no finite number'),
         (
             [*'--task FetchReach --steps 1 --set gamma=.9 --gamma .95'.split()],
             '--gamma 0.95 excludes --set gamma=0.9',
