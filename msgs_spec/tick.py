@@ -144,6 +144,8 @@ class Tick:
         is_success: Whether the goal is reached now.
         applied_command: (action,), command units, after clipping.
         status: Of the episode.
+        has_diverged: Whether MuJoCo gave up in the step that led here, which ends the episode;
+            state, goal and reward are of what it was set back to.
     """
 
     stamp_ns: int
@@ -154,6 +156,7 @@ class Tick:
     is_success: bool
     applied_command: Array | None
     status: EpisodeStatus
+    has_diverged: bool = False
 
 
 def _vectors(tick: Tick) -> dict[str, ArrayLike | None]:

@@ -81,7 +81,7 @@ def _run(options: argparse.Namespace) -> int:
     by_task: dict[str, list[EpisodeArrays]] = {}
     filtered = 0
     try:
-        paths = expand_episodes(options.path)
+        paths = _each_once(expand_episodes(options.path))
         with progress('episodes', len(paths)) as advance:
             for path in paths:
                 try:
@@ -101,6 +101,16 @@ def _run(options: argparse.Namespace) -> int:
     for task, written in _export(options, by_task, name).items():
         say(f'{_counted(by_task[task])} of {task}: {written}')
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
+
+
+def _each_once(paths: Sequence[Path]) -> list[Path]:
+    """Paths without those that lead to one before, as links do."""
+    first: dict[Path, Path] = {}
+    for path in paths:
+        known = first.setdefault(path.resolve(), path)
+        if known is not path:
+            complain(_NAME, f'{path} is {known}, which is taken once')
+    return list(first.values())
 
 
 def _why_none(path: Path, filtered: int) -> str:

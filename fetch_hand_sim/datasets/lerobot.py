@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from fetch_hand_sim.datasets.writing import (
     ByTask,
     ExportError,
     alone_in,
+    hidden_folder,
     move_all,
     require_module,
     require_new,
@@ -71,11 +71,11 @@ def export_lerobot(
     try:
         with alone_in(directory):
             require_new(targets.values())
-            with TemporaryDirectory(prefix='.', suffix='.partial', dir=directory) as hidden:
+            with hidden_folder(directory, 'lerobot') as hidden:
                 for task, episodes in by_task.items():
                     rate = episodes[0].record.control_hz
-                    _Dataset(Path(hidden) / task, episodes[0].spec, rate, camera).write(episodes)
-                move_all({Path(hidden) / task: target for task, target in targets.items()})
+                    _Dataset(hidden / task, episodes[0].spec, rate, camera).write(episodes)
+                move_all({hidden / task: target for task, target in targets.items()})
     except OSError as error:
         raise ExportError(f'{directory}: {error.strerror or error}') from error
     return targets

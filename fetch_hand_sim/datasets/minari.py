@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium
@@ -23,6 +22,7 @@ from fetch_hand_sim.datasets.writing import (
     ByTask,
     ExportError,
     alone_in,
+    hidden_folder,
     move_all,
     require_module,
     require_new,
@@ -154,8 +154,8 @@ def _appearing(directory: Path, dataset_ids: Sequence[str]) -> Iterator[None]:
     """Minari writes into a hidden folder meanwhile; what is whole at the end moves to its place."""
     # Minari joins a relative path to itself.
     directory, before = directory.resolve(), os.environ.get(_MINARI_PATH)
-    with TemporaryDirectory(prefix='.', suffix='.partial', dir=directory) as hidden:
-        os.environ[_MINARI_PATH] = hidden
+    with hidden_folder(directory, 'minari') as hidden:
+        os.environ[_MINARI_PATH] = str(hidden)
         try:
             with warnings.catch_warnings():
                 # Minari warns of every field that only an author could fill in.
@@ -166,12 +166,12 @@ def _appearing(directory: Path, dataset_ids: Sequence[str]) -> Iterator[None]:
                 del os.environ[_MINARI_PATH]
             else:
                 os.environ[_MINARI_PATH] = before
-        for source in Path(hidden).rglob(_NAMESPACE):
+        for source in hidden.rglob(_NAMESPACE):
             target = directory / source.relative_to(hidden)
             target.parent.mkdir(parents=True, exist_ok=True)
             if not target.exists():
                 source.replace(target)
-        move_all({Path(hidden) / each: directory / each for each in dataset_ids})
+        move_all({hidden / each: directory / each for each in dataset_ids})
 
 
 def _environment(episode: EpisodeArrays) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import importlib
 import os
+import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -65,6 +66,21 @@ def alone_in(directory: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+@contextmanager
+def hidden_folder(directory: Path, name: str) -> Iterator[Path]:
+    """Makes a hidden folder in one that nobody else writes to, and removes it at the end.
+
+    What an export left there that was killed goes first.
+    """
+    hidden = directory / f'.{name}.partial'
+    shutil.rmtree(hidden, ignore_errors=True)
+    hidden.mkdir()
+    try:
+        yield hidden
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
 
 
 def require_new(paths: Iterable[Path]) -> None:

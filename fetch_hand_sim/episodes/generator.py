@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeLogError, EpisodeWriter
 from fetch_hand_sim.episodes.context import RecordingContext
-from fetch_hand_sim.episodes.recorder import LoggedEpisode, episode_result
+from fetch_hand_sim.episodes.recorder import DIVERGED, LoggedEpisode, episode_result
 from fetch_hand_sim.episodes.robot_episode import RobotEpisode, sense
 from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS
 from fetch_hand_sim.simulation import Observation, Simulation
@@ -50,14 +50,21 @@ class EpisodeGenerator:
         directory: Where episodes are collected.
         act: Returns actions (N, action size) in [-1, 1] for the observations of all robots.
         context: Metadata and attachments.
+        on_start: Called with the seeds (N,) of the episodes that all robots begin.
     """
 
     def __init__(
-        self, simulation: Simulation, directory: Path, act: Act, context: RecordingContext
+        self,
+        simulation: Simulation,
+        directory: Path,
+        act: Act,
+        context: RecordingContext,
+        on_start: Callable[[Sequence[int]], object] | None = None,
     ) -> None:
         self._simulation = simulation
         self._episodes = EpisodeDirectory(directory)
         self._act = act
+        self._on_start = on_start
         self._context = context
         self._encoder = TickEncoder(simulation.spec)
         self._commands = topic(simulation.spec, 'commands')
@@ -102,6 +109,8 @@ class EpisodeGenerator:
         """Runs one episode in every robot; robots beyond those given run idle."""
         simulation, robot_spec = self._simulation, self._simulation.spec.robot
         simulation.reset(seed=first_seed)
+        if self._on_start is not None:
+            self._on_start(range(first_seed, first_seed + simulation.num_envs))
         sensed = sense(simulation)
         for index, robot in enumerate(robots):
             self._take(robot, robot.episode.start(sensed, index))
@@ -160,8 +169,9 @@ def _completed(waiting: deque[Future[LoggedEpisode]]) -> Iterator[LoggedEpisode]
 
 
 def _complete(writer: EpisodeWriter, robot: _Robot) -> LoggedEpisode:
-    status = robot.episode.status
-    path = writer.finish(episode_result(status))
+    status, is_complete = robot.episode.status, not robot.episode.has_diverged
+    writer.end(episode_result(status), None if is_complete else DIVERGED)
+    path = writer.store()
     if path is None:
         raise EpisodeLogError(f'episode of seed {status.seed} could not be written')
-    return LoggedEpisode(status, path, is_complete=True)
+    return LoggedEpisode(status, path, is_complete)

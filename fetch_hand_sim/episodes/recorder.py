@@ -43,6 +43,8 @@ _LOOK_AFTER = 0.1
 _PATIENCE = 3.0
 # Seconds that a disk which has failed may still hold up the end.
 _LAST_CHANCE = 5.0
+# Why an episode was cut short that MuJoCo gave up.
+DIVERGED = 'diverged'
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +123,7 @@ class EpisodeRecorder:
         self._put(partial(self._files.write_tick, tick.stamp_ns, messages))
         self._status = tick.status
         if tick.status.phase == 'finished':
-            self._end(None)
+            self._end(DIVERGED if tick.has_diverged else None)
 
     def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> None:
         """Logs a message received since the last tick; between episodes there is no file."""

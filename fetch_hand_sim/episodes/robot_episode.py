@@ -131,6 +131,7 @@ class RobotEpisode:
             is_success=is_success,
             applied_command=command,
             status=self.status,
+            has_diverged=self.has_diverged,
         )
 
     def _make_status(self, phase: Phase, *, is_success: bool) -> EpisodeStatus:

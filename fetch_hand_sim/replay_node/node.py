@@ -13,6 +13,7 @@ from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool
 
 from fetch_hand_sim.episode_log import EpisodeReadError
+from fetch_hand_sim.episode_log.summary import folders_below
 from fetch_hand_sim.replay_node import NODE_NAME
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
 from msgs_spec.command_line import UsageError
@@ -74,7 +75,8 @@ class ReplayNode(Node):
         try:
             return ReplaySchedule(Path(path), names, self._settings['inputs'])
         except (EpisodeReadError, ValueError) as error:
-            raise UsageError(str(error)) from None
+            below = folders_below(Path(path))
+            raise UsageError(f'{error}{f"; there are some in {below}" if below else ""}') from None
 
     def _open(self, name: str) -> Publisher:
         spec = self._schedule.topics[name]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -56,12 +56,22 @@ class LoadedPolicy:
         return self.policy.predict(observation, deterministic=deterministic)
 
 
+# Apart from other streams of random numbers that a seed stands for.
+_OF_ACTIONS = 1
+
+
 class RandomPolicy:
     """Uniformly random actions, alike for equal seeds."""
 
     def __init__(self, action_size: int, seed: int = 0) -> None:
         self._action_size = action_size
         self._generator = np.random.default_rng(seed)
+        self._of_rows: list[np.random.Generator] = []
+
+    def start(self, seeds: Sequence[int]) -> None:
+        """Begins an episode in each row of a batch; equal seeds have equal actions from then on."""
+        # Not the numbers that resets draw from the same seeds.
+        self._of_rows = [np.random.default_rng((seed, _OF_ACTIONS)) for seed in seeds]
 
     def predict(
         self,
@@ -73,6 +83,9 @@ class RandomPolicy:
         """Returns actions (..., action size) in [-1, 1], whatever the observation."""
         del state, episode_start, deterministic
         shape = _action_shape(observation, self._action_size)
+        if shape == (len(self._of_rows), self._action_size):
+            rows = [generator.uniform(-1.0, 1.0, shape[1:]) for generator in self._of_rows]
+            return np.array(rows, np.float32), None
         return self._generator.uniform(-1.0, 1.0, shape).astype(np.float32), None
 
 

@@ -32,6 +32,7 @@ from msgs_spec.command_line import (
     whole_number,
 )
 from msgs_spec.parameters import LARGEST_SEED
+from policy_node.policies.policy import RandomPolicy
 from policy_node.training.policy_options import (
     CheckedPolicy,
     add_batch_options,
@@ -73,7 +74,9 @@ def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simul
     def act(observation: Observation) -> NDArray[Any]:
         return policy.predict(observation)[0]
 
-    return EpisodeGenerator(simulation, options.output, act, context), simulation
+    random = loaded.policy if isinstance(loaded.policy, RandomPolicy) else None
+    on_start = random.start if random else None
+    return EpisodeGenerator(simulation, options.output, act, context, on_start), simulation
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fetch_hand_sim.episode_log import EpisodeArrays, load_episodes
+from fetch_hand_sim.episode_log.summary import holds_no_episode
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec
 from policy_node.training.replay.episode_replay import Episodes
 
@@ -38,6 +39,8 @@ def read_experience(
             skipped.append(f'{episode.path}: {reason}')
         else:
             usable.append(episode)
+    if not (usable or skipped):
+        raise ValueError(str(holds_no_episode(Path(directory))))
     if not usable:
         first = f', first: {skipped[0]}' if skipped else ''
         raise ValueError(f'{directory} holds no usable episode of {task.name}{first}')

@@ -324,3 +324,29 @@ def test_minari_looks_afterwards_where_it_looked_before(before, episodes, tmp_pa
     arguments = [str(episodes), '--to', 'minari', '--output', str(tmp_path)]
     assert export_episodes.main(arguments) == 0
     assert os.environ.get('MINARI_DATASETS_PATH') == before
+
+
+def test_what_a_killed_export_left_goes(episodes, tmp_path, monkeypatch):
+    left = tmp_path / 'out' / '.minari.partial' / 'data'
+    left.mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert (
+        export_episodes.main([str(episodes), '--to', 'minari', '--output', str(tmp_path / 'out')])
+        == 0
+    )
+    assert not [path for path in (tmp_path / 'out').iterdir() if path.name.endswith('.partial')]
+
+
+def test_an_episode_and_a_link_to_it_are_one(episodes, tmp_path, capsys):
+    first, *_ = sorted(episodes.iterdir())
+    folder = tmp_path / 'linked'
+    folder.mkdir()
+    for name in ('a', 'b'):
+        (folder / name).symlink_to(first)
+    assert (
+        export_episodes.main([str(folder), '--to', 'parquet', '--output', str(tmp_path / 'out')])
+        == 0
+    )
+    printed = capsys.readouterr()
+    assert '1 episodes of ' in printed.out
+    assert f'{folder / "b"} is {folder / "a"}, which is taken once' in printed.err

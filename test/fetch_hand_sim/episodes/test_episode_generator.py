@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.episode_log import EpisodeWriter
+from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.simulation import Simulation
@@ -56,3 +57,23 @@ def test_ctrl_c_while_a_file_is_written_leaves_whole_ones_alone(
         for each in generator.generate(ROBOTS):
             logged.append(each.path)
     assert len(logged) == 1 and logged == list(tmp_path.iterdir())
+
+
+def test_an_episode_that_mujoco_gave_up_is_no_whole_one(tmp_path: Path) -> None:
+    """Its last tick is of the state that MuJoCo was set back to."""
+    simulation = Simulation('FetchReach', num_envs=ROBOTS, num_threads=1)
+    velocity, asked = simulation.task.batch.bind('qvel'), 0
+
+    def act(observation: object) -> np.ndarray:
+        nonlocal asked
+        asked += 1
+        if asked == 5:
+            velocity[1, 0] = np.nan
+        return np.zeros((ROBOTS, 4))
+
+    generator = EpisodeGenerator(simulation, tmp_path, act, RecordingContext(simulation))
+    whole, lost = generator.generate(ROBOTS)
+    assert whole.is_complete and not lost.is_complete
+    outcomes = [load_episode(each.path) for each in (whole, lost)]
+    assert [each.outcome.reason for each in outcomes] == [None, 'diverged']
+    assert [(each.is_complete, len(each)) for each in outcomes] == [(True, 50), (False, 5)]

@@ -209,3 +209,14 @@ def test_what_is_loaded_acts_itself() -> None:
     observation = {'observation': np.zeros(10), 'achieved_goal': np.zeros(3)}
     observation['desired_goal'] = np.zeros(3)
     assert loaded.predict(observation)[0].tolist() == [0.0] * 4
+
+
+def test_random_episodes_are_alike_for_equal_seeds_wherever_they_run() -> None:
+    observation = {'observation': np.zeros((3, 10))}
+    first, second = RandomPolicy(4), RandomPolicy(4)
+    first.start([5, 6, 7])
+    second.start([7, 8, 9])
+    ours, theirs = (policy.predict(observation)[0] for policy in (first, second))
+    assert (ours[2] == theirs[0]).all()
+    assert len(np.unique(ours[:, 0])) == 3
+    assert (np.abs(ours) <= 1.0).all()

@@ -232,7 +232,12 @@ def test_logs_that_cannot_be_learnt_from_are_refused(
     assert main([*SMALL, *small]) == 2
     assert 'holds 600 transitions, the replay 500; allow more with' in capsys.readouterr().err
     assert main([*SMALL, '--from-episodes', str(tmp_path), *output]) == 2
-    assert 'holds no usable episode of FetchReach' in capsys.readouterr().err
+    assert f'{tmp_path} holds no episode' in capsys.readouterr().err
+    above = tmp_path / 'above'
+    above.mkdir()
+    (above / 'inner').symlink_to(logged)
+    assert main([*SMALL, '--from-episodes', str(above), *output]) == 2
+    assert f'holds no episode; there are some in {above / "inner"}' in capsys.readouterr().err
     assert main([*SMALL, '--from-episodes', str(logged), '--set', 'control_hz=50', *output]) == 2
     assert 'holds no usable episode of FetchReach' in capsys.readouterr().err
     assert not (tmp_path / 'run').exists(), 'refused before anything was written'
