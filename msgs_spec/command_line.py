@@ -184,7 +184,7 @@ def run_command(name: str, run: Callable[[], int]) -> int:
         Ctrl-C (it is acknowledged at once with a line), 141 if nobody reads the output any more.
         SIGTERM and SIGHUP are as Ctrl-C, with 143 and 129.
     """
-    _make_output_usable()
+    make_output_usable()
     with _stopping_is_said(name) as stopping:
         code = _exit_code(name, run, stopping)
         if stopping and code == EXIT_INTERRUPTED:
@@ -224,7 +224,7 @@ def _exit_code(name: str, run: Callable[[], int], stopping: Sequence[int]) -> in
     return code
 
 
-def _make_output_usable() -> None:
+def make_output_usable() -> None:
     """Lets this process print where its stdout or stderr is closed, or cannot take every letter.
 
     Of a program of somebody else that runs a command, nothing is changed.
@@ -256,18 +256,36 @@ def start_command(name: str, module: str, *extras: str) -> int:
     return run_command(name, run)
 
 
-def require_extra(extra: str) -> None:
+def require_extra(extra: str, *needed: str) -> None:
     """Checks that what an extra of this package brings is installed.
+
+    Args:
+        extra: Its name.
+        needed: Those of its modules that are; none given are all of them.
 
     Raises:
         UsageError: If not; the message says what to install.
     """
-    missing = [module for module in EXTRAS[extra] if find_spec(module) is None]
+    missing = [module for module in needed or EXTRAS[extra] if find_spec(module) is None]
     if missing:
         source = 'source a ROS 2 Jazzy installation or ' if extra == 'ros' else ''
         raise UsageError(
             f"{' and '.join(missing)} missing: {source}pip install 'fetch_hand_sim[{extra}]'"
         )
+    if extra == 'ros':
+        _require_rclpy()
+
+
+def _require_rclpy() -> None:
+    """Refuses an rclpy that is found and cannot be used, as that of a ROS for another Python."""
+    try:
+        import_module('rclpy')
+    except (ImportError, OSError) as error:
+        python = '.'.join(map(str, sys.version_info[:2]))
+        raise UsageError(
+            f'rclpy cannot be used by Python {python} (a sourced ROS 2 Jazzy is for 3.12): '
+            f'{one_line(error)}'
+        ) from None
 
 
 @contextmanager

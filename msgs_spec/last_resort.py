@@ -45,7 +45,7 @@ def ends_within(seconds: float, exit_code: int) -> Iterator[None]:
     Nothing is flushed but standard output and error, and these before. It works where the C library
     is glibc; elsewhere nothing happens.
     """
-    for stream in (sys.stdout, sys.stderr):
+    for stream in filter(None, (sys.stdout, sys.stderr)):
         # Whoever read it may be gone.
         with suppress(OSError, ValueError):
             stream.flush()

@@ -21,6 +21,7 @@ from msgs_spec.command_line import (
     UsageError,
     complain,
     heard,
+    make_output_usable,
     one_line,
     require_extra,
     run_command,
@@ -173,7 +174,8 @@ def run_node(
         0 for a normal end, also by signal; 2 for bad usage; 1 for a failure. Errors of both kinds
         are one line on stderr.
     """
-    # First of all: what follows takes long enough for people to change their mind.
+    make_output_usable()
+    # What follows takes long enough for people to change their mind.
     stop = StopSignals()
     keep_discovery_local()
     find_place_for_logs()

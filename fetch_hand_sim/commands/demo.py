@@ -12,7 +12,6 @@ import re
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
-from fetch_hand_sim.commands.node_processes import start_nodes, stop_node
+from fetch_hand_sim.commands.node_processes import open_log, start_nodes, stop_node
 from fetch_hand_sim.episode_log import (
     Episode,
     EpisodeOutcome,
@@ -167,7 +166,7 @@ class Demo:
         """Runs the nodes, prints what they did and returns the exit code."""
         began = time.monotonic()
         # What the nodes print is shown if something goes wrong.
-        with tempfile.NamedTemporaryFile('w+', prefix='demo_', suffix='.log') as logs:
+        with open_log('demo') as logs:
             self._log = Path(logs.name)
             policy, sim = start_nodes(
                 {'policy_node': {'policy': commander}, 'sim_node': self._sim_parameters()}, logs
@@ -336,7 +335,7 @@ def _run(options: argparse.Namespace) -> int:
     find_place_for_logs()
     os.environ.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
     stop = StopSignals()
-    rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    rclpy.init(args=[], signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     try:
         return Demo(options, Console()).run(stop)
     finally:

@@ -50,7 +50,8 @@ def executable(name: str, parent: int | None = None) -> list[str]:
     function = f'__import__({point.module!r}, fromlist=["_"]).{point.attr}'
     # Before anything that takes long to import.
     first = '' if parent is None else f'import {_PARENT}; {_PARENT}.end_with_parent({parent}); '
-    return [sys.executable, '-c', f'{first}import sys; sys.exit({function}())']
+    # As an installed executable: modules of the working directory do not come first.
+    return [sys.executable, '-P', '-c', f'{first}import sys; sys.exit({function}())']
 
 
 def is_actor_shipped(task: str) -> bool:

@@ -40,6 +40,7 @@ from msgs_spec.command_line import (
 
 _NAME = 'export_episodes'
 _TITLES = {'parquet': 'Parquet', 'minari': 'Minari', 'lerobot': 'LeRobot'}
+_NEEDED = {'parquet': ('pyarrow',), 'minari': ('pyarrow', 'minari'), 'lerobot': ('pyarrow',)}
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -75,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    require_extra('data')
+    require_extra('data', *_NEEDED[options.to])
     name = minari.dataset_name('logged-v0' if options.name is None else options.name)
     skipped: list[EpisodeReadError] = []
     by_task: dict[str, list[EpisodeArrays]] = {}

@@ -6,13 +6,26 @@ import json
 import os
 import signal
 import subprocess
+import tempfile
 from collections.abc import Mapping
 from typing import IO
 
 from fetch_hand_sim.commands.executables import executable
-from msgs_spec.command_line import EXIT_SUCCESS
+from msgs_spec.command_line import EXIT_SUCCESS, CommandError
 
 _SHUTDOWN_TIMEOUT = 10.0
+
+
+def open_log(name: str) -> IO[str]:
+    """Opens a file for what nodes print, which goes when it is closed.
+
+    Raises:
+        CommandError: If there is no folder for temporary files.
+    """
+    try:
+        return tempfile.NamedTemporaryFile('w+', prefix=f'{name}_', suffix='.log')
+    except OSError as error:
+        raise CommandError(f'no file for what the nodes print: {error.strerror}') from None
 
 
 def start_node(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -16,7 +15,7 @@ import rclpy
 from rclpy.node import Node
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
-from fetch_hand_sim.commands.node_processes import start_nodes, stop_node
+from fetch_hand_sim.commands.node_processes import open_log, start_nodes, stop_node
 from fetch_hand_sim.view.attendance import Attendance
 from fetch_hand_sim.view.frame_rate import FrameRate
 from fetch_hand_sim.view.live import LiveRobot
@@ -107,7 +106,7 @@ def _nodes(
     elif options.task is None:
         raise NodeFailure(_nobody(node))
     else:
-        with tempfile.NamedTemporaryFile('w+', prefix='view_', suffix='.log') as log:
+        with open_log('view') as log:
             started = _start(options, node, log)
             try:
                 yield started

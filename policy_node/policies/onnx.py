@@ -124,7 +124,8 @@ def _session(data: bytes, path: Path) -> Any:
 
 def _try_out(data: bytes, path: Path) -> None:
     """Raises ValueError for what cannot be loaded and run within the limits."""
-    command = [sys.executable, '-m', __name__, str(path)]
+    # Python files of the working directory are none of ours.
+    command = [sys.executable, '-P', '-m', __name__, str(path)]
     environment = os.environ | {'PYTHONPATH': os.pathsep.join(p or os.getcwd() for p in sys.path)}
     try:
         trial = subprocess.run(

@@ -16,6 +16,8 @@ _DIAGNOSES = {
     'rotation': 'median rotation at the end, rad',
 }
 
+_NARROWEST = 60
+
 
 def print_table(report: dict[str, Any]) -> None:
     """Prints rates with their 95 % intervals."""
@@ -34,4 +36,5 @@ def print_table(report: dict[str, Any]) -> None:
             table.add_row(label, f'{report[name]:.4f}', '')
     table.add_row('mean return', f'{report["mean_return"]:.3f}', '')
     table.add_row('diverged episodes', str(report['diverged']), '')
-    Console().print(table)
+    # Numbers are whole in a terminal that has no room for them.
+    Console(width=max(Console().width, _NARROWEST)).print(table)

@@ -26,6 +26,36 @@ def test_an_executable_runs_with_its_arguments_and_exit_code(tmp_path):
     assert missing.returncode == 2 and 'none' in missing.stderr
 
 
+def test_python_files_of_the_working_directory_are_not_run(tmp_path):
+    for name in ('random', 'numpy', 'yaml'):
+        (tmp_path / f'{name}.py').write_text('raise RuntimeError("not asked for")')
+    command = [*executable('list_episodes'), tmp_path]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (0, '')
+
+
+@pytest.mark.parametrize('closed', [1, 2])
+def test_a_node_without_stdout_or_stderr_does_its_work(closed):
+    words = ['-p', 'task:=FetchReach', '-p', 'episodes:=1', '-p', 'real_time_factor:=0.0']
+    command = [*executable('sim_node'), '--ros-args', *words]
+    process = subprocess.Popen(command, preexec_fn=lambda: os.close(closed))
+    assert process.wait(60) == 0
+
+
+def test_an_rclpy_of_another_python_is_one_line(tmp_path):
+    (tmp_path / 'rclpy').mkdir()
+    code = 'raise ImportError("no _rclpy_pybind11 for this Python")'
+    (tmp_path / 'rclpy' / '__init__.py').write_text(code)
+    environment = {**os.environ, 'PYTHONPATH': str(tmp_path)}
+    for name in ('sim_node', 'view'):
+        command = [*executable(name), *(['--task', 'FetchReach'] if name == 'view' else [])]
+        result = subprocess.run(command, capture_output=True, text=True, env=environment)
+        (line,) = result.stderr.splitlines()
+        assert result.returncode == 2
+        assert line.startswith(f'{name}: rclpy cannot be used by Python 3.')
+        assert line.endswith('for this Python')
+
+
 @pytest.mark.skipif(sys.platform != 'linux', reason='Linux tells of a parent that has ended')
 def test_an_executable_whose_parent_is_gone_does_not_start(tmp_path):
     for parent, code in ((os.getpid(), 0), (os.getppid(), -signal.SIGTERM)):

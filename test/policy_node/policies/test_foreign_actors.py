@@ -88,6 +88,12 @@ def test_onnx_runs_without_torch(onnx_file):
     subprocess.run([sys.executable, '-c', code], check=True)
 
 
+def test_files_beside_an_onnx_actor_are_not_run(onnx_file, tmp_path, monkeypatch):
+    (tmp_path / 'numpy.py').write_text('raise RuntimeError("not asked for")')
+    monkeypatch.chdir(tmp_path)
+    assert load_policy(onnx_file).task == 'FetchReach'
+
+
 def test_onnx_of_another_task_or_damaged_is_refused_in_one_line(onnx_file, tmp_path):
     with pytest.raises(ValueError, match=r'reach.onnx was trained on FetchReach, not on HandReach'):
         load_policy(onnx_file, 'HandReach')
