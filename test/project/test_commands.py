@@ -69,7 +69,8 @@ def test_every_executable_says_what_it_needs():
 )
 def test_a_missing_extra_is_one_line_that_says_what_to_install(name, module, run, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
-    required = ['x', '--to', 'parquet', '--output', 'x'] if name == 'export_episodes' else []
+    to = 'minari' if module == 'minari' else 'parquet'
+    required = ['x', '--to', to, '--output', 'x'] if name == 'export_episodes' else []
     code, output, error = run(name, *required)
     assert (code, output) == (2, '')
     line = rf"{name}: {module} missing: .*pip install 'fetch_hand_sim\[\w+\]'\n"
