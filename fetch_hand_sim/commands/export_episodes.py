@@ -7,6 +7,7 @@ not be written; 2: bad usage.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -106,9 +107,9 @@ def _run(options: argparse.Namespace) -> int:
 
 def _each_once(paths: Sequence[Path]) -> list[Path]:
     """Paths without those that lead to one before, as links do."""
-    first: dict[Path, Path] = {}
+    first: dict[str, Path] = {}
     for path in paths:
-        known = first.setdefault(path.resolve(), path)
+        known = first.setdefault(os.path.realpath(path), path)
         if known is not path:
             complain(_NAME, f'{path} is {known}, which is taken once')
     return list(first.values())

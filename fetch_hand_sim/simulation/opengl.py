@@ -6,12 +6,15 @@ when the first picture is wanted instead, so that the order of imports does not 
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import os
 import sys
 import warnings
+from collections.abc import Iterator
 from importlib import import_module
+from typing import Any
 
 from mujoco.rendering.classic import gl_context
 
@@ -45,12 +48,33 @@ def prepare_opengl() -> str:
     return backend
 
 
-def let_go() -> None:
-    """Leaves the context that this thread draws in to others: with EGL any thread may take it."""
+@contextlib.contextmanager
+def context_of_its_own() -> Iterator[None]:
+    """Leaves the OpenGL context of this thread as it was, so that others draw in theirs.
+
+    With EGL the one that is drawn in is free then, and any thread may take it.
+    """
+    before = _current_of_egl()
+    try:
+        yield
+    finally:
+        egl = sys.modules.get('mujoco.egl')
+        if egl is not None and egl.EGL_DISPLAY is not None:
+            none = egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_CONTEXT
+            egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, *none)
+            if before is not None:
+                # Somebody may have destroyed it meanwhile.
+                with contextlib.suppress(Exception):
+                    egl.EGL.eglMakeCurrent(*before)
+
+
+def _current_of_egl() -> tuple[Any, ...] | None:
+    """Display, surfaces and context of this thread, as EGL takes them; None if there is none."""
     egl = sys.modules.get('mujoco.egl')
-    if egl is not None and egl.EGL_DISPLAY is not None:
-        none = egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_CONTEXT
-        egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, *none)
+    if egl is None or egl.EGL_DISPLAY is None or not (context := egl.EGL.eglGetCurrentContext()):
+        return None
+    surfaces = (egl.EGL.eglGetCurrentSurface(each) for each in (egl.EGL.EGL_DRAW, egl.EGL.EGL_READ))
+    return egl.EGL.eglGetCurrentDisplay(), *surfaces, context
 
 
 @functools.cache

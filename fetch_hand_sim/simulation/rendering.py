@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation.opengl import ADVICE, let_go, prepare_opengl
+from fetch_hand_sim.simulation.opengl import ADVICE, context_of_its_own, prepare_opengl
 from fetch_hand_sim.simulation.scene import SHOWN_SITES, Frame, Scene
 from fetch_hand_sim.simulation.simulation import Simulation
 from msgs_spec.arrays import Array, Picture
@@ -61,11 +61,10 @@ class SceneRenderer:
         prepare_opengl()
         self._thread = threading.get_ident()
         try:
-            self._renderer = mujoco.Renderer(scene.model, height, width)
+            with context_of_its_own():
+                self._renderer = mujoco.Renderer(scene.model, height, width)
         except Exception as error:
             raise RuntimeError(f'{ADVICE} ({error})') from error
-        finally:
-            let_go()
 
     def render(self, frame: Frame, trail: Sequence[Array] = ()) -> Picture:
         """Returns the picture of a frame, (height, width, 3).
@@ -114,7 +113,8 @@ class SceneRenderer:
     def _in_its_thread(self) -> Iterator[None]:
         """Says in one line what OpenGL says at length to a thread that did not open the context."""
         try:
-            yield
+            with context_of_its_own():
+                yield
         except Exception as error:
             if threading.get_ident() == self._thread:
                 raise
@@ -122,8 +122,6 @@ class SceneRenderer:
                 'OpenGL draws in one thread only: render and close in the thread of the first '
                 f'picture, or make the environment where it is drawn ({type(error).__name__})'
             ) from error
-        finally:
-            let_go()
 
     def _update(self, frame: Frame) -> None:
         # Again: a forked process may have come by a renderer of its parent's.

@@ -72,12 +72,15 @@ def _damage(job: Job) -> str:
 
 
 def _lost_rows(job: Job) -> float | None:
-    """After which step the log of a finished job has lost rows, of which each cycle has one."""
+    """After which step the log of a finished job has lost rows, of which each cycle has one.
+
+    A cycle is shorter where MuJoCo gave episodes up, which are not counted.
+    """
     config = job.config
     cycle = config.num_envs * task_spec(config.task, control_hz=config.control_hz).episode_ticks
     steps = [0.0, *(row['env_steps'] for row in read_progress(job.folder / PROGRESS_FILE))]
     for before, after in itertools.pairwise(steps):
-        if after != before + cycle:
+        if after > before + cycle:
             return before
     return steps[-1] if steps[-1] < config.total_steps else None
 

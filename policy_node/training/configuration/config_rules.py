@@ -199,8 +199,9 @@ def _contradictions_of_noise(config: ConfigFields) -> Iterator[str]:
     if 0.0 < config.noise_seconds * config.control_hz < 1.0 - 1e-6:
         tick = 1.0 / config.control_hz
         yield f'noise_seconds {config.noise_seconds:g} is less than a tick of {tick:g} s'
-    if config.parameter_noise and config.noise_seconds > 0.0 and config.random_epsilon == 0.0:
-        yield 'parameter_noise with noise_seconds above 0 needs random_epsilon above 0'
+    holds_nothing = config.random_epsilon == 0.0 and config.random_steps == 0
+    if config.parameter_noise and config.noise_seconds > 0.0 and holds_nothing:
+        yield 'parameter_noise with noise_seconds above 0 needs random_epsilon or random_steps'
     if config.parameter_noise and config.noise_spread > 0.0:
         yield 'parameter_noise excludes noise_spread: its copies are alike'
 

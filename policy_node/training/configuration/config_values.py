@@ -79,12 +79,16 @@ def whole(text: str) -> int:
 def config_from_dict(values: dict[str, Any]) -> TrainConfig:
     """Rebuilds a configuration from `dataclasses.asdict` that went through JSON.
 
-    Fields that came later have their default.
+    Fields that came later have their default; of one that did nothing, and is refused since, the
+    value is left out.
 
     Raises:
         ValueError: If a field is unknown or a value not allowed.
     """
-    return TrainConfig(**typed_fields(values))
+    fields = typed_fields(values)
+    if fields.get('goals') or fields.get('strategy') != 'futureactual':
+        fields.pop('future_only_steps', None)
+    return TrainConfig(**fields)
 
 
 def typed_fields(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -51,10 +52,12 @@ def set_former_run_aside(folder: Path) -> str:
     Raises:
         OSError: If a file cannot be renamed or removed.
     """
-    kept = [name for name in _OF_FORMER_RUNS if (folder / name).is_file()]
+    kept = [name for name in _OF_FORMER_RUNS if _holds_something(folder / name)]
+    prefixes = itertools.chain(['former'], (f'former{number}' for number in itertools.count(2)))
+    prefix = next(each for each in prefixes if not any(folder.glob(f'{each}_*')))
     for name in kept:
-        (folder / name).replace(folder / f'former_{name}')
-    said = f'{", ".join(kept)} of an earlier run in {folder}: now former_*' if kept else ''
+        (folder / name).replace(folder / f'{prefix}_{name}')
+    said = f'{", ".join(kept)} of an earlier run in {folder}: now {prefix}_*' if kept else ''
     files = [folder / REPLAY_FILE]
     replays = folder.glob(f'*.{REPLAY_FILE}')
     files += [file for file in replays if file.name.partition('.')[0].isdecimal()]
@@ -62,6 +65,13 @@ def set_former_run_aside(folder: Path) -> str:
     for file in files:
         file.unlink(missing_ok=True)
     return said
+
+
+def _holds_something(path: Path) -> bool:
+    """Whether a file is worth keeping: a log that no cycle has ended in is not."""
+    if not path.is_file():
+        return False
+    return path.name != PROGRESS_FILE or path.read_bytes().count(b'\n') > 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,7 +73,7 @@ class RunLog:
         self._time_limit = time_limit
         kept = _rows_until(self.path, resumed_steps)
         logged = float(kept[-1]['env_steps']) if kept else 0.0
-        if logged < resumed_steps:
+        if logged < resumed_steps and not quiet:
             complain(
                 'train_her',
                 f'{self.path} has no rows from {logged:,.0f} to {resumed_steps:,} steps',

@@ -6,6 +6,7 @@ import copy
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import gymnasium
 import numpy as np
@@ -429,9 +430,28 @@ def test_any_thread_draws_with_egl(monkeypatch):
     env.close()
 
 
+def test_somebody_elses_pictures_are_theirs(monkeypatch):
+    """Gymnasium takes its own context once and expects it to stay."""
+    monkeypatch.setenv('MUJOCO_GL', 'egl')
+    arguments = {'render_mode': 'rgb_array', 'width': 32, 'height': 32}
+    ours, theirs = make('FetchReach', **arguments), gymnasium.make('Hopper-v5', **arguments)
+    for env in (ours, theirs):
+        env.reset(seed=0)
+    try:
+        before = theirs.render(), ours.render()
+    except Exception as error:
+        pytest.skip(str(error))
+    after = theirs.render(), ours.render()
+    for one, other in zip(before, after, strict=True):
+        assert one.any() and (one == other).all()
+    ours.close()
+    assert (theirs.render() == before[0]).all()
+    theirs.close()
+
+
 def test_a_thread_is_told_that_another_holds_the_context(monkeypatch):
     monkeypatch.setenv('MUJOCO_GL', 'egl')
-    monkeypatch.setattr(rendering, 'let_go', lambda: None)
+    monkeypatch.setattr(rendering, 'context_of_its_own', nullcontext)
     env = make('FetchReach', render_mode='rgb_array', width=32, height=32)
     env.reset(seed=0)
     try:

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from policy_node.policies.files import write_files
+from policy_node.training.benchmark import reporting
 from policy_node.training.benchmark.actors_table import actors_table
-from policy_node.training.benchmark.command import main
+from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.benchmark.stored_runs import StoredRuns, read_rows
 from support.full_disk import files_at_most
@@ -106,6 +107,20 @@ def test_a_run_whose_log_lost_a_row_is_not_told_of(
     assert again(study) == 1
     assert f'progress.csv lacks rows from {steps} steps on; without ' in capsys.readouterr().err
     assert (study / 'told' / 'runs.csv').read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ('steps', 'lost'),
+    [([400, 800], None), ([350, 750, 1150], None), ([350, 1150], 350), ([400], 400)],
+)
+def test_a_cycle_that_lost_an_episode_is_no_lost_row(
+    tmp_path: Path, steps: list[int], lost: int | None
+) -> None:
+    """Episodes that MuJoCo gave up do not count."""
+    (job,) = jobs_from_arguments(parse_arguments([*STUDY, '--output', str(tmp_path)]))
+    job.folder.mkdir(parents=True)
+    (job.folder / 'progress.csv').write_text('\n'.join(map(str, ['env_steps', *steps, ''])))
+    assert reporting._lost_rows(job) == lost
 
 
 @pytest.mark.parametrize(

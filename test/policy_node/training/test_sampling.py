@@ -225,8 +225,13 @@ def test_an_actor_at_one_condition_is_an_actor_like_any_other() -> None:
         ({'importance': 'density', 'strategy': 'random'}, 'density excludes strategy random'),
         ({'future_only_steps': 9}, 'needs strategy futureactual, and no goals'),
         (
-            {'parameter_noise': True, 'noise_seconds': 0.04, 'random_epsilon': 0.0},
-            'parameter_noise with noise_seconds above 0 needs random_epsilon above 0',
+            {
+                'parameter_noise': True,
+                'noise_seconds': 0.04,
+                'random_epsilon': 0.0,
+                'random_steps': 0,
+            },
+            'parameter_noise with noise_seconds above 0 needs random_epsilon or random_steps',
         ),
     ],
 )

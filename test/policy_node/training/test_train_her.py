@@ -27,6 +27,7 @@ from policy_node.training.machine.distributed import Workers
 from policy_node.training.replay.logged_episodes import read_experience
 from policy_node.training.runs.finite_checks import TrainingError
 from policy_node.training.runs.run import train_run
+from policy_node.training.runs.run_folder import set_former_run_aside
 from policy_node.training.runs.run_log import RunLog, read_progress
 from policy_node.training.runs.trainer import Collected, Trainer
 from policy_node.training.runs.training_state import read_state
@@ -486,15 +487,22 @@ def test_a_run_that_begins_anew_sets_the_one_before_aside(
     names = 'best.safetensors', '1.replay.safetensors', 'tensorboard/events.out.tfevents.1.host.2.0'
     others = 'mine.replay.safetensors', 'tensorboard/mine', 'progress.csv', 'curve.png'
     for name in (*names, *others):
-        (tmp_path / name).write_bytes(name.encode())
+        (tmp_path / name).write_bytes(f'{name}\n\n'.encode())
     train_run(small_config(total_steps=400, learning_starts=1000), tmp_path)
     # It may be all that somebody has kept of a run.
     kept = 'best.safetensors', 'progress.csv', 'curve.png'
     for name in kept:
-        assert (tmp_path / f'former_{name}').read_bytes() == name.encode()
+        assert (tmp_path / f'former_{name}').read_bytes() == f'{name}\n\n'.encode()
     assert f'{", ".join(kept)} of an earlier run in {tmp_path}: now' in capsys.readouterr().err
     assert not [name for name in names if (tmp_path / name).exists()]
     assert (tmp_path / 'mine.replay.safetensors').exists() and (board / 'mine').exists()
+    # Nor do two that were killed early take the place of what is kept.
+    for left in ('env_steps\n', 'env_steps\n400\n'):
+        (tmp_path / 'training_state.safetensors').unlink(missing_ok=True)
+        (tmp_path / 'progress.csv').write_text(left)
+        set_former_run_aside(tmp_path)
+    assert (tmp_path / 'former_progress.csv').read_bytes() == b'progress.csv\n\n'
+    assert (tmp_path / 'former3_progress.csv').read_text() == 'env_steps\n400\n'
 
 
 def test_an_observation_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
