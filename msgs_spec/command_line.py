@@ -83,7 +83,9 @@ class CommandParser(argparse.ArgumentParser):
         assigned = re.match(r'unrecognized arguments: (\w+=\S+)', message)
         if assigned and '--set' in self._option_string_actions:
             return f'; each has a --set of its own: --set {assigned[1]}'
-        if re.match(r'unrecognized arguments: (?:true|false|yes|no|on|off|0|1)\b', message, re.I):
+        has_switches = any(option.startswith('--no-') for option in self._option_string_actions)
+        word = re.match(r'unrecognized arguments: (?:true|false|yes|no|on|off)\b', message, re.I)
+        if word and has_switches:
             return '; switches take no value: --name is on, --no-name is off'
         choice = re.match(r"argument (?:[^:]*/)?(--[\w-]+): invalid choice: '([^']*)'", message)
         choices = self._option_string_actions[choice[1]].choices if choice else None
