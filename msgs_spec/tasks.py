@@ -10,6 +10,8 @@ from functools import partial
 from numbers import Real
 from typing import Literal, get_args
 
+# Packages with tasks of their own have it from here.
+from msgs_spec.arrays import Array as Array
 from msgs_spec.foreign_tasks import foreign_tasks
 from msgs_spec.hints import did_you_mean
 from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND
