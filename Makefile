@@ -8,7 +8,7 @@ TASK ?= FetchReach
 EPISODES ?= 5
 SECONDS ?= 60
 
-PACKAGES := msgs_spec fetch_hand_sim policy_node
+PACKAGES := msgs_spec node_runtime fetch_hand_sim policy_node
 PYTHON_FILES := $(PACKAGES) bench docs/conf.py examples test tools setup.py
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.complete

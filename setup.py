@@ -71,12 +71,13 @@ setup(
     packages=find_packages(
         include=[
             f'{name}{suffix}'
-            for name in ('msgs_spec', 'fetch_hand_sim', 'policy_node')
+            for name in ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
             for suffix in ('', '.*')
         ]
     ),
     package_data={
-        'msgs_spec': ['py.typed', '*.xml'],
+        'msgs_spec': ['py.typed'],
+        'node_runtime': ['py.typed', '*.xml'],
         'fetch_hand_sim': ['py.typed'],
         'policy_node': ['py.typed', 'actors/*'],
     },

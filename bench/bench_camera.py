@@ -23,12 +23,12 @@ import rclpy  # noqa: E402
 from bench_rate import Watcher, report  # noqa: E402
 from bench_view import start  # noqa: E402
 
-from msgs_spec.event_loop import EventLoop  # noqa: E402
-from msgs_spec.ros import rclpy_profile, ros_message_class  # noqa: E402
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
-from msgs_spec.transport import keep_discovery_local  # noqa: E402
 from msgs_spec.view_topics import view_topic  # noqa: E402
+from node_runtime.event_loop import EventLoop  # noqa: E402
+from node_runtime.ros import rclpy_profile, ros_message_class  # noqa: E402
+from node_runtime.transport import keep_discovery_local  # noqa: E402
 
 _TICKS_PER_SECOND = os.sysconf('SC_CLK_TCK')
 # Seconds before each measurement.

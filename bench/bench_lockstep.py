@@ -32,9 +32,7 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
 from msgs_spec.cdr import TopicCodec  # noqa: E402
 from msgs_spec.codecs import decode_status  # noqa: E402
-from msgs_spec.event_loop import EventLoop  # noqa: E402
 from msgs_spec.observations import ObservationAssembler  # noqa: E402
-from msgs_spec.ros import rclpy_profile, ros_message_class  # noqa: E402
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec  # noqa: E402
 from msgs_spec.tick import TickEncoder  # noqa: E402
 from msgs_spec.topics import (  # noqa: E402
@@ -43,7 +41,9 @@ from msgs_spec.topics import (  # noqa: E402
     topic,
     topics,
 )
-from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402
+from node_runtime.event_loop import EventLoop  # noqa: E402
+from node_runtime.ros import rclpy_profile, ros_message_class  # noqa: E402
+from node_runtime.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402
 
 SUBSTEPS = 20
 TIMEOUT = 60.0

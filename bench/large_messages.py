@@ -12,10 +12,10 @@ sys.path.insert(0, str(ROOT))
 import rclpy  # noqa: E402
 
 from msgs_spec.cdr import TopicCodec  # noqa: E402
-from msgs_spec.ros import rclpy_profile, ros_message_class  # noqa: E402
 from msgs_spec.tasks import task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
-from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402
+from node_runtime.ros import rclpy_profile, ros_message_class  # noqa: E402
+from node_runtime.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402
 
 BYTES = 10_000_000
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from msgs_spec.command_line import one_line
+from msgs_spec.text import one_line
 
 SPECS = 'fetch_hand_sim_tasks.specification'
 SIMULATIONS = 'fetch_hand_sim_tasks.simulation'

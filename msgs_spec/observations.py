@@ -12,10 +12,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from msgs_spec.arrays import Array
-from msgs_spec.hints import first_of
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.rotations import matrix_to_euler, quaternion_to_matrix
 from msgs_spec.tasks import PHYSICS_TIMESTEP, GoalKind, TaskSpec, substeps_per_tick
+from msgs_spec.text import first_of
 from msgs_spec.topics import topic
 
 # Joints without a value that are named in an error.

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from msgs_spec.hints import did_you_mean
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
@@ -17,6 +16,7 @@ from msgs_spec.tasks import (
     TASKS,
     substeps_per_tick,
 )
+from msgs_spec.text import did_you_mean
 
 Value = str | int | float | bool
 # What parameters begin with that set the quality of service of ROS's own topics.

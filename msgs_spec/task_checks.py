@@ -11,9 +11,9 @@ from dataclasses import replace
 from numbers import Integral, Real
 from typing import Any
 
-from msgs_spec.hints import did_you_mean
 from msgs_spec.robots import CommandPart, RobotSpec
 from msgs_spec.task_types import GoalKind, TaskFormulas, TaskSpec, VectorPart
+from msgs_spec.text import did_you_mean
 
 # What Gymnasium takes in an id and every system in a file name.
 _NAME = re.compile(r'\w[\w.-]*')

@@ -13,10 +13,10 @@ from typing import Literal, get_args
 # Packages with tasks of their own have it from here.
 from msgs_spec.arrays import Array as Array
 from msgs_spec.foreign_tasks import foreign_tasks
-from msgs_spec.hints import did_you_mean
 from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND
 from msgs_spec.task_checks import accept
 from msgs_spec.task_types import GoalKind, TaskFormulas, TaskSpec, VectorPart
+from msgs_spec.text import did_you_mean
 
 __all__ = [
     'DEFAULT_CONTROL_HZ',

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_status
-from msgs_spec.hints import one_of
 from msgs_spec.observations import Readings
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.schemas import serialize
@@ -24,6 +23,7 @@ from msgs_spec.tasks import (
     TaskSpec,
     substeps_per_tick,
 )
+from msgs_spec.text import one_of
 from msgs_spec.topics import TopicSpec, topics
 
 Phase = Literal['waiting', 'reset', 'running', 'finished']

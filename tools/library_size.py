@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 REVISION = '2ce2393'
 # No library code: it lies in tools/ now.
 LEFT_OUT = 'msgs_spec/interface_table.py'
-PACKAGES = ('msgs_spec', 'fetch_hand_sim', 'policy_node')
+PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
 
 # The first pattern that a path matches names its ability: new ones first, then old names and new.
 ABILITIES = {
@@ -44,7 +44,7 @@ ABILITIES = {
         r'|devices|gamble|goal_choice|hierarchy|hindsight_actions|imagined|multi_step|sampling|subgoals)\.py'
     ),
     'studies in parallel, tables of actors': r'.*/(studies|workers|actors_table)\.py',
-    'contract and wire': r'msgs_spec/',
+    'contract and wire': r'msgs_spec/|node_runtime/',
     'file format': r'.*/episode_log/',
     'episodes, their record, check and export': (
         r'.*/episodes/|.*/(episode_(check|export|generator|recorder|runner)|recording_context)\.py'

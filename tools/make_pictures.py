@@ -20,8 +20,8 @@ from fetch_hand_sim.films.film import write_film, write_picture
 from fetch_hand_sim.films.pictures import Studio, tile, with_frame
 from fetch_hand_sim.films.recording import Recording, load_recordings
 from msgs_spec.arrays import Picture
-from msgs_spec.command_line import progress
 from msgs_spec.tasks import TASKS
+from node_runtime.command_line import progress
 from policy_node.training.generate_episodes import main as generate_episodes
 
 ROOT = Path(__file__).parent.parent

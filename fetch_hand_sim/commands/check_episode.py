@@ -16,7 +16,7 @@ from typing import Any
 from fetch_hand_sim.episode_log import EpisodeReadError, expand_episodes
 from fetch_hand_sim.episode_log.summary import holds_no_episode
 from fetch_hand_sim.episodes.checker import CheckResult, EpisodeChecker
-from msgs_spec.command_line import (
+from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     EXIT_USAGE,

@@ -29,30 +29,30 @@ from fetch_hand_sim.episode_log import (
     read_episode,
 )
 from msgs_spec.codecs import decode_status
-from msgs_spec.command_line import (
+from msgs_spec.parameters import LARGEST_SEED
+from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.text import printable
+from msgs_spec.tick import EpisodeStatus
+from msgs_spec.topics import DIAGNOSTICS, topic, topics
+from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     CommandError,
     CommandParser,
     FormerOption,
     complain,
-    printable,
     require_extra,
     run_command,
     whole_number,
 )
-from msgs_spec.node_main import StopSignals, destroy, find_place_for_logs
-from msgs_spec.parameters import LARGEST_SEED
-from msgs_spec.ros import (
+from node_runtime.node_main import StopSignals, destroy, find_place_for_logs
+from node_runtime.ros import (
     DISCOVERY_TIME,
     count_publishers,
     rclpy_profile,
     ros_message_class,
 )
-from msgs_spec.tasks import TaskSpec, task_spec
-from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import DIAGNOSTICS, topic, topics
-from msgs_spec.transport import keep_discovery_local
+from node_runtime.transport import keep_discovery_local
 
 _NAME = 'demo'
 _START_TIMEOUT = 60.0

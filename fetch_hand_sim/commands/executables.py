@@ -8,8 +8,8 @@ from __future__ import annotations
 import sys
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 
-from msgs_spec import parent_process
-from msgs_spec.command_line import UsageError
+from node_runtime import parent_process
+from node_runtime.command_line import UsageError
 
 _DISTRIBUTION = 'fetch_hand_sim'
 _ACTORS = 'fetch_hand_sim.actors'

@@ -25,7 +25,7 @@ from fetch_hand_sim.episode_log import (
 )
 from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.episode_log.summary import holds_no_episode
-from msgs_spec.command_line import (
+from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     EXIT_USAGE,

@@ -26,13 +26,13 @@ from fetch_hand_sim.episode_log import (
 )
 from fetch_hand_sim.episode_log.episode_record import integer_or_none
 from fetch_hand_sim.episode_log.summary import EpisodeSummary, folders_below
-from msgs_spec.command_line import (
+from msgs_spec.text import printable
+from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     CommandParser,
     UsageError,
     complain,
-    printable,
     run_command,
 )
 

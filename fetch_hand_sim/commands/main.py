@@ -16,8 +16,8 @@ from typing import NoReturn
 import shtab
 
 from fetch_hand_sim.commands.executables import find_executable
-from msgs_spec.command_line import EXIT_USAGE, CommandParser, run_command, start_command
-from msgs_spec.hints import did_you_mean
+from msgs_spec.text import did_you_mean
+from node_runtime.command_line import EXIT_USAGE, CommandParser, run_command, start_command
 
 _NAME = 'fetch_hand_sim'
 

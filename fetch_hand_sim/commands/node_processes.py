@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import IO
 
 from fetch_hand_sim.commands.executables import executable
-from msgs_spec.command_line import EXIT_SUCCESS, CommandError
+from node_runtime.command_line import EXIT_SUCCESS, CommandError
 
 _SHUTDOWN_TIMEOUT = 10.0
 

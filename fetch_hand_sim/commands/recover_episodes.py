@@ -22,7 +22,7 @@ from fetch_hand_sim.episode_log import (
     read_summary,
     recover_episode,
 )
-from msgs_spec.command_line import (
+from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     CommandParser,

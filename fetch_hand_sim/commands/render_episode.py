@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fetch_hand_sim.commands.picture_size import picture_size, two_numbers
 from msgs_spec.arrays import Picture
-from msgs_spec.command_line import (
+from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandError,
     CommandParser,

@@ -30,8 +30,9 @@ from fetch_hand_sim.datasets.writing import (
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
 from fetch_hand_sim.gym_envs.spaces import observation_space
-from msgs_spec.command_line import UsageError, one_line, progress
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
+from msgs_spec.text import one_line
+from node_runtime.command_line import UsageError, progress
 
 # Parts of a dataset's id become directories.
 _DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)

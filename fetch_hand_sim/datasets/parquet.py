@@ -22,7 +22,7 @@ from fetch_hand_sim.datasets.writing import (
     require_new,
 )
 from fetch_hand_sim.episode_log import EpisodeArrays
-from msgs_spec.command_line import printable
+from msgs_spec.text import printable
 
 _OBSERVATIONS = ('observation', 'achieved_goal', 'desired_goal')
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.episode_log import EpisodeArrays
-from msgs_spec.command_line import CommandError
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
+from node_runtime.command_line import CommandError
 
 ByTask = Mapping[str, Sequence[EpisodeArrays]]
 

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from msgs_spec.hints import one_of
 from msgs_spec.parameters import LARGEST_PERTURBATION
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import (
@@ -26,6 +25,7 @@ from msgs_spec.tasks import (
     substeps_per_tick,
     task_spec,
 )
+from msgs_spec.text import one_of
 
 Strings = Mapping[str, str]
 Number = TypeVar('Number', int, float)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from msgs_spec.command_line import printable
+from msgs_spec.text import printable
 
 
 class EpisodeLogError(RuntimeError):

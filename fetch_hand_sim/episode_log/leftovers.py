@@ -14,7 +14,7 @@ from pathlib import Path
 
 from fetch_hand_sim.episode_log import durable
 from fetch_hand_sim.episode_log.errors import EpisodeLogError
-from msgs_spec.command_line import printable
+from msgs_spec.text import printable
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from fetch_hand_sim.episode_log.episode_record import HasOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.limits import MAX_SUMMARY_BYTES
 from fetch_hand_sim.episode_log.untrusted import read_records, require_size
-from msgs_spec.command_line import one_line
+from msgs_spec.text import one_line
 
 # CRC of the summary and magic, bytes.
 FILE_END = 4 + 8

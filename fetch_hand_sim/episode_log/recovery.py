@@ -32,9 +32,9 @@ from fetch_hand_sim.episode_log.offered_qos import parse_offered_qos
 from fetch_hand_sim.episode_log.reader import DAMAGED, read_episode
 from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
 from fetch_hand_sim.episode_log.untrusted import RECOVERY_LIMITS, read_records
-from msgs_spec.command_line import one_line
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS
+from msgs_spec.text import one_line
 from msgs_spec.topics import topics
 
 _RECEIVED = frozenset(

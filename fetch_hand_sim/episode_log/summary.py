@@ -25,8 +25,7 @@ from fetch_hand_sim.episode_log.reader import (
     one_line_errors,
 )
 from fetch_hand_sim.episode_log.untrusted import BoundedStream, Records
-from msgs_spec.command_line import printable
-from msgs_spec.hints import first_of
+from msgs_spec.text import first_of, printable
 
 _MAGIC_BYTES = 8
 # Folders that are named where the one above was given.

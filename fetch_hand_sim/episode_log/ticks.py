@@ -8,9 +8,9 @@ from fetch_hand_sim.episode_log.episode_record import parse_task
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.reader import Episode
 from msgs_spec.codecs import message_stamp
-from msgs_spec.command_line import one_line
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TaskSpec
+from msgs_spec.text import one_line
 from msgs_spec.topics import TopicSpec, topics
 
 _CLOCK = '/clock'

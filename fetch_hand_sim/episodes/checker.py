@@ -23,11 +23,11 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode
-from msgs_spec.command_line import one_line, printable
 from msgs_spec.schemas import deserialize
-from msgs_spec.source_revision import source_revision
+from msgs_spec.text import one_line, printable
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import TopicSpec
+from node_runtime.source_revision import source_revision
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ from datetime import UTC, datetime
 from fetch_hand_sim.episode_log import Attachment, episode_metadata
 from fetch_hand_sim.episode_log.model import compiled_attachment, mjcf_attachment, model_sha256
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.source_revision import source_revision
 from msgs_spec.tick import EpisodeStatus
+from node_runtime.source_revision import source_revision
 
 
 class RecordingContext:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from msgs_spec.arrays import Picture
-from msgs_spec.command_line import CommandError, UsageError
+from node_runtime.command_line import CommandError, UsageError
 
 MOVING = ('.mp4', '.gif', '.webp')
 STILL = ('.png', '.jpg')

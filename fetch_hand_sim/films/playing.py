@@ -19,7 +19,7 @@ from fetch_hand_sim.films.pictures import Studio
 from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes
 from msgs_spec.arrays import Picture
-from msgs_spec.command_line import CommandError, UsageError
+from node_runtime.command_line import CommandError, UsageError
 
 # Pictures per second that a file can have.
 _RATES = (0.001, 1000.0)

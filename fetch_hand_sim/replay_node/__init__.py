@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from msgs_spec.node_main import RunnableNode, node_main
+from node_runtime.node_main import RunnableNode, node_main
 
 NODE_NAME = 'replay_node'
 SUMMARY = 'A recorded episode, published once more.'

@@ -16,17 +16,17 @@ from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.summary import folders_below
 from fetch_hand_sim.replay_node import NODE_NAME
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
-from msgs_spec.command_line import UsageError
-from msgs_spec.listeners import Listeners
-from msgs_spec.node_main import StopSignals
 from msgs_spec.parameters import REPLAY_NODE
-from msgs_spec.ros import (
+from node_runtime.command_line import UsageError
+from node_runtime.listeners import Listeners
+from node_runtime.node_main import StopSignals
+from node_runtime.ros import (
     await_acknowledgements,
     count_publishers,
     rclpy_profile,
     ros_message_class,
 )
-from msgs_spec.ros_parameters import declare_parameters, set_callback
+from node_runtime.ros_parameters import declare_parameters, set_callback
 
 # Seconds between looks at the stop flag while nothing is due.
 _SPIN = 0.1

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from msgs_spec.node_main import RunnableNode, node_main
+from node_runtime.node_main import RunnableNode, node_main
 
 NODE_NAME = 'sim_node'
 SUMMARY = 'One simulated robot on the network.'

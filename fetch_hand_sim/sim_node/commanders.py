@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from msgs_spec.ros import MEMORY_OF_THE_GRAPH
+from node_runtime.ros import MEMORY_OF_THE_GRAPH
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from fetch_hand_sim.sim_node.commanders import CommanderWatch, Endpoint
-from msgs_spec.listeners import Listeners
-from msgs_spec.ros import count_publishers, full_name
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topics
+from node_runtime.listeners import Listeners
+from node_runtime.ros import count_publishers, full_name
 
 if TYPE_CHECKING:
     from rclpy.node import Node

@@ -31,20 +31,20 @@ from fetch_hand_sim.sim_node.robot import Messages, Robot
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.command_line import UsageError
 from msgs_spec.diagnostics import REPORT_PERIOD, next_report
-from msgs_spec.event_loop import BEAT, EventLoop
-from msgs_spec.node_main import NodeFailure, StopSignals
 from msgs_spec.parameters import SIM_NODE
 from msgs_spec.robots import require_joint_prefix
-from msgs_spec.ros import (
+from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
+from msgs_spec.topics import LATEST_TICK, MONITORING, topics
+from node_runtime.command_line import UsageError
+from node_runtime.event_loop import BEAT, EventLoop
+from node_runtime.node_main import NodeFailure, StopSignals
+from node_runtime.ros import (
     await_acknowledgements,
     rclpy_profile,
     ros_message_class,
 )
-from msgs_spec.ros_parameters import declare_parameters, set_callback
-from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
-from msgs_spec.topics import LATEST_TICK, MONITORING, topics
+from node_runtime.ros_parameters import declare_parameters, set_callback
 
 _WARN_PERIOD = 1.0
 # Seconds a beat may take: none begins that close to a tick.

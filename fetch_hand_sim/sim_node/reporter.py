@@ -12,8 +12,8 @@ from fetch_hand_sim.sim_node.health import Health, Surroundings, lasting_problem
 from fetch_hand_sim.sim_node.robot import Messages, Robot
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.diagnostics import encode_reports
-from msgs_spec.ros import seldom
 from msgs_spec.topics import DIAGNOSTICS, REAL_TIME_FACTOR
+from node_runtime.ros import seldom
 
 if TYPE_CHECKING:
     from rclpy.node import Node

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from fetch_hand_sim.sim_node.robot import Answer, Robot
 from fetch_hand_sim.sim_node.simulation_interfaces import SimulationInterfaces
-from msgs_spec.ros import ros_service_class
 from msgs_spec.services import INTERFACE_SERVICES, PAUSE, RESET, STEP
+from node_runtime.ros import ros_service_class
 
 if TYPE_CHECKING:
     from rclpy.node import Node

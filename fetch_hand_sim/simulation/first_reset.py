@@ -15,10 +15,11 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks import Task
 from fetch_hand_sim.simulation.tasks.task import Ids
 from msgs_spec.arrays import Array
-from msgs_spec.command_line import CommandError, one_line
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
 from msgs_spec.tasks import GoalKind, RewardType, SuccessRule, TaskSpec
+from msgs_spec.text import one_line
 from msgs_spec.topics import sensor_topics
+from node_runtime.command_line import CommandError
 
 _Given = TypeVar('_Given')
 # What tells two rows of readings apart where there is one simulation; m, rad and per second.

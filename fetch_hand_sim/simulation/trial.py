@@ -16,8 +16,8 @@ from fetch_hand_sim.simulation.first_reset import SpecificationError
 from fetch_hand_sim.simulation.models import load_model
 from fetch_hand_sim.simulation.tasks import Task
 from msgs_spec.arrays import Array
-from msgs_spec.command_line import one_line
 from msgs_spec.tasks import TaskSpec
+from msgs_spec.text import one_line
 
 # Long enough for everything to move.
 _TICKS = 3

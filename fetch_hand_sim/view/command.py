@@ -12,8 +12,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from msgs_spec.command_line import CommandParser, FormerOption, require_extra, run_command
 from msgs_spec.tasks import TASKS
+from node_runtime.command_line import CommandParser, FormerOption, require_extra, run_command
 
 _LOOPBACK = '127.0.0.1'
 _NAMESPACE = re.compile(r'(?:[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*)?', re.ASCII)

@@ -12,8 +12,8 @@ from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.player import Player
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import announce, open_page
-from msgs_spec.command_line import EXIT_SUCCESS, UsageError
-from msgs_spec.node_main import StopSignals
+from node_runtime.command_line import EXIT_SUCCESS, UsageError
+from node_runtime.node_main import StopSignals
 
 _FRAME_TIME = 1.0 / 60.0
 

@@ -32,10 +32,10 @@ from msgs_spec.diagnostics import (
     PERTURB_LIMIT,
     RATE,
 )
-from msgs_spec.ros import full_name
 from msgs_spec.tasks import SuccessRule, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, topic
+from node_runtime.ros import full_name
 
 # A robot is fast that has more ticks per second than in real time by this factor.
 _HURRY = 1.5

@@ -23,16 +23,16 @@ from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.requests import LatestRequest, Request
 from fetch_hand_sim.view.session import Requests, Session
 from fetch_hand_sim.view.web import announce, open_page
-from msgs_spec.command_line import UsageError
-from msgs_spec.event_loop import EventLoop
-from msgs_spec.node_main import (
+from msgs_spec.tasks import TaskSpec
+from node_runtime.command_line import UsageError
+from node_runtime.event_loop import EventLoop
+from node_runtime.node_main import (
     NodeFailure,
     StopSignals,
     destroy,
     run_node,
 )
-from msgs_spec.ros import DISCOVERY_TIME, count_publishers
-from msgs_spec.tasks import TaskSpec
+from node_runtime.ros import DISCOVERY_TIME, count_publishers
 
 NODE_NAME = 'view'
 _FRAME_TIME = 1.0 / 60.0

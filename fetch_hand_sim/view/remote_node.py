@@ -8,7 +8,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from msgs_spec.ros import ros_service_class
+from node_runtime.ros import ros_service_class
 
 _SET_PARAMETERS = 'rcl_interfaces/srv/SetParameters'
 _GET_PARAMETERS = 'rcl_interfaces/srv/GetParameters'

@@ -8,8 +8,8 @@ from typing import Any
 
 from rclpy.node import Node, NodeNameNonExistentError
 
-from msgs_spec.ros import full_name
 from msgs_spec.services import PAUSE, RESET
+from node_runtime.ros import full_name
 
 # Seconds over which ticks are counted.
 _PERIOD = 1.0

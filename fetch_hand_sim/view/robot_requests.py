@@ -30,11 +30,11 @@ from fetch_hand_sim.view.requests import (
 from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_message
-from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.schemas import serialize
 from msgs_spec.services import PAUSE
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
+from node_runtime.ros import rclpy_profile, ros_message_class
 
 # Seconds a goal is shown before the robot confirms it.
 _GOAL_PATIENCE = 0.5

@@ -20,11 +20,11 @@ from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import decode_status
 from msgs_spec.latest_tick import split_messages
 from msgs_spec.robots import JOINT_PREFIX
-from msgs_spec.ros import count_publishers, rclpy_profile, ros_message_class
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import LATEST_TICK, QosSpec, TopicSpec, topic
+from node_runtime.ros import count_publishers, rclpy_profile, ros_message_class
 
 # Nothing is sent twice for a viewer.
 WATCHING = QosSpec(depth=5, reliability='best_effort', durability='volatile')

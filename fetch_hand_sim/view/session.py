@@ -11,7 +11,8 @@ from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.view.page.body_drag import pulls
 from fetch_hand_sim.view.picture import Picture, ShowScene
 from fetch_hand_sim.view.requests import LatestRequest, Push, Request
-from msgs_spec.command_line import CommandError, one_line
+from msgs_spec.text import one_line
+from node_runtime.command_line import CommandError
 
 
 class Source(Protocol):

@@ -31,7 +31,7 @@ from websockets.exceptions import ConnectionClosed
 from fetch_hand_sim.view.attendance import Attendance
 from fetch_hand_sim.view.frame_rate import FrameRate, Touch
 from fetch_hand_sim.view.guard import Guard, guarded_serve, is_loopback, new_token
-from msgs_spec.command_line import CommandError
+from node_runtime.command_line import CommandError
 
 _LOOPBACK = '127.0.0.1'
 _EVERYWHERE = ('::', '0.0.0.0')

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from msgs_spec.node_main import RunnableNode, node_main
+from node_runtime.node_main import RunnableNode, node_main
 
 NODE_NAME = 'visualization_node'
 SUMMARY = 'URDF, transforms, markers and a camera of a running robot, for standard tools.'

@@ -27,21 +27,21 @@ from fetch_hand_sim.visualization_node.transforms import (
     view_transform,
 )
 from msgs_spec.arrays import Picture
-from msgs_spec.event_loop import BEAT, EventLoop
-from msgs_spec.listeners import Listeners
-from msgs_spec.node_main import NodeFailure, StopSignals
 from msgs_spec.parameters import VISUALIZATION_NODE
-from msgs_spec.ros import (
+from msgs_spec.tasks import TaskSpec
+from msgs_spec.tick import EpisodeStatus
+from msgs_spec.topics import TopicSpec
+from msgs_spec.view_topics import SHOWN, scalar_topics
+from node_runtime.event_loop import BEAT, EventLoop
+from node_runtime.listeners import Listeners
+from node_runtime.node_main import NodeFailure, StopSignals
+from node_runtime.ros import (
     count_publishers,
     rclpy_profile,
     ros_message_class,
     seldom,
 )
-from msgs_spec.ros_parameters import declare_parameters
-from msgs_spec.tasks import TaskSpec
-from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import TopicSpec
-from msgs_spec.view_topics import SHOWN, scalar_topics
+from node_runtime.ros_parameters import declare_parameters
 
 _CAMERA_FRAME = 'camera'
 _PICTURES: dict[str, Callable[[Picture, str, int], Any]] = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from msgs_spec.node_main import RunnableNode, node_main
+from node_runtime.node_main import RunnableNode, node_main
 
 NODE_NAME = 'policy_node'
 SUMMARY = 'Commands for a robot, from an actor that sees its topics.'

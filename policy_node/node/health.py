@@ -9,8 +9,8 @@ from types import MappingProxyType
 from typing import Any
 
 from msgs_spec.diagnostics import ASKED_RATE, MODE, PAUSED, RATE, Increase, Report
-from msgs_spec.ros import MEMORY_OF_THE_GRAPH
 from msgs_spec.tick import EpisodeStatus
+from node_runtime.ros import MEMORY_OF_THE_GRAPH
 from policy_node.node.responder import Responder
 
 # Seconds without a complete observation after which the report says so. A robot that is paused

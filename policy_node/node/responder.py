@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_spec.cdr import TopicCodec
-from msgs_spec.command_line import one_line
 from msgs_spec.diagnostics import Durations
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import task_spec
+from msgs_spec.text import one_line
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import topic
 from policy_node.node.commander import Commander

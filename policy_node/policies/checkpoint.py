@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.command_line import one_line
 from msgs_spec.tasks import TASKS, TaskSpec, substeps_per_tick, task_spec
+from msgs_spec.text import one_line
 from policy_node.policies.files import read_file, sha256, write_file
 from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from msgs_spec.command_line import (
+from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandError,
     CommandParser,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msgs_spec.command_line import one_line
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
+from msgs_spec.text import one_line
 from policy_node.policies.policy import LoadedPolicy, Policy, RandomPolicy, RestingPolicy
 from policy_node.policies.python_policy import is_python_name, load_python
 from policy_node.policies.shipped import actor_path, shipped_actors

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.command_line import one_line
+from msgs_spec.text import one_line
 from policy_node.policies.checkpoint import ActorInfo, loaded_actor, parse_metadata
 from policy_node.policies.files import read_file, sha256
 from policy_node.policies.policy import LoadedPolicy, Observation, observation_and_goal

@@ -13,7 +13,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from msgs_spec.command_line import CommandError
+from node_runtime.command_line import CommandError
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.onnx import INPUTS, OUTPUT, OnnxActor

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.command_line import one_line
+from msgs_spec.text import one_line
 from policy_node.policies.policy import LoadedPolicy, Observation, Policy
 
 _NAME = re.compile(r'[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*')

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from msgs_spec.hints import did_you_mean
+from msgs_spec.text import did_you_mean
 
 # What a run of `train_her` leaves, and how the files of actors end.
 _BEST_OF_A_RUN = 'best.safetensors'

@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as from_bytes
 from safetensors.numpy import save as to_bytes
 
-from msgs_spec.command_line import one_line
+from msgs_spec.text import one_line
 from policy_node.policies.files import read_file, write_file
 
 # A training state with its optimisers has a few megabytes.

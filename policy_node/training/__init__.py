@@ -16,7 +16,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     from importlib import import_module
 
-    from msgs_spec.command_line import UsageError, require_extra
+    from node_runtime.command_line import UsageError, require_extra
 
     try:
         require_extra('train')

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from msgs_spec.command_line import start_command
+from node_runtime.command_line import start_command
 
 
 def train_her() -> int:

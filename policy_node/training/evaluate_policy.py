@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.command_line import (
+from msgs_spec.parameters import LARGEST_SEED
+from node_runtime.command_line import (
     EXIT_INTERRUPTED,
     EXIT_SUCCESS,
     CommandError,
@@ -23,7 +24,6 @@ from msgs_spec.command_line import (
     run_command,
     whole_number,
 )
-from msgs_spec.parameters import LARGEST_SEED
 from policy_node.policies.files import to_json, write_file
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import (

@@ -14,7 +14,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from msgs_spec.command_line import (
+from msgs_spec.parameters import LARGEST_SEED
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
+from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandError,
     CommandParser,
@@ -22,8 +24,6 @@ from msgs_spec.command_line import (
     run_command,
     whole_number,
 )
-from msgs_spec.parameters import LARGEST_SEED
-from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from policy_node.policies.files import to_json, write_file
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval

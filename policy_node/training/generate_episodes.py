@@ -20,7 +20,8 @@ from fetch_hand_sim.episode_log.episodes import named_seeds
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.simulation import Observation, Simulation
-from msgs_spec.command_line import (
+from msgs_spec.parameters import LARGEST_SEED
+from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandError,
     CommandParser,
@@ -31,7 +32,6 @@ from msgs_spec.command_line import (
     say,
     whole_number,
 )
-from msgs_spec.parameters import LARGEST_SEED
 from policy_node.policies.policy import RandomPolicy
 from policy_node.training.policy_options import (
     CheckedPolicy,

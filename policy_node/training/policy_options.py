@@ -12,14 +12,6 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.arguments import finite_numbers
-from msgs_spec.command_line import (
-    CommandError,
-    FormerOption,
-    UsageError,
-    complain,
-    one_line,
-    whole_number,
-)
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
     REWARD_TYPES,
@@ -27,6 +19,8 @@ from msgs_spec.tasks import (
     TASKS,
     task_spec,
 )
+from msgs_spec.text import one_line
+from node_runtime.command_line import CommandError, FormerOption, UsageError, complain, whole_number
 from policy_node.policies.loading import POLICY_NAMES, load_policy
 from policy_node.policies.policy import LoadedPolicy, Observation
 

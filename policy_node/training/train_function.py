@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from msgs_spec.command_line import CommandError, UsageError
+from node_runtime.command_line import CommandError, UsageError
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_values import typed_fields
 from policy_node.training.configuration.recipes import recipe_config

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msgs_spec.command_line import (
+from msgs_spec.tasks import TASKS, task_spec
+from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandParser,
     UsageError,
@@ -18,7 +19,6 @@ from msgs_spec.command_line import (
     run_command,
     say,
 )
-from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_options import (
     add_field_options,

@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from msgs_spec.command_line import UsageError
-from msgs_spec.node_main import _refuse_arguments
 from msgs_spec.parameters import NODES, POLICY_NODE, SIM_NODE, unknown_parameter, usage, validate
-from msgs_spec.ros_parameters import declare_parameters, descriptor, set_callback
+from node_runtime.command_line import UsageError
+from node_runtime.node_main import _refuse_arguments
+from node_runtime.ros_parameters import declare_parameters, descriptor, set_callback
 
 SPECS = {
     f'{node.removesuffix("_node")}.{s.name}': s for node, specs in NODES.items() for s in specs

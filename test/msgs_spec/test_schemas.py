@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from msgs_spec.ros import rclpy_profile
 from msgs_spec.schemas import deserialize, message_class, schema_text, serialize, type_hash
 from msgs_spec.tasks import TASKS
 from msgs_spec.topics import CLOCK, COMMAND, LATCHED, STATE, topics
+from node_runtime.ros import rclpy_profile
 
 TYPES = sorted({spec.type_name for task in TASKS.values() for spec in topics(task)})
 

@@ -9,10 +9,10 @@ import time
 
 import pytest
 
-from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import TickEncoder
+from node_runtime.ros import rclpy_profile, ros_message_class
 from support import SUPPORT, script_environment
 from support.random_ticks import STAMP, random_tick
 

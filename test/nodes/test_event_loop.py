@@ -8,7 +8,7 @@ import time
 import pytest
 from std_msgs.msg import Float64
 
-from msgs_spec.event_loop import EventLoop
+from node_runtime.event_loop import EventLoop
 
 
 def collect(node) -> tuple[list[float], object]:

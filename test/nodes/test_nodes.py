@@ -21,10 +21,10 @@ from fetch_hand_sim.simulation import Simulation
 from msgs_spec.actions import command_from_action
 from msgs_spec.codecs import build_message, decode, message_stamp
 from msgs_spec.observations import ObservationAssembler
-from msgs_spec.ros import rclpy_profile
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import topic, topics
+from node_runtime.ros import rclpy_profile
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,

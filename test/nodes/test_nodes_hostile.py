@@ -17,9 +17,9 @@ from std_msgs.msg import Float64MultiArray
 
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import message_stamp
-from msgs_spec.ros import rclpy_profile
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from msgs_spec.topics import QosSpec, topic, topics
+from node_runtime.ros import rclpy_profile
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,

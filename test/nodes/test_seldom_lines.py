@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rclpy.clock_type import ClockType
 
-from msgs_spec.ros import seldom
+from node_runtime.ros import seldom
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -19,7 +19,7 @@ from msgs_spec.parameters import POLICY_NODE, SIM_NODE, validate
 from support import ROOT
 
 PACKAGE = 'fetch_hand_sim'
-PYTHON_PACKAGES = ('msgs_spec', 'fetch_hand_sim', 'policy_node')
+PYTHON_PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
 BIN = Path(sys.prefix) / 'bin'
 
 

@@ -13,7 +13,7 @@ from importlib.metadata import distribution
 import pytest
 
 from fetch_hand_sim.commands.executables import executable, find_executable
-from msgs_spec.command_line import EXTRAS
+from node_runtime.command_line import EXTRAS
 from support import script_environment
 from support.entry_points import console_scripts, started_as_modules
 
@@ -82,7 +82,7 @@ WITHOUT_EXTRAS = """
 import os, runpy, sys, traceback
 
 sys.modules.update(dict.fromkeys({extras!r}))
-import fetch_hand_sim.episodes.generator, msgs_spec.node_main, rich.progress, rich.table, shtab
+import fetch_hand_sim.episodes.generator, node_runtime.node_main, rich.progress, rich.table, shtab
 
 for module in {modules!r}:
     print(f'== {{module}}', file=sys.stderr, flush=True)

@@ -12,7 +12,7 @@ import yaml
 
 from fetch_hand_sim.view.command import parse
 from msgs_spec.parameters import POLICY_NODE, SIM_NODE, validate
-from msgs_spec.ros_parameters import declare_parameters
+from node_runtime.ros_parameters import declare_parameters
 from support import ROOT
 
 SPECS = {'sim_node': SIM_NODE, 'policy_node': POLICY_NODE}

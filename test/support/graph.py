@@ -19,10 +19,10 @@ from rclpy.executors import SingleThreadedExecutor
 
 from fetch_hand_sim.episode_log import Episode, read_episode
 from msgs_spec.codecs import decode_status, message_stamp
-from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import MONITORING, TopicSpec, topic, topics
+from node_runtime.ros import rclpy_profile, ros_message_class
 
 SIM_NODE = (sys.executable, '-m', 'fetch_hand_sim.sim_node')
 POLICY_NODE = (sys.executable, '-m', 'policy_node.node')

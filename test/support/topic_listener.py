@@ -13,9 +13,9 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from msgs_spec.codecs import decode, decode_status, message_stamp
-from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import TASKS
 from msgs_spec.topics import topics
+from node_runtime.ros import rclpy_profile, ros_message_class
 
 DEADLINE = 30.0
 

@@ -9,7 +9,6 @@ from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, 
 from fetch_hand_sim.simulation.tasks.hand_reach import REACH_ASSET, HandReachTask
 from fetch_hand_sim.simulation.tasks.offered import require_offered
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task
-from msgs_spec.command_line import one_line
 from msgs_spec.foreign_tasks import foreign_simulation
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
@@ -19,6 +18,7 @@ from msgs_spec.tasks import (
     substeps_per_tick,
     task_spec,
 )
+from msgs_spec.text import one_line
 
 
 def make_task(

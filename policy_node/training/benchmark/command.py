@@ -28,7 +28,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from msgs_spec.command_line import (
+from msgs_spec.tasks import TASKS
+from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     CommandError,
@@ -39,7 +40,6 @@ from msgs_spec.command_line import (
     run_command,
     whole_number,
 )
-from msgs_spec.tasks import TASKS
 from policy_node.policies.files import write_file
 from policy_node.training.benchmark.actors_table import actors_table
 from policy_node.training.benchmark.jobs import ARMS, Job

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from msgs_spec.command_line import one_line
-from msgs_spec.hints import did_you_mean
+from msgs_spec.text import did_you_mean, one_line
 from policy_node.policies.python_policy import is_python_name, working_directory_first
 from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.benchmark.study import Study

@@ -6,8 +6,8 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
-from msgs_spec.command_line import CommandError, complain
 from msgs_spec.tasks import task_spec
+from node_runtime.command_line import CommandError, complain
 from policy_node.policies.checkpoint import read_info
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.benchmark.measures import curve_of, measure_run

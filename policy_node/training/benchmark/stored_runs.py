@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msgs_spec.command_line import complain
+from node_runtime.command_line import complain
 from policy_node.policies.files import to_json
 from policy_node.training.benchmark.jobs import Job, differing_runs, run_name
 from policy_node.training.benchmark.measures import MEASURED, curve_of, measure_run

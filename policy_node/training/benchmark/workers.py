@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol, Self
 
-from msgs_spec.command_line import (
+from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     CommandError,
@@ -25,7 +25,7 @@ from msgs_spec.command_line import (
     complain_from_handler,
     discard_unread_output,
 )
-from msgs_spec.parent_process import end_with_parent
+from node_runtime.parent_process import end_with_parent
 from policy_node.training.benchmark.final import measure_final
 from policy_node.training.benchmark.jobs import Job
 from policy_node.training.runs.run import RunTakenError, lock_run, train_run

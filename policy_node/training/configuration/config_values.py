@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from msgs_spec.hints import did_you_mean
+from msgs_spec.text import did_you_mean
 from policy_node.training.configuration.config import TrainConfig
 
 # Floats know all whole numbers up to here.

@@ -12,16 +12,16 @@ from types import FrameType
 
 import numpy as np
 
-from msgs_spec.command_line import (
+from msgs_spec.text import one_line
+from node_runtime.command_line import (
     CommandError,
     UsageError,
     complain,
     complain_from_handler,
     on_stop_signals,
-    one_line,
     require_extra,
 )
-from msgs_spec.source_revision import source_revision
+from node_runtime.source_revision import source_revision
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import is_first_worker, join_workers, leave_workers

@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from msgs_spec.command_line import complain
+from node_runtime.command_line import complain
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from msgs_spec.command_line import complain
+from node_runtime.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.training.collection.collector import Collector
 from policy_node.training.collection.simulations import make_simulation

@@ -25,7 +25,7 @@ from fetch_hand_sim.films.playing import Film, film_episode
 from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.simulation.opengl import prepare_opengl
-from msgs_spec.command_line import CommandError, UsageError
+from node_runtime.command_line import CommandError, UsageError
 from support.crafted_files import Crafter
 from support.episode_recorder import Recorder
 from support.full_disk import files_at_most

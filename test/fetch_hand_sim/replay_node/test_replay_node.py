@@ -21,10 +21,10 @@ from fetch_hand_sim.episode_log import read_episode
 from fetch_hand_sim.episode_log.ticks import split_ticks
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplaySchedule
 from msgs_spec.codecs import decode, message_stamp
-from msgs_spec.ros import ros_message_class
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics
+from node_runtime.ros import ros_message_class
 from policy_node.training import generate_episodes
 from support.fresh_actor import fresh_actor
 from support.graph import POLICY_NODE, SIM_NODE, TIMEOUT, client, ros_args

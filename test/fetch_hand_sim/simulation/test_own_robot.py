@@ -18,9 +18,9 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Scene, default_view
 from fetch_hand_sim.simulation.tasks import registry
 from fetch_hand_sim.simulation.tasks.task import Task
-from msgs_spec.command_line import CommandError
 from msgs_spec.robots import CommandPart, RobotSpec
 from msgs_spec.tasks import TASKS, GoalKind, TaskFormulas, TaskSpec, VectorPart
+from node_runtime.command_line import CommandError
 
 MJCF = """<mujoco>
   <worldbody>

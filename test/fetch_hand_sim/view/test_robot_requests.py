@@ -22,9 +22,9 @@ from fetch_hand_sim.view.requests import (
 )
 from fetch_hand_sim.view.robot_requests import RobotRequests
 from msgs_spec.codecs import decode
-from msgs_spec.ros import rclpy_profile, ros_message_class
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic
+from node_runtime.ros import rclpy_profile, ros_message_class
 
 SPEC = task_spec('FetchPush')
 WRENCH = np.array([30.0, 0.0, 40.0, 0.0, 0.0, 0.0])

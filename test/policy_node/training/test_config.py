@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from msgs_spec.command_line import CommandParser
 from msgs_spec.tasks import TASKS
+from node_runtime.command_line import CommandParser
 from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.configuration import config_fields
 from policy_node.training.configuration.config import TrainConfig

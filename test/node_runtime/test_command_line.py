@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from msgs_spec.command_line import (
+from node_runtime.command_line import (
     CommandError,
     CommandParser,
     UsageError,
@@ -23,7 +23,7 @@ from msgs_spec.command_line import (
 )
 from support import script_environment
 
-PRELUDE = 'import sys, time\nfrom msgs_spec.command_line import *\n'
+PRELUDE = 'import sys, time\nfrom node_runtime.command_line import *\n'
 
 
 def run_script(body: str, **options: object) -> subprocess.Popen[str]:
@@ -194,7 +194,7 @@ def test_letters_that_the_output_does_not_have_are_escaped(monkeypatch):
 def test_what_nobody_reads_goes_nowhere_where_a_command_has_more_to_do(open_pair):
     code = (
         'import sys\n'
-        'from msgs_spec.command_line import discard_unread_output\n'
+        'from node_runtime.command_line import discard_unread_output\n'
         'sys.stdin.readline()\n'
         'discard_unread_output()\n'
         'for stream in (sys.stdout, sys.stderr): print("line", file=stream, flush=True)\n'

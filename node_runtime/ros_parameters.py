@@ -6,9 +6,9 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from msgs_spec.command_line import UsageError
-from msgs_spec.parameter_requests import serve_parameter_requests
 from msgs_spec.parameters import ParameterSpec, unknown_parameter, validate
+from node_runtime.command_line import UsageError
+from node_runtime.parameter_requests import serve_parameter_requests
 
 if TYPE_CHECKING:
     from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult

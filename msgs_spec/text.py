@@ -1,4 +1,4 @@
-"""What is said of names: which was meant, which are allowed, and a few of many."""
+"""Text of messages: one safe line, suggestions for misspelt names, shortened lists."""
 
 from __future__ import annotations
 
@@ -46,3 +46,22 @@ def first_of(names: Sequence[str], most: int) -> str:
     """Returns the first of many names and how many are left out: `a, b and 3 more`."""
     rest = f' and {len(names) - most} more' if len(names) > most else ''
     return f'{", ".join(names[:most])}{rest}'
+
+
+def printable(text: str) -> str:
+    """Return text with the characters escaped that a terminal would interpret."""
+    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def one_line(text: object, longest: int = 200) -> str:
+    """Return a text or an error as one line that is safe to print.
+
+    An error without a message becomes the name of its type.
+
+    Args:
+        longest: Maximum number of characters of the line.
+    """
+    words = ' '.join(str(text).split())
+    if not words and isinstance(text, BaseException):
+        words = type(text).__name__
+    return printable(words[:longest])[:longest]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from msgs_spec.source_revision import revision_of
+from node_runtime.source_revision import revision_of
 
 
 def git(root: Path, *arguments: str) -> str:

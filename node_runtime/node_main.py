@@ -14,7 +14,9 @@ from itertools import pairwise
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol
 
-from msgs_spec.command_line import (
+from msgs_spec.parameters import usage
+from msgs_spec.text import one_line
+from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,
     CommandError,
@@ -22,13 +24,11 @@ from msgs_spec.command_line import (
     complain,
     heard,
     make_output_usable,
-    one_line,
     require_extra,
     run_command,
 )
-from msgs_spec.last_resort import ends_within
-from msgs_spec.parameters import usage
-from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory
+from node_runtime.exit_watchdog import ends_within
+from node_runtime.transport import keep_discovery_local, leave_out_shared_memory
 
 if TYPE_CHECKING:
     from rclpy.node import Node

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-import msgs_spec
-from msgs_spec.transport import keep_discovery_local, leave_out_shared_memory
+import node_runtime
+from node_runtime.transport import keep_discovery_local, leave_out_shared_memory
 
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
 MIDDLEWARE = 'RMW_IMPLEMENTATION'
-UDP_ONLY = str(Path(msgs_spec.__file__).with_name('fastdds_udp.xml'))
+UDP_ONLY = str(Path(node_runtime.__file__).with_name('fastdds_udp.xml'))
 
 
 @pytest.mark.parametrize(('before', 'after'), [(None, 'LOCALHOST'), ('SUBNET', 'SUBNET')])

@@ -8,7 +8,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-_PACKAGES = ('msgs_spec', 'fetch_hand_sim', 'policy_node')
+_PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
 
 
 @cache

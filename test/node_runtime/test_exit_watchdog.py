@@ -12,7 +12,7 @@ import pytest
 # A library that spins and holds the interpreter: `PyDLL` does not let go of its lock.
 HELD = """
 import ctypes, time
-from msgs_spec.last_resort import ends_within
+from node_runtime.exit_watchdog import ends_within
 print('done', flush=False)
 with ends_within({limit}, {code}):
     ctypes.PyDLL(None).usleep(ctypes.c_uint({microseconds}))

@@ -22,9 +22,9 @@ from importlib.util import find_spec
 from types import FrameType
 from typing import Any, NoReturn
 
-from msgs_spec.hints import did_you_mean
-from msgs_spec.loading import EXIT_INTERRUPTED as EXIT_INTERRUPTED
-from msgs_spec.loading import is_nobodys
+from msgs_spec.text import did_you_mean, one_line, printable
+from node_runtime.import_guard import EXIT_INTERRUPTED as EXIT_INTERRUPTED
+from node_runtime.import_guard import is_nobodys
 
 # Done; done, and something is wrong; not begun, because of what was given.
 EXIT_SUCCESS, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
@@ -121,24 +121,6 @@ class FormerOption(argparse.Action):
         """Says so and sets the option."""
         complain(parser.prog, f'{option_string} is now called --{self.dest}')
         setattr(namespace, self.dest, values)
-
-
-def printable(text: str) -> str:
-    """Returns text from anywhere with what could command a terminal escaped."""
-    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-
-
-def one_line(text: object, longest: int = 200) -> str:
-    """Returns what an error, a file or a library says, as one line that is safe to print.
-
-    Args:
-        text: An error without words is called by its type.
-        longest: Characters of the line, at most.
-    """
-    words = ' '.join(str(text).split())
-    if not words and isinstance(text, BaseException):
-        words = type(text).__name__
-    return printable(words[:longest])[:longest]
 
 
 def complain(name: str, text: object) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from msgs_spec import node_main
-from msgs_spec.node_main import StopSignals, find_place_for_logs
+from node_runtime import node_main
+from node_runtime.node_main import StopSignals, find_place_for_logs
 
 
 @pytest.mark.parametrize(
