@@ -22,7 +22,7 @@ def generate_episodes() -> int:
 
 def benchmark() -> int:
     """Runs `benchmark`; returns the exit code."""
-    return start_command('benchmark', 'policy_node.training.benchmark.command', 'train')
+    return start_command('benchmark', 'policy_node.training.studies.command', 'train')
 
 
 def export_actor() -> int:

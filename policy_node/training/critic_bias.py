@@ -47,7 +47,7 @@ def _run(options: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from policy_node.training.runs.promises import measure
+    from policy_node.training.values_and_returns import measure
 
     try:
         promises = measure(options.run, options.episodes)

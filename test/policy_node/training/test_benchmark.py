@@ -22,12 +22,6 @@ import torch
 
 from msgs_spec.tasks import TASKS
 from policy_node.policies.checkpoint import read_info
-from policy_node.training.benchmark import published
-from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
-from policy_node.training.benchmark.jobs import ARMS
-from policy_node.training.benchmark.results import Curve, aggregate, draw, read_curve, summarize
-from policy_node.training.benchmark.studies import paper_jobs, reduced_budget
-from policy_node.training.benchmark.study import REPEATABLE
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.runs.run_folder import LOCK_FILE
 from policy_node.training.runs.run_log import COLUMNS
@@ -36,6 +30,12 @@ from policy_node.training.runs.training_state import (
     read_state,
     write_state,
 )
+from policy_node.training.studies import published
+from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
+from policy_node.training.studies.jobs import ARMS
+from policy_node.training.studies.results import Curve, aggregate, draw, read_curve, summarize
+from policy_node.training.studies.studies import paper_jobs, reduced_budget
+from policy_node.training.studies.study import REPEATABLE
 
 torch.set_num_threads(1)
 
@@ -212,7 +212,7 @@ def test_a_second_ctrl_c_ends_jobs_at_once(tmp_path: Path) -> None:
     """Amid an evaluation that would take minutes."""
     arguments = small(tmp_path, '--arms', 'her_sparse', 'her_dense', '--jobs', '2')
     arguments += ['--set', 'evaluation_episodes=1000000', '--set', 'evaluate_every=400']
-    command = [sys.executable, '-m', 'policy_node.training.benchmark', *arguments]
+    command = [sys.executable, '-m', 'policy_node.training.studies', *arguments]
     benchmark = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     logs = [tmp_path / 'FetchReach' / arm / 'seed0' / 'progress.csv' for arm in ARMS][:2]
     deadline = time.monotonic() + 120
@@ -262,7 +262,7 @@ def test_ctrl_c_keeps_what_there_is_and_the_same_command_goes_on(
 def test_jobs_go_on_where_nobody_reads_how_far_they_are() -> None:
     code = (
         'import sys\n'
-        'from policy_node.training.benchmark.workers import _tell\n'
+        'from policy_node.training.studies.workers import _tell\n'
         'sys.stdin.readline()\n'
         '_tell("line")\n'
     )

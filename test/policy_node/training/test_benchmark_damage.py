@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from policy_node.policies.files import write_files
-from policy_node.training.benchmark import reporting
-from policy_node.training.benchmark.actors_table import actors_table
-from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
-from policy_node.training.benchmark.research import STUDIES
-from policy_node.training.benchmark.stored_runs import StoredRuns, read_rows
+from policy_node.training.studies import reporting
+from policy_node.training.studies.actors_table import actors_table
+from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
+from policy_node.training.studies.research import STUDIES
+from policy_node.training.studies.stored_runs import StoredRuns, read_rows
 from support.full_disk import files_at_most
 
 torch.set_num_threads(1)

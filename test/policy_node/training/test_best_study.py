@@ -16,16 +16,16 @@ import torch
 
 from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
-from policy_node.training.benchmark import command, workers
-from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
-from policy_node.training.benchmark.jobs import Job
-from policy_node.training.benchmark.studies import BEST_ORDER, STARTS_FROM, start_from
-from policy_node.training.benchmark.workers import LOG_FILE, Outcome, run_jobs
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.runs.origins import steps_behind
 from policy_node.training.runs.run import Ending
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import Counters, TrainingState, write_state
+from policy_node.training.studies import command, workers
+from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
+from policy_node.training.studies.jobs import Job
+from policy_node.training.studies.studies import BEST_ORDER, STARTS_FROM, start_from
+from policy_node.training.studies.workers import LOG_FILE, Outcome, run_jobs
 
 torch.set_num_threads(1)
 
@@ -174,7 +174,7 @@ def test_processes_end_by_the_signal_that_came_though_all_get_sigterm(tmp_path: 
 def test_two_at_once_are_stopped_resumed_and_shipped(tmp_path: Path) -> None:
     arguments = [*TINY, '--tasks', *EGGS, 'FetchReach', '--jobs', '2', '--steps', '2000']
     arguments += ['--episodes', '4', '--output', str(tmp_path)]
-    module = [sys.executable, '-m', 'policy_node.training.benchmark', *arguments]
+    module = [sys.executable, '-m', 'policy_node.training.studies', *arguments]
     first, second, other = (tmp_path / task / 'best' / 'seed0' for task in (*EGGS, 'FetchReach'))
     process = subprocess.Popen(module, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:

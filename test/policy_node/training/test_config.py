@@ -13,7 +13,6 @@ import pytest
 
 from msgs_spec.tasks import TASKS
 from node_runtime.command_line import CommandParser
-from policy_node.training.benchmark.research import STUDIES
 from policy_node.training.configuration import config_fields
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_fields import ConfigFields
@@ -30,6 +29,7 @@ from policy_node.training.configuration.config_values import (
 )
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.threads import split_threads
+from policy_node.training.studies.research import STUDIES
 from policy_node.training.train_her import config_from_arguments, parse_arguments
 from support import ROOT
 

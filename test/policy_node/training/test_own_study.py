@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from policy_node.training.benchmark.command import main, parse_arguments
-from policy_node.training.benchmark.own_study import find_study
-from policy_node.training.benchmark.stored_runs import read_rows
+from policy_node.training.studies.command import main, parse_arguments
+from policy_node.training.studies.own_study import find_study
+from policy_node.training.studies.stored_runs import read_rows
 
 torch.set_num_threads(1)
 PAGE = Path(__file__).parents[3] / 'docs' / 'research' / 'README.md'

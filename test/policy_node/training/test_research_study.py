@@ -14,10 +14,13 @@ import torch
 
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies.files import write_files
-from policy_node.training.benchmark.command import jobs_from_arguments, main, parse_arguments
-from policy_node.training.benchmark.final import FINAL_FILE
-from policy_node.training.benchmark.jobs import Job
-from policy_node.training.benchmark.measures import (
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.runs.run_folder import STATE_FILE
+from policy_node.training.runs.training_state import Counters, TrainingState, write_state
+from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
+from policy_node.training.studies.final import FINAL_FILE
+from policy_node.training.studies.jobs import Job
+from policy_node.training.studies.measures import (
     are_apart,
     area_in_time,
     area_under,
@@ -25,20 +28,17 @@ from policy_node.training.benchmark.measures import (
     rank_sum_chance,
     sum_up,
 )
-from policy_node.training.benchmark.research import STUDIES
-from policy_node.training.benchmark.research_report import BEGIN, END, format_table, sum_up_arms
-from policy_node.training.benchmark.results import Curve
-from policy_node.training.benchmark.shared_runs import (
+from policy_node.training.studies.research import STUDIES
+from policy_node.training.studies.research_report import BEGIN, END, format_table, sum_up_arms
+from policy_node.training.studies.results import Curve
+from policy_node.training.studies.shared_runs import (
     take_from_other_reports,
     take_from_other_studies,
 )
-from policy_node.training.benchmark.stored_runs import StoredRuns, own_fields, read_rows
-from policy_node.training.benchmark.studies import PAPER
-from policy_node.training.benchmark.study import Study, research_jobs
-from policy_node.training.benchmark.workers import Outcome, attempt
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.runs.run_folder import STATE_FILE
-from policy_node.training.runs.training_state import Counters, TrainingState, write_state
+from policy_node.training.studies.stored_runs import StoredRuns, own_fields, read_rows
+from policy_node.training.studies.studies import PAPER
+from policy_node.training.studies.study import Study, research_jobs
+from policy_node.training.studies.workers import Outcome, attempt
 from support import ROOT
 
 torch.set_num_threads(1)

@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from policy_node.policies.tensor_file import read_tensors, write_tensors
-from policy_node.training.benchmark.jobs import BEST_ARM, Job
-from policy_node.training.benchmark.reporting import ship_all
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.runs.run_log import RunLog
 from policy_node.training.runs.trainer import Trainer
 from policy_node.training.ship_actor import main
+from policy_node.training.studies.jobs import BEST_ARM, Job
+from policy_node.training.studies.reporting import ship_all
 
 torch.set_num_threads(1)
 

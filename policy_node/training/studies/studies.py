@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from msgs_spec.tasks import TASKS, task_spec
-from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, Job
-from policy_node.training.benchmark.research import HAND
-from policy_node.training.benchmark.study import Study
 from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.studies.jobs import ARMS, BEST_ARM, Job
+from policy_node.training.studies.research import HAND
+from policy_node.training.studies.study import Study
 
 # The long ones first. What XYZ has learnt of turning a block serves every other task of the block;
 # likewise the egg and the pen.

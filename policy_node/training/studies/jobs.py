@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from policy_node.training.benchmark.final import read_final
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_values import config_from_dict
 from policy_node.training.runs.run_folder import PROGRESS_FILE, STATE_FILE
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import read_counters, read_state
+from policy_node.training.studies.final import read_final
 
 # What may differ between two parts of a job without another result to be expected; where a run
 # started from is decided once, and its path depends on the working directory.

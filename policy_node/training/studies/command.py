@@ -41,28 +41,28 @@ from node_runtime.command_line import (
     whole_number,
 )
 from policy_node.policies.files import write_file
-from policy_node.training.benchmark.actors_table import actors_table
-from policy_node.training.benchmark.jobs import ARMS, Job
-from policy_node.training.benchmark.own_study import find_study
-from policy_node.training.benchmark.reporting import report, require_readable, ship_all
-from policy_node.training.benchmark.research import STUDIES
-from policy_node.training.benchmark.shared_runs import (
+from policy_node.training.configuration.config_options import with_assignments
+from policy_node.training.configuration.config_rules import FROM_NOTHING
+from policy_node.training.configuration.config_values import whole
+from policy_node.training.studies.actors_table import actors_table
+from policy_node.training.studies.jobs import ARMS, Job
+from policy_node.training.studies.own_study import find_study
+from policy_node.training.studies.reporting import report, require_readable, ship_all
+from policy_node.training.studies.research import STUDIES
+from policy_node.training.studies.shared_runs import (
     take_from_other_reports,
     take_from_other_studies,
 )
-from policy_node.training.benchmark.stored_runs import StoredRuns
-from policy_node.training.benchmark.studies import PAPER, best_jobs, paper_jobs, reduced_budget
-from policy_node.training.benchmark.study import FINAL_EPISODES, Study, research_jobs
-from policy_node.training.benchmark.workers import (
+from policy_node.training.studies.stored_runs import StoredRuns
+from policy_node.training.studies.studies import PAPER, best_jobs, paper_jobs, reduced_budget
+from policy_node.training.studies.study import FINAL_EPISODES, Study, research_jobs
+from policy_node.training.studies.workers import (
     JobsStopped,
     Processes,
     Ray,
     ThisProcess,
     run_jobs,
 )
-from policy_node.training.configuration.config_options import with_assignments
-from policy_node.training.configuration.config_rules import FROM_NOTHING
-from policy_node.training.configuration.config_values import whole
 
 _NAME = 'benchmark'
 ACTORS_TABLE = 'actors.md'

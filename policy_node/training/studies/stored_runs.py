@@ -17,12 +17,12 @@ from typing import Any
 
 from node_runtime.command_line import complain
 from policy_node.policies.files import to_json
-from policy_node.training.benchmark.jobs import Job, differing_runs, run_name
-from policy_node.training.benchmark.measures import MEASURED, curve_of, measure_run
-from policy_node.training.benchmark.results import curve_rows, to_csv
-from policy_node.training.benchmark.study import Study
 from policy_node.training.configuration.config_values import config_from_dict
 from policy_node.training.configuration.recipes import STEP_COUNTS
+from policy_node.training.studies.jobs import Job, differing_runs, run_name
+from policy_node.training.studies.measures import MEASURED, curve_of, measure_run
+from policy_node.training.studies.results import curve_rows, to_csv
+from policy_node.training.studies.study import Study
 
 RUNS, CURVES, ABOUT = 'runs.csv', 'curves.csv', 'study.json'
 RUN = ('task', 'arm', 'seed')

@@ -18,11 +18,11 @@ from msgs_spec.arrays import Array
 from msgs_spec.tasks import task_spec
 from policy_node.policies.checkpoint import read_info
 from policy_node.policies.files import to_json, write_files
-from policy_node.training.benchmark.jobs import ARMS, BEST_ARM, Job
-from policy_node.training.benchmark.machines import machine
-from policy_node.training.benchmark.published import BEST, RERUN
 from policy_node.training.runs.run_folder import LATEST_FILE, PROGRESS_FILE
 from policy_node.training.runs.run_log import read_progress
+from policy_node.training.studies.jobs import ARMS, BEST_ARM, Job
+from policy_node.training.studies.machines import machine
+from policy_node.training.studies.published import BEST, RERUN
 
 # An epoch of the paper: 50 cycles of 2 episodes on each of 19 workers.
 EPISODES_PER_EPOCH = 1900

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies.files import write_files
-from policy_node.training.benchmark.jobs import Job, differing_runs, run_name
-from policy_node.training.benchmark.stored_runs import ABOUT, StoredRuns, run_of
-from policy_node.training.benchmark.study import Study
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.runs.training_state import read_state
+from policy_node.training.studies.jobs import Job, differing_runs, run_name
+from policy_node.training.studies.stored_runs import ABOUT, StoredRuns, run_of
+from policy_node.training.studies.study import Study
 
 
 def take_from_other_studies(jobs: Sequence[Job], studies: Path) -> None:

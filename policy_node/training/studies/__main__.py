@@ -1,4 +1,4 @@
-"""`python -m policy_node.training.benchmark`."""
+"""`python -m policy_node.training.studies`."""
 
 import sys
 

@@ -6,8 +6,8 @@ from importlib import import_module
 
 from msgs_spec.text import did_you_mean, one_line
 from policy_node.policies.python_policy import is_python_name, working_directory_first
-from policy_node.training.benchmark.research import STUDIES
-from policy_node.training.benchmark.study import Study
+from policy_node.training.studies.research import STUDIES
+from policy_node.training.studies.study import Study
 
 # Studies that are not of one page under docs/research.
 _OTHERS = ('paper', 'best')

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from msgs_spec.tasks import TASKS
-from policy_node.training.benchmark.published import BEST, CEILINGS
 from policy_node.training.runs.origins import steps_behind
+from policy_node.training.studies.published import BEST, CEILINGS
 
 _NOT_PUBLISHED = 'no number found'
 

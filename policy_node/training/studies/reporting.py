@@ -9,15 +9,15 @@ from pathlib import Path
 from msgs_spec.tasks import task_spec
 from node_runtime.command_line import CommandError, complain
 from policy_node.policies.checkpoint import read_info
-from policy_node.training.benchmark.jobs import Job
-from policy_node.training.benchmark.measures import curve_of, measure_run
-from policy_node.training.benchmark.research_report import write_study
-from policy_node.training.benchmark.results import write_report
-from policy_node.training.benchmark.stored_runs import RUNS
-from policy_node.training.benchmark.study import Study
 from policy_node.training.runs.run_folder import BEST_FILE, LATEST_FILE, PROGRESS_FILE
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.shipping import ship
+from policy_node.training.studies.jobs import Job
+from policy_node.training.studies.measures import curve_of, measure_run
+from policy_node.training.studies.research_report import write_study
+from policy_node.training.studies.results import write_report
+from policy_node.training.studies.stored_runs import RUNS
+from policy_node.training.studies.study import Study
 
 
 def report(jobs: Sequence[Job], study: Study | None, output: Path, command: str) -> None:

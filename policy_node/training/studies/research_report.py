@@ -13,17 +13,17 @@ import numpy as np
 
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies.files import write_files
-from policy_node.training.benchmark.jobs import Job
-from policy_node.training.benchmark.measures import (
+from policy_node.training.studies.jobs import Job
+from policy_node.training.studies.measures import (
     GOOD_SUCCESS,
     are_apart,
     area_in_time,
     compared,
     sum_up,
 )
-from policy_node.training.benchmark.results import Band, Curve, aggregate, draw, to_csv
-from policy_node.training.benchmark.stored_runs import RUN, Rows, StoredRuns, run_of
-from policy_node.training.benchmark.study import Study
+from policy_node.training.studies.results import Band, Curve, aggregate, draw, to_csv
+from policy_node.training.studies.stored_runs import RUN, Rows, StoredRuns, run_of
+from policy_node.training.studies.study import Study
 
 # The page of a study keeps its table between these lines.
 BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'

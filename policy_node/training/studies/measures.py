@@ -11,13 +11,13 @@ import numpy as np
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from policy_node.policies.checkpoint import read_info
-from policy_node.training.benchmark.final import read_final
-from policy_node.training.benchmark.jobs import Job
-from policy_node.training.benchmark.machines import machine
-from policy_node.training.benchmark.results import Curve, read_curve
 from policy_node.training.configuration.recipes import ticks_of_40_ms
 from policy_node.training.runs.run_folder import COMMAND_FILE, LATEST_FILE, PROGRESS_FILE
 from policy_node.training.runs.run_log import read_progress
+from policy_node.training.studies.final import read_final
+from policy_node.training.studies.jobs import Job
+from policy_node.training.studies.machines import machine
+from policy_node.training.studies.results import Curve, read_curve
 
 GOOD_SUCCESS = 0.9
 _SUMMED_UP = ('area', 'final_success')

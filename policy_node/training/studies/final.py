@@ -8,13 +8,13 @@ from typing import Any
 
 from policy_node.policies import checkpoint
 from policy_node.policies.files import to_json, write_file
-from policy_node.training.benchmark.machines import machine
 from policy_node.training.collection.simulations import make_simulation
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, wilson_interval
 from policy_node.training.evaluation.evaluator import successes
 from policy_node.training.runs.run_folder import LATEST_FILE
 from policy_node.training.runs.state_checks import is_finite
+from policy_node.training.studies.machines import machine
 
 FINAL_FILE = 'final.json'
 _MOST_AT_ONCE = 64

@@ -26,9 +26,9 @@ from node_runtime.command_line import (
     discard_unread_output,
 )
 from node_runtime.parent_process import end_with_parent
-from policy_node.training.benchmark.final import measure_final
-from policy_node.training.benchmark.jobs import Job
 from policy_node.training.runs.run import RunTakenError, lock_run, train_run
+from policy_node.training.studies.final import measure_final
+from policy_node.training.studies.jobs import Job
 
 LOG_FILE = 'log.txt'
 # Seconds between two lines about each running job.

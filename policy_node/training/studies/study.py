@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
-from policy_node.training.benchmark.jobs import Arm, Job
 from policy_node.training.configuration.recipes import recipe_config, steps_at_rate
+from policy_node.training.studies.jobs import Arm, Job
 
 # Fresh episodes behind the final success of a run.
 FINAL_EPISODES = 500
