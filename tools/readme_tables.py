@@ -14,7 +14,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from policy_node.training.studies.actors_table import actors_summary, actors_table
+from policy_node.training.studies.published import actors_summary, actors_table
 
 ROOT = Path(__file__).resolve().parent.parent
 ACTORS = ROOT / 'policy_node' / 'actors'

@@ -25,7 +25,7 @@ from node_runtime.source_revision import source_revision
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import is_first_worker, join_workers, leave_workers
-from policy_node.training.machine.memory import available_memory, why_too_large
+from policy_node.training.machine.host import available_memory, why_too_large
 from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.runs.finite_checks import TrainingError
 from policy_node.training.runs.initial_networks import InitialNetworks

@@ -25,7 +25,7 @@ from policy_node.training.learners.actor_critic import Losses
 from policy_node.training.learners.make_learner import make_learner
 from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.machine.threads import split_threads
+from policy_node.training.machine.host import split_threads
 from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.replay_file import load_replay
 from policy_node.training.runs.finite_checks import (

@@ -1,1 +1,1 @@
-"""What compares: the paper's four arms, task by task, seed by seed."""
+"""Studies: many trainings of several variants and seeds, their results, tables and figures."""

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from policy_node.training.studies.jobs import Arm
-from policy_node.training.studies.study import Study
+from policy_node.training.studies.study import Arm, Study
 
 # FetchReach in cycles of 16 episodes, so that its first thousands of steps can be told apart.
 _REACH = {

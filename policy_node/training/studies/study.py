@@ -1,24 +1,30 @@
-"""A study: a question, its arms and its budget, and the jobs that this makes.
+"""A study: its question, its variants and its budget, and the training runs that these make.
 
-All arms of a study share task, budget and settings and differ in `changes` alone. Every run is one
-of `train_her`: on one thread it gives the same bits from the same seed.
+All variants of a study share task, budget and settings and differ in `changes` only. Every run is
+an ordinary training: on one thread the same seed gives the same bits.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config_values import config_from_dict
 from policy_node.training.configuration.recipes import recipe_config, steps_at_rate
-from policy_node.training.studies.jobs import Arm, Job
+from policy_node.training.runs.run_folder import PROGRESS_FILE, STATE_FILE
+from policy_node.training.runs.run_log import read_progress
+from policy_node.training.runs.training_state import read_counters, read_state
 
-# Fresh episodes behind the final success of a run.
 FINAL_EPISODES = 500
-# What makes runs repeatable, and one core enough for a run.
+"""Fresh episodes that measure the final success of a run."""
+
+# Make runs repeatable, and one core enough for a run.
 REPEATABLE: dict[str, Any] = {
     'simulation_threads': 1,
     'torch_threads': 1,
@@ -26,20 +32,52 @@ REPEATABLE: dict[str, Any] = {
     'overlap': False,
 }
 
+# Fields that do not change the result. The start networks are read once, and their path depends on
+# the working directory.
+_MAY_DIFFER = (
+    'simulation_threads',
+    'torch_threads',
+    'checkpoint_seconds',
+    'kept_transitions',
+    'device',
+    'init_from',
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One variant of a study: one curve in its figure.
+
+    Attributes:
+        name: Name in folders and on the command line.
+        label: Name in figures and tables.
+        changes: Fields of `TrainConfig` that only this variant sets.
+        factors: Whole-numbered fields and how many times the common value this variant has.
+    """
+
+    name: str
+    label: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    factors: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def own(self) -> set[str]:
+        """Names of the fields that only this variant sets."""
+        return {*self.changes, *self.factors}
+
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """One question, its arms and its budget.
+    """One question, its variants and its budget.
 
     Attributes:
-        name: Name of the folder and of the command-line option.
-        request: Number of the request in the second part of Plappert et al. 2018; None if it
-            answers none of them.
-        question: What it asks.
-        settings: Fields of `TrainConfig` for all arms, by task; the first task is the default.
-            They replace those of the recipe `best`, or of the one that they name as `recipe`.
-        arms: What is compared; the first is the baseline.
-        seeds: How many by default.
+        name: Name of the folder and on the command line.
+        request: Number of the request in the second part of Plappert et al. 2018, or None.
+        question: The question in one sentence.
+        settings: Fields of `TrainConfig` for all variants, by task; the first task is the default.
+            They replace fields of the recipe `best`, or of the recipe that they name.
+        arms: The variants; the first is the baseline.
+        seeds: Default number of seeds.
     """
 
     name: str
@@ -51,14 +89,14 @@ class Study:
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """The tasks that it has settings for."""
+        """The tasks that the study has settings for."""
         return tuple(self.settings)
 
     def arm(self, name: str) -> Arm:
-        """Returns an arm.
+        """Return a variant.
 
         Raises:
-            ValueError: If there is none of this name.
+            ValueError: If the name is unknown.
         """
         arms = {arm.name: arm for arm in self.arms}
         if name not in arms:
@@ -66,8 +104,145 @@ class Study:
         return arms[name]
 
 
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One training run.
+
+    Attributes:
+        arm: The variant.
+        config: The whole configuration.
+        folder: Output folder of the training.
+        after: The job that trains the networks this one starts from, or None.
+        final_episodes: Fresh episodes that measure the last actor; 0 measures nothing.
+    """
+
+    arm: Arm
+    config: TrainConfig
+    folder: Path
+    after: Job | None = None
+    final_episodes: int = 0
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """Task, variant and seed."""
+        return self.config.task, self.arm.name, self.config.seed
+
+    @property
+    def name(self) -> str:
+        """Task, variant and seed as in the path of the folder."""
+        return run_name(*self.key)
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether there is a training to continue."""
+        return (self.folder / STATE_FILE).is_file()
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether the budget is spent and saved. The log may be ahead of the saved state."""
+        if not self.has_checkpoint:
+            return False
+        return read_counters(self.folder / STATE_FILE).env_steps >= self.config.total_steps
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the start networks exist."""
+        return self.after is None or self.has_checkpoint or self.after.is_trained
+
+    @property
+    def status(self) -> str:
+        """One line of progress."""
+        log, total = self.folder / PROGRESS_FILE, self.config.total_steps
+        rows = read_progress(log) if log.is_file() else []
+        evaluated = [row['eval_success'] for row in rows if 'eval_success' in row]
+        success = f'{evaluated[-1]:.3f}' if evaluated else '-'
+        last = rows[-1] if rows else {}
+        steps, speed = last.get('env_steps', 0.0), last.get('steps_per_second', 0.0)
+        left = f'{(total - steps) / speed / 3600:.1f} h' if speed else '-'
+        return f'{self.name}: {steps:,.0f} of {total:,} steps, eval {success}, ETA {left}'
+
+    def check_configuration(self) -> None:
+        """Reject a folder that contains a run with another configuration.
+
+        Raises:
+            ValueError: The message names the fields.
+        """
+        if not self.has_checkpoint:
+            return
+        try:
+            stored = read_state(self.folder / STATE_FILE).extra['config']
+        except ValueError as error:
+            raise ValueError(f'{error}. Remove {self.folder} to train it again.') from None
+        if differing := differing_fields(stored, self.config):
+            raise ValueError(
+                f'{self.folder} contains a run with {"; ".join(differing.values())}. '
+                'Choose another --output.'
+            )
+
+
+def run_name(task: str, arm: str, seed: int) -> str:
+    """Task, variant and seed as in the path of a run folder."""
+    return f'{task}/{arm}/seed{seed}'
+
+
+def to_settings(config: TrainConfig) -> dict[str, Any]:
+    """Return a configuration as JSON values."""
+    values: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
+    return values
+
+
+def differing_fields(stored: Mapping[str, Any], config: TrainConfig) -> dict[str, str]:
+    """Return the fields that make another result likely, each with both values in words.
+
+    Args:
+        stored: A configuration from `to_settings`; missing fields have their default.
+        config: The configuration to compare with.
+
+    Raises:
+        ValueError: If the stored configuration has unknown fields or invalid values.
+    """
+    before, now = to_settings(config_from_dict(dict(stored))), to_settings(config)
+    return {
+        name: f'{name} {value!r}, now {now[name]!r}'
+        for name, value in before.items()
+        if value != now[name] and name not in _MAY_DIFFER
+    }
+
+
+def make_jobs(
+    task: str,
+    arms: Sequence[Arm],
+    seeds: Sequence[int],
+    values: Mapping[str, Any],
+    output: Path,
+    episodes: int = 0,
+) -> list[Job]:
+    """Return seed x variant, seed by seed, so that a stopped study has equally many seeds of each.
+
+    Args:
+        task: The task.
+        arms: The variants.
+        seeds: The seeds.
+        values: Common fields of `TrainConfig`, `recipe` among them.
+        output: Folder of all runs.
+        episodes: Fresh episodes that measure the last actor of each run.
+
+    Raises:
+        ValueError: If a value is not allowed.
+    """
+    jobs = []
+    for seed in seeds:
+        for arm in arms:
+            config = recipe_config(task, **_at_rate({**values, **arm.changes, 'seed': seed}))
+            factors = {name: getattr(config, name) * by for name, by in arm.factors.items()}
+            config = dataclasses.replace(config, **factors)
+            folder = output / task / arm.name / f'seed{seed}'
+            jobs.append(Job(arm, config, folder, final_episodes=episodes))
+    return jobs
+
+
 def _at_rate(values: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a configuration with step counts at its rate: equal budgets in simulated time."""
+    """Scale step counts to the action frequency: equal budgets in simulated time."""
     return {**values, **steps_at_rate(values, values.get('control_hz', DEFAULT_CONTROL_HZ))}
 
 
@@ -80,16 +255,7 @@ def research_jobs(
     output: Path,
     episodes: int = FINAL_EPISODES,
 ) -> list[Job]:
-    """Task x seed x arm, seed by seed, so that an early stop leaves all arms with as many seeds.
-
-    Args:
-        study: The study.
-        tasks: Some of its tasks.
-        arms: Some of its arms.
-        seeds: Seeds.
-        overrides: Fields of `TrainConfig` for all jobs; what the arms differ in is theirs.
-        output: Folder for all runs.
-        episodes: Fresh episodes behind the final success of each.
+    """Return the runs of a study on some of its tasks; see `make_jobs`.
 
     Raises:
         ValueError: If a task or a value is not allowed.
@@ -98,13 +264,6 @@ def research_jobs(
     for task in tasks:
         if task not in study.settings:
             raise ValueError(f'--tasks {task}; allowed in {study.name}: {", ".join(study.tasks)}')
-        shared = {'recipe': 'best', **REPEATABLE, **study.settings[task], **overrides}
-        for seed in seeds:
-            for arm in arms:
-                values = _at_rate({**shared, **arm.changes, 'seed': seed})
-                config = recipe_config(task, **values)
-                more = {name: getattr(config, name) * by for name, by in arm.factors.items()}
-                config = dataclasses.replace(config, **more)
-                folder = output / task / arm.name / f'seed{seed}'
-                jobs.append(Job(arm, config, folder, final_episodes=episodes))
+        values = {'recipe': 'best', **REPEATABLE, **study.settings[task], **overrides}
+        jobs += make_jobs(task, arms, seeds, values, output, episodes)
     return jobs

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import fcntl
-import json
 import os
 import shlex
 import signal
@@ -24,7 +23,7 @@ from msgs_spec.tasks import TASKS
 from policy_node.policies.checkpoint import read_info
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.runs.run_folder import LOCK_FILE
-from policy_node.training.runs.run_log import COLUMNS
+from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import (
     read_counters,
     read_state,
@@ -32,10 +31,12 @@ from policy_node.training.runs.training_state import (
 )
 from policy_node.training.studies import published
 from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
-from policy_node.training.studies.jobs import ARMS
-from policy_node.training.studies.results import Curve, aggregate, draw, read_curve, summarize
-from policy_node.training.studies.studies import paper_jobs, reduced_budget
+from policy_node.training.studies.measures import Curve
+from policy_node.training.studies.paper import ARMS, reduced_budget
+from policy_node.training.studies.report import aggregate, draw
+from policy_node.training.studies.store import read_runs
 from policy_node.training.studies.study import REPEATABLE
+from policy_node.training.studies.workers import is_finished
 
 torch.set_num_threads(1)
 
@@ -51,24 +52,13 @@ def small(output: Path, *more: str) -> list[str]:
     return [*SMALL, '--output', str(output), *more]
 
 
-def write_progress(path: Path, evaluations: dict[int, float | None]) -> Path:
-    """A log as `train_her` writes it; None is a cycle without an evaluation."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open('w', newline='') as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        for steps, success in evaluations.items():
-            found = {} if success is None else {'eval_success': success, 'eval_episodes': 50}
-            writer.writerow({'seconds': 1.0, 'env_steps': steps, 'train_success': 0.0, **found})
-    return path
-
-
 def curve(*success: float) -> Curve:
-    return Curve(100.0 * np.arange(1, len(success) + 1), np.array(success), 50)
+    return Curve(100.0 * np.arange(1, len(success) + 1), np.array(success))
 
 
-def test_jobs_come_seed_by_seed_with_all_arms(tmp_path: Path) -> None:
-    jobs = paper_jobs(['FetchReach', 'FetchPush'], list(ARMS), [3, 4], 'paper', {}, tmp_path)
+def test_jobs_come_seed_by_seed_with_all_variants(tmp_path: Path) -> None:
+    options = ['--tasks', 'FetchReach', 'FetchPush', '--seeds', '3', '4', '--output', str(tmp_path)]
+    jobs = jobs_from_arguments(parse_arguments(options))
     assert [job.name for job in jobs[:5]] == [
         'FetchReach/her_sparse/seed3',
         'FetchReach/her_dense/seed3',
@@ -117,18 +107,6 @@ def test_the_page_of_the_paper_shows_a_budget_for_two_cores_on_every_task() -> N
         assert all(getattr(job.config, name) == value for name, value in budget.items())
 
 
-def test_a_curve_holds_the_evaluations_of_a_log(tmp_path: Path) -> None:
-    read = read_curve(write_progress(tmp_path / 'p.csv', {100: None, 200: 0.5, 250: 0.6}))
-    assert read.env_steps.tolist() == [200, 250]
-    assert read.success.tolist() == [0.5, 0.6]
-
-
-def test_a_run_without_evaluation_has_no_curve(tmp_path: Path) -> None:
-    path = write_progress(tmp_path / 'progress.csv', {100: None})
-    with pytest.raises(ValueError, match='holds no evaluation'):
-        read_curve(path)
-
-
 def test_median_and_quartiles_over_seeds() -> None:
     band = aggregate(
         [curve(0.0, 0.1), curve(0.2, 0.5), curve(0.4, 0.6), curve(0.6, 0.7), curve(1, 1)]
@@ -140,32 +118,18 @@ def test_median_and_quartiles_over_seeds() -> None:
 
 
 def test_curves_evaluated_at_other_steps_meet_on_common_ones() -> None:
-    late = Curve(np.array([150.0, 250.0]), np.array([0.0, 1.0]), 50)
+    late = Curve(np.array([150.0, 250.0]), np.array([0.0, 1.0]))
     band = aggregate([curve(0.0, 0.2, 0.4), late])
     assert band.env_steps.tolist() == [150, 200, 250]
     np.testing.assert_allclose(band.median, [(0.1 + 0) / 2, (0.2 + 0.5) / 2, (0.3 + 1) / 2])
 
 
 def test_curves_without_a_common_step_are_drawn_as_nothing() -> None:
-    late = Curve(np.array([350.0, 450.0]), np.array([0.0, 1.0]), 50)
+    late = Curve(np.array([350.0, 450.0]), np.array([0.0, 1.0]))
     band = aggregate([curve(0.0, 0.2), late])
     assert band.env_steps.size == 0
     picture = draw({'FetchReach': {'her_sparse': band}}, {'her_sparse': 'DDPG+HER, sparse'})
     assert picture.startswith(b'\x89PNG')
-
-
-def test_a_summary_is_about_the_last_evaluations() -> None:
-    row = summarize(
-        'FetchPush', 'her_sparse', [curve(0.5, 0.9), curve(0.96, 0.94), curve(0.2, 1.0)]
-    )
-    assert (row['final_median'], row['seeds'], row['env_steps']) == (0.94, 3, 200)
-    assert row['final_lower_quartile'] == pytest.approx(0.92)
-    assert row['final_upper_quartile'] == pytest.approx(0.97)
-    assert row['median_steps_to_0.95'] == 200
-    assert row['published_rerun'].startswith('about 0.99 (quoted; ')
-    never = summarize('HandReach', 'ddpg_dense', [curve(0.0), curve(1.0), curve(0.0)])
-    assert never['median_steps_to_0.95'] is None
-    assert never['published_rerun'] is None
 
 
 def test_published_numbers_name_tasks_arms_kind_and_source() -> None:
@@ -191,14 +155,14 @@ def test_a_benchmark_runs_reports_and_is_not_run_again(
     report = tmp_path / 'report'
     assert (report / 'benchmark.png').read_bytes()[:4] == b'\x89PNG'
     assert (report / 'benchmark.txt').read_text() in printed
-    stored = json.loads((report / 'benchmark.json').read_text())
-    assert stored['command'].startswith('benchmark --seeds 0 --steps 1200')
-    assert len(stored['source_revisions']) == 1 and stored['machine']
-    assert [row['arm'] for row in stored['results']] == ['her_sparse', 'ddpg_dense']
-    assert {row['env_steps'] for row in stored['results']} == {1200}
-    assert len(list(csv.DictReader((report / 'benchmark.csv').open()))) == 2
-    steps = [row['env_steps'] for row in csv.DictReader((report / 'benchmark_curves.csv').open())]
-    assert steps == ['400', '800', '1200'] * 2
+    runs = list(read_runs(report).values())
+    assert all(run['command'].startswith('benchmark --seeds 0 --steps 1200') for run in runs)
+    assert [[steps for steps, _ in run['curve']] for run in runs] == [[400, 800, 1200]] * 2
+    rows = list(csv.DictReader((report / 'benchmark.csv').open()))
+    assert [row['arm'] for row in rows] == ['her_sparse', 'ddpg_dense']
+    for row, run in zip(rows, runs, strict=True):
+        assert row['env_steps'] == '1200' and row['published_rerun'].startswith('solved')
+        assert float(row['final_median']) == run['curve'][-1][1]
     logs = sorted((tmp_path / 'runs').rglob('progress.csv'))
     assert len(logs) == 2
     before = [path.read_bytes() for path in logs]
@@ -249,22 +213,22 @@ def test_ctrl_c_keeps_what_there_is_and_the_same_command_goes_on(
     thread.start()
     assert main(arguments) == 130
     thread.join()
-    assert '0 of 2 jobs are finished; the same command goes on' in capsys.readouterr().out
+    assert '0 of 2 jobs are finished; the same command continues' in capsys.readouterr().out
     assert signal.getsignal(signal.SIGINT) is handler
     assert not (tmp_path / 'FetchReach' / 'her_dense').exists()
     assert main(arguments) == 0
     commands = (first / 'command.txt').read_text().splitlines()
     assert commands == [shlex.join(['benchmark', *arguments])] * 2
-    assert read_curve(first / 'progress.csv').env_steps[-1] == 4_000
-    assert 'goes on' not in capsys.readouterr().out
+    assert read_progress(first / 'progress.csv')[-1]['env_steps'] == 4_000
+    assert 'continues' not in capsys.readouterr().out
 
 
-def test_jobs_go_on_where_nobody_reads_how_far_they_are() -> None:
+def test_a_closed_pipe_does_not_end_jobs() -> None:
     code = (
         'import sys\n'
-        'from policy_node.training.studies.workers import _tell\n'
+        'from policy_node.training.studies.workers import _print\n'
         'sys.stdin.readline()\n'
-        '_tell("line")\n'
+        '_print("line")\n'
     )
     reader, writer = os.pipe()
     streams: dict[str, Any] = {'stdin': subprocess.PIPE, 'stdout': writer, 'text': True}
@@ -284,7 +248,7 @@ def test_a_job_of_another_process_is_left_alone(
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert main(small(tmp_path, '--arms', 'her_sparse', 'ddpg_dense')) == 1
     printed = capsys.readouterr().out
-    assert 'FetchReach/her_sparse/seed0 is being run by another process' in printed
+    assert 'FetchReach/her_sparse/seed0 is being trained by another process' in printed
     assert '1 of 2 jobs are finished' in printed
     assert not (taken / 'progress.csv').exists()
 
@@ -296,12 +260,12 @@ def test_a_job_whose_end_was_not_saved_is_not_finished(tmp_path: Path) -> None:
     (job,) = jobs_from_arguments(parse_arguments(arguments))
     state = job.folder / 'training_state.safetensors'
     finished = read_state(state)
-    assert job.is_finished
+    assert is_finished(job, tmp_path)
     before = dataclasses.replace(finished.counters, env_steps=800, updates=8, episodes=16)
     write_state(state, dataclasses.replace(finished, counters=before))
-    assert job.env_steps == 1200 and not job.is_finished
+    assert not is_finished(job, tmp_path)
     assert main(arguments) == 0
-    assert job.is_finished and read_counters(state).env_steps == 1200
+    assert is_finished(job, tmp_path) and read_counters(state).env_steps == 1200
     assert read_info(job.folder / 'latest.safetensors').env_steps == 1200
 
 
@@ -312,7 +276,7 @@ def test_another_budget_in_the_same_folder_is_refused(
     capsys.readouterr()
     assert main(small(tmp_path, '--arms', 'her_sparse', '--set', 'batch_size=32')) == 2
     error = capsys.readouterr().err
-    assert 'holds a run with batch_size 64, now 32: choose another --output' in error
+    assert 'contains a run with batch_size 64, now 32. Choose another --output.' in error
     assert error.count('\n') == 1
 
 

@@ -23,8 +23,9 @@ from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import Counters, TrainingState, write_state
 from policy_node.training.studies import command, workers
 from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
-from policy_node.training.studies.jobs import Job
-from policy_node.training.studies.studies import BEST_ORDER, STARTS_FROM, start_from
+from policy_node.training.studies.paper import BEST_ORDER, STARTS_FROM, start_from
+from policy_node.training.studies.store import add_run
+from policy_node.training.studies.study import Job, to_settings
 from policy_node.training.studies.workers import LOG_FILE, Outcome, run_jobs
 
 torch.set_num_threads(1)
@@ -79,8 +80,8 @@ def test_the_status_of_a_job_says_how_far_it_is_and_how_long_it_will_take(tmp_pa
 class Recorder:
     """A place where jobs take no time; some of them fail."""
 
-    def __init__(self, limit: int, failing: tuple[str, ...] = ()) -> None:
-        self.limit, self.failing = limit, failing
+    def __init__(self, report: Path, limit: int, failing: tuple[str, ...] = ()) -> None:
+        self.report, self.limit, self.failing = report, limit, failing
         self.running: list[Job] = []
         self.order: list[str] = []
         self.most = 0
@@ -98,28 +99,31 @@ class Recorder:
         counters = Counters(env_steps=job.config.total_steps)
         state = TrainingState({}, counters, {'config': {}})
         write_state(job.folder / 'training_state.safetensors', state)
+        task, arm, seed = job.key
+        run = {'task': task, 'arm': arm, 'seed': seed, 'final_episodes': 0}
+        add_run(self.report, {**run, 'config': to_settings(job.config)})
         return job, Outcome.FINISHED
 
 
 def test_jobs_run_as_many_at_once_as_allowed_and_after_what_they_need(tmp_path: Path) -> None:
-    place = Recorder(limit=3)
-    assert run_jobs(jobs_of('--output', str(tmp_path)), place)
+    place = Recorder(tmp_path, limit=3)
+    assert run_jobs(jobs_of('--output', str(tmp_path)), place, tmp_path)
     assert place.most == 3 and sorted(place.order) == sorted(TASKS)
     for task, start in STARTS_FROM.items():
         assert place.order.index(start) < place.order.index(task)
 
 
 def test_a_job_that_fails_stops_only_what_starts_from_it(tmp_path: Path) -> None:
-    place = Recorder(limit=2, failing=('HandManipulateBlockRotateXYZ',))
+    place = Recorder(tmp_path, limit=2, failing=('HandManipulateBlockRotateXYZ',))
     jobs = jobs_of('--output', str(tmp_path))
-    assert not run_jobs(jobs, place)
+    assert not run_jobs(jobs, place, tmp_path)
     lost: set[str] = set()
     for task in BEST_ORDER:
         if STARTS_FROM.get(task) in lost | set(place.failing):
             lost.add(task)
     assert set(place.order) == set(TASKS) - lost
-    again = Recorder(limit=2)
-    assert run_jobs(jobs, again)
+    again = Recorder(tmp_path, limit=2)
+    assert run_jobs(jobs, again, tmp_path)
     assert set(again.order) == lost | set(place.failing)
 
 
@@ -129,8 +133,8 @@ def test_a_report_that_cannot_be_written_ends_no_job(
     def full() -> None:
         raise OSError(28, 'No space left on device', 'runs.csv')
 
-    place = Recorder(limit=2)
-    assert run_jobs(jobs_of('--output', str(tmp_path)), place, full)
+    place = Recorder(tmp_path, limit=2)
+    assert run_jobs(jobs_of('--output', str(tmp_path)), place, tmp_path, full)
     assert sorted(place.order) == sorted(TASKS)
     assert "benchmark: no report yet: [Errno 28] No space left on device: 'runs.csv'" in (
         capsys.readouterr().err
@@ -144,7 +148,7 @@ def test_who_stops_jobs_does_not_wait_for_actors_to_be_evaluated(
     shipped: list[object] = []
     ending = Ending('stopped', Counters(), number)
     monkeypatch.setattr(workers, 'train_run', lambda *_, **__: ending)
-    monkeypatch.setattr(command, 'ship_all', lambda *given: bool(shipped.append(given)))
+    monkeypatch.setattr(command, '_ship_all', lambda *given: bool(shipped.append(given)))
     arguments = [*TINY, '--tasks', 'FetchReach', '--jobs', '1', '--output', str(tmp_path)]
     assert main(arguments) == 128 + number
     assert shipped == []
@@ -160,7 +164,7 @@ def test_processes_end_by_the_signal_that_came_though_all_get_sigterm(tmp_path: 
         def join(self) -> None: ...
 
     (job,) = jobs_of('--tasks', 'FetchReach', '--output', str(tmp_path))
-    (reader, writer), place = os.pipe(), workers.Processes(1, '')
+    (reader, writer), place = os.pipe(), workers.Processes(1, tmp_path, '')
     with place:
         place._running[reader] = job, Ended()  # type: ignore[assignment]
         os.kill(os.getpid(), signal.SIGINT)
@@ -195,7 +199,7 @@ def test_two_at_once_are_stopped_resumed_and_shipped(tmp_path: Path) -> None:
     assert said.count('stopping; jobs finish their cycle') == 1
     assert not second.exists(), 'its predecessor was not finished'
     stopped = [checkpoint.read_info(f / 'latest.safetensors').env_steps for f in (first, other)]
-    assert stopped[0] < 2000 and 'jobs are finished; the same command goes on' in printed
+    assert stopped[0] < 2000 and 'jobs are finished; the same command continues' in printed
     assert 'stopped by SIGTERM' not in said and (first / LOG_FILE).is_file()
 
     assert main(arguments) == 0

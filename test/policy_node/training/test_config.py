@@ -28,7 +28,7 @@ from policy_node.training.configuration.config_values import (
     typed_fields,
 )
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.machine.threads import split_threads
+from policy_node.training.machine.host import split_threads
 from policy_node.training.studies.research import STUDIES
 from policy_node.training.train_her import config_from_arguments, parse_arguments
 from support import ROOT

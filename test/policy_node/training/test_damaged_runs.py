@@ -18,7 +18,7 @@ from policy_node.policies.shipped import shipped_actors
 from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.machine.memory import available_memory
+from policy_node.training.machine.host import available_memory
 from policy_node.training.runs import run as run_module
 from policy_node.training.runs.read_networks import read_initial_networks
 from policy_node.training.runs.run_log import read_progress

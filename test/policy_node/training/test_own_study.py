@@ -1,4 +1,4 @@
-"""A study of somebody's own, as the page of the studies shows it."""
+"""A study in a module of the user, as the page of the studies shows it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from policy_node.training.studies.command import main, parse_arguments
-from policy_node.training.studies.own_study import find_study
-from policy_node.training.studies.stored_runs import read_rows
+from policy_node.training.studies.command import find_study, main, parse_arguments
+from policy_node.training.studies.store import read_runs
 
 torch.set_num_threads(1)
 PAGE = Path(__file__).parents[3] / 'docs' / 'research' / 'README.md'
@@ -31,14 +30,14 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 def test_the_study_of_the_page_runs(module: str, tmp_path: Path) -> None:
     assert main(['--study', f'{module}:WIDTHS', *SMALL]) == 0
     report = tmp_path / 'docs' / 'research' / 'widths'
-    assert [row['arm'] for row in read_rows(report / 'runs.csv')] == ['w256', 'w64']
+    assert [run['arm'] for run in read_runs(report).values()] == ['w256', 'w64']
     assert (report / 'figure.png').is_file()
     assert (tmp_path / 'runs' / 'research' / 'widths' / 'FetchReach' / 'w64' / 'seed0').is_dir()
 
 
 def test_columns_of_the_tables_are_explained() -> None:
     text, folder = PAGE.read_text(), PAGE.parent / 'values'
-    for name in read_rows(folder / 'runs.csv')[0]:
+    for name in next(iter(read_runs(folder).values())):
         assert f'`{name}`' in text
 
 

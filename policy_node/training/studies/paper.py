@@ -1,4 +1,4 @@
-"""What `paper` and `best` train: four arms, or the best recipe of every task."""
+"""The studies `paper` (four variants) and `best` (the best recipe of every task)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,24 @@ from typing import Any
 
 from msgs_spec.tasks import TASKS, task_spec
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.studies.jobs import ARMS, BEST_ARM, Job
 from policy_node.training.studies.research import HAND
-from policy_node.training.studies.study import Study
+from policy_node.training.studies.study import Arm, Job, Study
 
-# The long ones first. What XYZ has learnt of turning a block serves every other task of the block;
-# likewise the egg and the pen.
+_NO_HINDSIGHT = {'strategy': 'none', 'goals': ''}
+ARMS = {
+    arm.name: arm
+    for arm in (
+        Arm('her_sparse', 'DDPG+HER, sparse', {'reward_type': 'sparse'}),
+        Arm('her_dense', 'DDPG+HER, dense', {'reward_type': 'dense'}),
+        Arm('ddpg_sparse', 'DDPG, sparse', {'reward_type': 'sparse', **_NO_HINDSIGHT}),
+        Arm('ddpg_dense', 'DDPG, dense', {'reward_type': 'dense', **_NO_HINDSIGHT}),
+    )
+}
+"""The four curves in each panel of the paper's figures."""
+BEST_ARM = Arm('best', 'DDPG+HER, best recipe')
+
+# Long trainings first. Networks that can turn the block (XYZ) help in every other block task;
+# likewise for egg and pen.
 BEST_ORDER = (
     'HandManipulateBlockRotateXYZ',
     'HandManipulateEggRotate',
@@ -36,8 +48,8 @@ STARTS_FROM = {
     'HandManipulateEggFull': 'HandManipulateEggRotate',
     'HandManipulatePenFull': 'HandManipulatePenRotate',
 }
-# What keeps what the networks know already: a full replay before the first update, smaller steps,
-# less noise; and where goals gain a position, goals that are coarse at first (docs/training.md).
+# Settings that preserve trained networks: a full replay before the first update, smaller steps and
+# less noise. Where goals gain a position, they are coarse at first (docs/training.md).
 _FINE_TUNING = {
     'learning_starts': 100_000,
     'learning_rate': 5e-4,
@@ -45,8 +57,8 @@ _FINE_TUNING = {
     'random_epsilon': 0.2,
 }
 _COARSE_FIRST = {'first_distance': 8.0}
-# A pen is dropped by most noise, and a drop that counts as final teaches to hold it only while some
-# goals are met besides.
+# Most noise drops a pen. A drop that ends the episode teaches holding only while the policy also
+# reaches some goals.
 _HELD = {
     'learning_starts': 64_000,
     'noise_std': 0.1,
@@ -59,18 +71,18 @@ _HELD = {
 
 
 def start_from(task: str, networks: str) -> dict[str, Any]:
-    """Fields of a run that starts from the networks of the task named in `STARTS_FROM`."""
+    """Return the fields of a run that starts from networks of the task in `STARTS_FROM`."""
     coarse = _COARSE_FIRST if task_spec(task).position_counts else {}
     held = _HELD if 'Pen' in task else {}
     return {**_FINE_TUNING, **coarse, **held, 'init_from': networks}
 
 
 def reduced_budget(task: str) -> dict[str, Any]:
-    """What makes the `paper` recipe fit one machine; everything else stays as in the paper.
+    """Return the fields that make the `paper` recipe fit one machine.
 
-    Two collections of 38 episodes are one, with twice the updates. Steps are 1.2 % (FetchReach) or
-    12 % of the paper's; batches 256 or 1024 instead of 4864; to learn in so few updates, targets
-    move after every 10 of them instead of 40.
+    Steps are 1.2 % (FetchReach) or 12 % of the paper's, batches 256 or 1024 instead of 4864. One
+    collection of 76 episodes replaces two of 38, with twice the updates. Targets move every 10
+    updates instead of 40, because there are so few.
     """
     small = task == 'FetchReach'
     full = recipe_config(task, 'paper').total_steps
@@ -82,17 +94,17 @@ def reduced_budget(task: str) -> dict[str, Any]:
         'target_update_interval': 10,
         'replay_transitions': 1_000_000,
         'evaluate_every': 3_800 if small else 19_000,
-        # As many as there are simulations, so that none of them is cut short.
+        # As many as simulations, so that no evaluation ends early.
         'evaluation_episodes': 76,
     }
 
 
 def _page_settings(task: str) -> dict[str, Any]:
-    """What the page of the paper's comparison trains: a quarter of an hour of a core or so.
+    """Return the settings of the page: about a quarter of an hour of one core per run.
 
-    Long runs compute in bfloat16. Those of the Fetch with an object have a third of the paper's
-    steps: with 12 % the one arm that learns is still rising. Hands have the recipe `best`, which
-    sees in a million steps what the paper's sees in many.
+    Long runs compute in bfloat16. Fetch tasks with an object have a third of the paper's steps:
+    after 12 % the learning variant is still rising. Hand tasks use the recipe `best`, which learns
+    in a million steps what the paper's recipe learns in many.
     """
     if task == 'FetchReach':
         return {'recipe': 'paper', **reduced_budget(task)}
@@ -109,52 +121,15 @@ PAPER = Study(
     {task: _page_settings(task) for task in TASKS},
     tuple(ARMS.values()),
 )
-"""The paper's own comparison as a study with a page."""
-
-
-def paper_jobs(
-    tasks: Sequence[str],
-    arms: Sequence[str],
-    seeds: Sequence[int],
-    recipe: str,
-    overrides: dict[str, Any],
-    output: Path,
-) -> list[Job]:
-    """Task x arm x seed, seed by seed, so that an early stop leaves all arms with as many seeds.
-
-    Args:
-        tasks: Task names.
-        arms: Keys of `ARMS`.
-        seeds: Seeds.
-        recipe: The recipe of all jobs.
-        overrides: Fields of `TrainConfig` for all jobs; what the arms differ in is theirs.
-        output: Folder for all runs.
-
-    Raises:
-        ValueError: If a value is not allowed.
-    """
-    jobs = []
-    for task in tasks:
-        for seed in seeds:
-            for arm in (ARMS[name] for name in arms):
-                values = {**overrides, **arm.changes, 'seed': seed}
-                config = recipe_config(task, recipe, **values)
-                jobs.append(Job(arm, config, output / task / arm.name / f'seed{seed}'))
-    return jobs
+"""The paper's comparison as a study with a page."""
 
 
 def best_jobs(
     tasks: Sequence[str], seeds: Sequence[int], overrides: dict[str, Any], output: Path
 ) -> list[Job]:
-    """The best recipe of each task; some start from the networks of another that comes before.
+    """Return the best recipe of each task, some starting from the networks of an earlier job.
 
-    A task whose predecessor is not among the tasks starts from nothing.
-
-    Args:
-        tasks: Task names.
-        seeds: Seeds.
-        overrides: Fields of `TrainConfig` for all jobs.
-        output: Folder for all runs.
+    A task starts from random networks if its predecessor is not among the tasks.
 
     Raises:
         ValueError: If a value is not allowed.

@@ -1,0 +1,363 @@
+"""Tables and figures of studies, derived from their stored runs."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from fetch_hand_sim.datasets.writing import alone_in
+from msgs_spec.arrays import Array
+from msgs_spec.tasks import task_spec
+from policy_node.policies.files import write_files
+from policy_node.training.studies.measures import (
+    GOOD_SUCCESS,
+    Curve,
+    area_in_time,
+    compared,
+    is_significant,
+    sum_up,
+)
+from policy_node.training.studies.published import BEST, RERUN
+from policy_node.training.studies.store import Run, in_order, read_runs
+from policy_node.training.studies.study import Job, Study
+
+# The page of a study keeps its table between these lines.
+BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'
+ARMS, FIGURE, PAGE = 'arms.csv', 'figure.png', 'README.md'
+# Fewer seeds support no claim.
+_ENOUGH_SEEDS = 5
+# An epoch of the paper: 50 cycles of 2 episodes on each of 19 workers.
+EPISODES_PER_EPOCH = 1900
+FAST_SUCCESS = 0.95
+# Colours of a figure; further curves are dashed.
+_COLORS = 10
+_MOST_INSIDE = 4
+
+Bands = Mapping[str, Mapping[str, 'Band']]
+"""Bands by task and variant."""
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """Median and quartiles over seeds on common steps, each (n,)."""
+
+    env_steps: Array
+    median: Array
+    lower: Array
+    upper: Array
+
+
+def write_study(study: Study, output: Path) -> None:
+    """Write the tables and the figure of a study from the runs in its folder.
+
+    `arms.csv` holds medians and quartiles. `README.md` keeps the user's text around the table.
+
+    Raises:
+        ValueError: If a stored run cannot be read.
+        OSError: If the report cannot be written; the earlier one stays.
+    """
+    with alone_in(output):
+        runs = in_order(read_runs(output).values(), study)
+        if not runs:
+            return
+        arms = sum_up_arms(study, runs)
+        labels = {arm.name: arm.label for arm in study.arms}
+        page, table = output / PAGE, format_study(study, arms)
+        contents = {
+            ARMS: to_csv(arms),
+            FIGURE: draw(_bands(runs), labels, paper_epochs=False),
+            PAGE: _with_table(page.read_text() if page.is_file() else '', table),
+        }
+        write_files({output / name: content for name, content in contents.items()})
+
+
+def sum_up_arms(study: Study, runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Return the rows of `arms.csv`: by task, in the order of the study's variants."""
+    first = study.arms[0].name
+    order = {arm.name: index for index, arm in enumerate(study.arms)}
+    rows = []
+    for of_task in _grouped(runs, 'task').values():
+        arms = _grouped(of_task, 'arm')
+        names = sorted(arms, key=lambda name: order.get(name, len(order)))
+        # The first variant, usually the baseline, sets the time in which areas are compared.
+        seconds = _median_seconds(arms[names[0]])
+        measured = {name: [_timed(run, seconds) for run in arms[name]] for name in names}
+        baseline = measured.get(first, [])
+        for name, group in measured.items():
+            rows.append(sum_up(group) | compared(group, [] if name == first else baseline))
+    return rows
+
+
+def _grouped(runs: Sequence[Run], name: str) -> dict[str, list[Run]]:
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(run[name], []).append(run)
+    return groups
+
+
+def _median_seconds(runs: Sequence[Run]) -> dict[str, float]:
+    """Return the median processor time of runs by machine."""
+    return {
+        machine: float(np.median([run['processor_seconds'] for run in group]))
+        for machine, group in _grouped(runs, 'machine').items()
+    }
+
+
+def _timed(run: Run, seconds: Mapping[str, float]) -> Run:
+    """Add the area in the baseline's time on the same machine; None if it never ran there."""
+    known = seconds.get(run['machine'])
+    return {**run, 'area_in_time': None if known is None else area_in_time(run, known)}
+
+
+def _bands(runs: Sequence[Run]) -> dict[str, dict[str, Band]]:
+    return {
+        task: {arm: aggregate(list(map(Curve.of, group))) for arm, group in arms.items()}
+        for task, arms in ((t, _grouped(r, 'arm')) for t, r in _grouped(runs, 'task').items())
+    }
+
+
+def aggregate(curves: Sequence[Curve]) -> Band:
+    """Return median and quartiles over the steps that all curves cover.
+
+    Resumed runs are evaluated at other steps; curves are linear between evaluations.
+    """
+    first = max(float(curve.env_steps[0]) for curve in curves)
+    last = min(float(curve.env_steps[-1]) for curve in curves)
+    steps = np.unique(np.concatenate([curve.env_steps for curve in curves]))
+    steps = steps[(steps >= first) & (steps <= last)]
+    values = np.stack([np.interp(steps, curve.env_steps, curve.success) for curve in curves])
+    lower, median, upper = np.percentile(values, [25, 50, 75], axis=0)
+    return Band(steps, median, lower, upper)
+
+
+def format_study(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
+    """Return the Markdown table of a study: a variant per row, quartiles beside each median."""
+    labels = {arm.name: arm.label for arm in study.arms}
+    lines = [
+        f'| task | arm | seeds | area | steps to {GOOD_SUCCESS} (reached) | final success '
+        '| processor time, s | area in equal time | samples per s | against the baseline |',
+        '| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |',
+    ]
+    for row in arms:
+        steps = row[f'steps_to_{GOOD_SUCCESS}_median']
+        cells = [
+            row['task'],
+            f'`{row["arm"]}`: {labels.get(row["arm"], "an arm of before")}',
+            str(row['seeds']),
+            _quartiles(row, 'area'),
+            f'{steps:,} ({row["reached"]})' if steps != '' else f'censored ({row["reached"]})',
+            _quartiles(row, 'final_success'),
+            *_times(row),
+            _against(study, row, arms),
+        ]
+        lines.append(f'| {" | ".join(cells)} |')
+    return '\n'.join(lines) + '\n'
+
+
+def _times(row: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return the cells of processor time, area in equal time and samples per second."""
+    if not row['timed']:
+        return ('-',) * 3
+    some = '' if row['timed'] == row['seeds'] else f', of {row["timed"]}'
+    return (
+        f'{row["processor_seconds_median"]:.0f}{some}',
+        _quartiles(row, 'area_in_time') + some,
+        f'{row["samples_per_processor_second_median"]:,.0f}{some}',
+    )
+
+
+def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, Any]]) -> str:
+    """Return the cell that compares a variant with the baseline."""
+    base = study.arms[0].name
+    found = [other for other in arms if (other['task'], other['arm']) == (row['task'], base)]
+    if row['arm'] == base or not found:
+        return ''
+    if min(row['seeds'], found[0]['seeds']) < _ENOUGH_SEEDS:
+        return 'fewer than five seeds'
+    words = []
+    for name, label, runs in (
+        ('area', 'area', 'seeds'),
+        ('area_in_time', 'area in time', 'timed'),
+        ('final_success', 'final', 'seeds'),
+    ):
+        enough = min(row[runs], found[0][runs]) >= _ENOUGH_SEEDS
+        if enough and is_significant(row, found[0], name):
+            better = row[f'{name}_median'] > found[0][f'{name}_median']
+            words.append(f'{label} {"better" if better else "worse"}')
+    return ', '.join(words) or 'not apart'
+
+
+def _quartiles(row: Mapping[str, Any], name: str) -> str:
+    values = (row[f'{name}_{part}'] for part in ('median', 'lower', 'upper'))
+    return '{:.3f} ({:.3f} ... {:.3f})'.format(*values)
+
+
+def _with_table(page: str, table: str) -> bytes:
+    """Replace the table between the marks of a page; without marks the page stays as it is."""
+    text = page or f'{BEGIN}\n{END}\n'
+    if BEGIN in text and END in text:
+        before, after = text.split(BEGIN)[0], text.split(END, 1)[1]
+        text = f'{before}{BEGIN}\n{table}{END}{after}'
+    return text.encode()
+
+
+def write_comparison(jobs: Sequence[Job], output: Path) -> None:
+    """Write and print figure and table of stored jobs of the studies `paper` and `best`.
+
+    Raises:
+        ValueError: If a stored run cannot be read.
+        OSError: If the report cannot be written; the earlier one stays.
+    """
+    stored = read_runs(output)
+    runs = [stored[job.key] for job in jobs if job.key in stored]
+    if not runs:
+        return
+    labels = {job.arm.name: job.arm.label for job in jobs}
+    table = [
+        _comparison_row(task, labels[arm], arm, group)
+        for task, of_task in _grouped(runs, 'task').items()
+        for arm, group in _grouped(of_task, 'arm').items()
+    ]
+    text = _format_comparison(table)
+    contents = {
+        'benchmark.csv': to_csv(table),
+        'benchmark.png': draw(_bands(runs), labels),
+        'benchmark.txt': text.encode(),
+    }
+    with alone_in(output):
+        write_files({output / name: content for name, content in contents.items()})
+    print(text, end='')
+    print(f'figure and tables in {output}')
+
+
+def _comparison_row(task: str, label: str, arm: str, runs: Sequence[Run]) -> dict[str, Any]:
+    """Return final success over seeds beside the published numbers: one row of the table."""
+    curves = [Curve.of(run) for run in runs]
+    lower, median, upper = np.percentile([curve.success[-1] for curve in curves], [25, 50, 75])
+    # The middle of an even number with an unreached one has no value: the slower one counts.
+    fast = sorted(curve.steps_to(FAST_SUCCESS) for curve in curves)[len(curves) // 2]
+    return {
+        'task': task,
+        'arm': arm,
+        'label': label,
+        'seeds': len(curves),
+        'env_steps': int(min(curve.env_steps[-1] for curve in curves)),
+        'final_median': float(median),
+        'final_lower_quartile': float(lower),
+        'final_upper_quartile': float(upper),
+        f'median_steps_to_{FAST_SUCCESS}': None if np.isinf(fast) else int(fast),
+        'published_rerun': str(RERUN.get((task, arm), 'none')),
+        'published_best': str(BEST.get(task, 'none')),
+    }
+
+
+def _format_comparison(table: Sequence[dict[str, Any]]) -> str:
+    """Return the results as text, and below them the published numbers with their sources."""
+    columns = ('task', 'arm', 'seeds', 'steps', 'median', 'quartiles', f'steps to {FAST_SUCCESS}')
+    results = Table(*columns, title='success at the last step, over seeds')
+    published = Table('task', 'arm', 'published success (kind; source)')
+    for row in table:
+        fast = row[f'median_steps_to_{FAST_SUCCESS}']
+        results.add_row(
+            row['task'],
+            row['label'],
+            str(row['seeds']),
+            f'{row["env_steps"]:,}',
+            f'{row["final_median"]:.3f}',
+            f'{row["final_lower_quartile"]:.3f} ... {row["final_upper_quartile"]:.3f}',
+            'not reached' if fast is None else f'{fast:,}',
+        )
+        published.add_row(row['task'], row['label'], row['published_rerun'])
+    for row in {row['task']: row for row in table}.values():
+        published.add_row(row['task'], 'best of any method', row['published_best'])
+    text = io.StringIO()
+    Console(file=text, width=110).print(results, published)
+    return text.getvalue()
+
+
+def draw(bands: Bands, labels: Mapping[str, str], paper_epochs: bool = True) -> bytes:
+    """Return a PNG with one panel per task: the median of each variant over its quartiles.
+
+    Args:
+        bands: The curves.
+        labels: By variant, in the order of their colours.
+        paper_epochs: Mark the epochs of the paper on a second axis.
+    """
+    from matplotlib.figure import Figure
+
+    top = _top_of_axis(bands)
+    columns = min(len(bands), 4)
+    rows = -(-len(bands) // columns)
+    figure = Figure(figsize=(4.6 * columns + 0.8, 3.9 * rows), layout='constrained')
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[len(bands) :]:
+        axes.set_visible(False)
+    for axes, (task, arms) in zip(panels, bands.items(), strict=False):
+        for index, (arm, label) in enumerate(labels.items()):
+            if arm in arms:
+                band, color = arms[arm], f'C{index}'
+                style = '--' if index >= _COLORS else '-'
+                axes.fill_between(band.env_steps, band.lower, band.upper, color=color, alpha=0.2)
+                axes.plot(band.env_steps, band.median, style, color=color, label=label)
+        _label(axes, task, top, paper_epochs)
+    _add_legend(figure, list(panels[: len(bands)]), columns)
+    file = io.BytesIO()
+    figure.savefig(file, dpi=130)
+    return file.getvalue()
+
+
+def _add_legend(figure: Any, panels: Sequence[Any], columns: int) -> None:
+    """Add a legend inside the first panel, or below all panels where it would hide curves."""
+    named: dict[str, Any] = {}
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        named |= zip(labels, handles, strict=True)
+    if len(named) <= _MOST_INSIDE:
+        panels[0].legend(named.values(), named.keys(), loc='best', fontsize='small')
+        return
+    lines = -(-len(named) // columns)
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + 0.2 * lines)
+    place = {'loc': 'outside lower center', 'ncols': columns}
+    figure.legend(named.values(), named.keys(), fontsize='small', **place)
+
+
+def _top_of_axis(bands: Bands) -> float:
+    """Return 1, or less where no variant reaches half of it."""
+    # Curves without a common step have an empty band.
+    tops = [band.upper for arms in bands.values() for band in arms.values() if band.upper.size]
+    highest = max((float(upper.max()) for upper in tops), default=0.0)
+    return 1.0 if highest > 0.4 else max(1.25 * highest, 0.05)
+
+
+def _label(axes: Any, task: str, top: float, paper_epochs: bool) -> None:
+    from matplotlib.ticker import EngFormatter
+
+    unit = 'environment steps' if paper_epochs else 'steps of 40 ms'
+    axes.set(xlabel=unit, ylabel='success at the last step')
+    axes.set_ylim(-0.02 * top, 1.02 * top)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=''))
+    axes.set_title(task)
+    axes.grid(alpha=0.3)
+    if not paper_epochs:
+        return
+    steps = EPISODES_PER_EPOCH * task_spec(task).episode_ticks
+    epochs = axes.secondary_xaxis('top', functions=(lambda x: x / steps, lambda x: x * steps))
+    epochs.set_xlabel("the paper's epochs")
+
+
+def to_csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """Return rows with equal columns as CSV."""
+    file = io.StringIO()
+    writer = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
+    writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue().encode()

@@ -1,0 +1,146 @@
+"""The finished runs of a study, one JSON object per line in `runs.jsonl` of its report folder.
+
+The file only grows; of two lines about the same run the later one counts. Tables and figures are
+derived from it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fetch_hand_sim.datasets.writing import alone_in
+from policy_node.policies.files import write_file
+from policy_node.training.configuration.recipes import STEP_COUNTS
+from policy_node.training.studies.study import Job, Study, differing_fields, run_name
+
+RUNS = 'runs.jsonl'
+
+Run = dict[str, Any]
+"""A line of `runs.jsonl`: `task`, `arm`, `seed`, measures, `curve`, `command` and `config`."""
+Runs = dict[tuple[str, str, int], Run]
+"""Runs by task, variant and seed."""
+
+
+def read_runs(folder: Path) -> Runs:
+    """Read the runs of a report folder; without a file there are none.
+
+    Raises:
+        ValueError: If a line is no run.
+    """
+    runs: Runs = {}
+    file = folder / RUNS
+    if not file.is_file():
+        return runs
+    for number, line in enumerate(file.read_text(errors='replace').splitlines(), 1):
+        try:
+            run = json.loads(line)
+            runs[run['task'], run['arm'], run['seed']] = run
+        except (ValueError, KeyError, TypeError):
+            raise ValueError(
+                f'{file}, line {number}, is no run. Remove the line; the run is measured again.'
+            ) from None
+    return runs
+
+
+def add_run(folder: Path, run: Mapping[str, Any]) -> None:
+    """Append a run.
+
+    Raises:
+        OSError: If the disk is full; the file is as before.
+    """
+    file, line = folder / RUNS, json.dumps(run, separators=(',', ':'))
+    with alone_in(folder):
+        stored = file.read_bytes() if file.is_file() else b''
+        write_file(file, stored + line.encode() + b'\n')
+
+
+def in_order(runs: Iterable[Run], study: Study) -> list[Run]:
+    """Sort runs by task, seed and variant in the order of the study."""
+    tasks = {name: index for index, name in enumerate(study.tasks)}
+    arms = {arm.name: index for index, arm in enumerate(study.arms)}
+
+    def place(run: Run) -> tuple[int, int, int]:
+        return tasks.get(run['task'], len(tasks)), run['seed'], arms.get(run['arm'], len(arms))
+
+    return sorted(runs, key=place)
+
+
+def holds(runs: Runs, job: Job) -> bool:
+    """Return whether the runs include one with the job's name, configuration and measure."""
+    run = runs.get(job.key)
+    if run is None or run['final_episodes'] != job.final_episodes:
+        return False
+    return not differing_fields(run['config'], job.config)
+
+
+def _differing_runs(run: Run, job: Job) -> dict[str, str]:
+    """Return the differing fields of two runs of different places; here the start counts too."""
+    before, now = run['config'].get('init_from', ''), job.config.init_from
+    start = {} if before == now else {'init_from': f'init_from {before!r}, now {now!r}'}
+    stored = {**run['config'], 'seed': job.config.seed}
+    return {**differing_fields(stored, job.config), **start}
+
+
+def own_fields(study: Study) -> set[str]:
+    """Return the fields in which variants of a study may differ."""
+    own = {name for arm in study.arms for name in arm.own}
+    return own | set(STEP_COUNTS) if 'control_hz' in own else own
+
+
+def require_alike(study: Study, jobs: Sequence[Job], folder: Path) -> None:
+    """Reject jobs that are configured otherwise than the runs beside which they would stand.
+
+    Raises:
+        ValueError: The message names one run and the differing fields.
+    """
+    own = own_fields(study)
+    examples = {(run['task'], run['arm']): run for run in read_runs(folder).values()}
+    for job in {job.key[:2]: job for job in jobs}.values():
+        for (task, arm), run in examples.items():
+            if task != job.config.task:
+                continue
+            differing = _differing_runs(run, job)
+            if arm != job.arm.name:
+                differing = {name: text for name, text in differing.items() if name not in own}
+            if differing:
+                raise ValueError(
+                    f'{folder} contains runs of {task}/{arm} with '
+                    f'{"; ".join(differing.values())}. Choose another --report.'
+                )
+
+
+def take_from_other_studies(jobs: Sequence[Job], folder: Path) -> None:
+    """Copy runs with equal settings from the reports of other studies.
+
+    Equal settings give equal runs, so no run is trained twice. Jobs with a run folder or a stored
+    run are left alone.
+
+    Args:
+        jobs: Jobs of one study.
+        folder: Its report, beside the reports of the other studies.
+    """
+    here = read_runs(folder)
+    beside = [path.parent for path in sorted(folder.parent.glob(f'*/{RUNS}'))]
+    others = {path: read_runs(path) for path in beside if path != folder}
+    for job in jobs:
+        if job.folder.exists() or holds(here, job):
+            continue
+        for path, runs in others.items():
+            if (run := _equal_run(runs, job)) is not None:
+                name = f'{run_name(run["task"], run["arm"], run["seed"])} of {path}'
+                add_run(folder, {**run, 'arm': job.arm.name, 'command': f'as {name}'})
+                print(f'{job.name} is {name}', flush=True)
+                break
+
+
+def _equal_run(runs: Runs, job: Job) -> Run | None:
+    """Return a run of any variant that is configured and measured like a job, or None."""
+    wanted = (job.config.task, job.config.seed, job.final_episodes)
+    for run in runs.values():
+        if (run['task'], run['seed'], run['final_episodes']) == wanted:
+            if not _differing_runs(run, job):
+                return run
+    return None
