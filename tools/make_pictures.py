@@ -17,8 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from fetch_hand_sim.commands.executables import is_actor_shipped
 from fetch_hand_sim.films.film import write_film, write_picture
-from fetch_hand_sim.films.pictures import Studio, tile, with_frame
 from fetch_hand_sim.films.recording import Recording, load_recordings
+from fetch_hand_sim.films.studio import Studio, tile, with_edge
 from msgs_spec.arrays import Picture
 from msgs_spec.tasks import TASKS
 from node_runtime.command_line import progress
@@ -77,7 +77,7 @@ def play(studio: Studio, act: Act) -> Iterator[Picture]:
         for index in range(0, len(recording.frames), STEP):
             picture = studio.picture(recording, index)
             if recording.frames[index].is_success:
-                picture = with_frame(picture)
+                picture = with_edge(picture)
             yield labelled(picture, act.text)
 
 

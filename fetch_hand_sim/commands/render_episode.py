@@ -90,8 +90,8 @@ def _check_is_used(options: argparse.Namespace) -> None:
 
 def _render(options: argparse.Namespace) -> None:
     from fetch_hand_sim.films.film import STILL, check_size, write_film, write_picture
-    from fetch_hand_sim.films.pictures import Studio, framed, grid, sheet_size, sheets, tile
     from fetch_hand_sim.films.recording import Recording, find_playable, load_recordings
+    from fetch_hand_sim.films.studio import Studio, grid, sheet_size, sheets, tile
 
     columns, rows = options.grid or (1, 1)
     recordings: list[Recording] = load_recordings(
@@ -104,7 +104,7 @@ def _render(options: argparse.Namespace) -> None:
     studio = Studio(width, height, options.camera)
     try:
         if options.out.suffix.lower() in STILL:
-            draw = framed if options.grid else Studio.picture
+            draw = Studio.framed if options.grid else Studio.picture
             index = -1 if options.frame is None else options.frame
             stills = [draw(studio, recording, index) for recording in recordings]
             write_picture(options.out, tile(stills, columns))

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from fetch_hand_sim.datasets.lerobot_columns import QUANTILES, quantile_name
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.films.film import write_film
-from fetch_hand_sim.films.pictures import Studio
 from fetch_hand_sim.films.recording import recording_of
+from fetch_hand_sim.films.studio import Studio
 from msgs_spec.arrays import Picture
 
 _LEVELS = 256

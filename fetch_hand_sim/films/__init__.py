@@ -11,7 +11,7 @@ __all__ = ['Film', 'film_episode']
 
 
 def __getattr__(name: str) -> Any:
-    # Commands check what they were given before they load what draws.
+    # Commands check their arguments before they load the renderer.
     if name not in __all__:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     from importlib import import_module

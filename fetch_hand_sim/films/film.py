@@ -1,34 +1,74 @@
-"""Writes films and pictures; the ending of the file says what kind."""
+"""Write films and pictures; the file suffix selects the format."""
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
+from io import BytesIO
 from itertools import chain
 from pathlib import Path
+from typing import IO
 
 import numpy as np
+from PIL import Image, TiffImagePlugin
 
 from msgs_spec.arrays import Picture
 from node_runtime.command_line import CommandError, UsageError
 
 MOVING = ('.mp4', '.gif', '.webp')
 STILL = ('.png', '.jpg')
-# All pixels of a picture that are held at a time, at most: 0.8 GB.
+# Limit of the uncompressed pixels of one picture: 0.8 GB.
 _MOST_PIXELS = 2**28
-# Pixels of a side, at most.
+# Largest side that each format can store, pixels.
 _LARGEST_SIDE = {'.mp4': 16384, '.gif': 65535, '.webp': 16383, '.jpg': 65500}
+# Time unit of each format, milliseconds.
+_UNITS = {'.gif': 10, '.webp': 1}
+# Browsers replace shorter times by 100 ms.
+_SHORTEST_MS = 20
+# More colours make a GIF several times as large.
+_GIF_COLORS = 128
+_PALETTE_SAMPLES = 8
+
+
+class Roll:
+    """Pictures (height, width, 3) uint8 of one size, stored in memory with lossless compression."""
+
+    def __init__(self) -> None:
+        self._file = BytesIO()
+        self._writer = TiffImagePlugin.AppendingTiffWriter(self._file, new=True)
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(self, picture: Picture) -> None:
+        """Append one picture."""
+        image = Image.fromarray(picture)
+        image.save(self._writer, format='TIFF', compression='tiff_adobe_deflate')
+        self._writer.newFrame()
+        self._count += 1
+
+    def picture(self, number: int) -> Picture:
+        """Return one picture, read-only."""
+        image = self.open()
+        image.seek(number)
+        return np.asarray(image)
+
+    def open(self) -> Image.Image:
+        """Return all pictures as one image, which decodes one frame at a time."""
+        return Image.open(self._file)
 
 
 def check_kind(path: Path) -> None:
-    """Checks that a file can be written, before anything is drawn.
+    """Check that a file can be written, before anything is drawn.
 
     Raises:
-        UsageError: If its ending is not known, its folder not there, or what it needs missing.
+        UsageError: If the suffix is unknown, the folder does not exist, or ffmpeg is missing.
     """
     kind = path.suffix.lower()
     if kind not in (*MOVING, *STILL):
@@ -42,10 +82,10 @@ def check_kind(path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Checks that pictures of a size can be written, before they are drawn.
+    """Check that the format can store pictures of a size, before they are drawn.
 
     Raises:
-        UsageError: If the kind of file takes none as large.
+        UsageError: If the size exceeds the limit of the format.
     """
     kind = path.suffix.lower()
     largest = _LARGEST_SIDE.get(kind)
@@ -58,23 +98,20 @@ def check_size(path: Path, width: int, height: int) -> None:
 def write_film(
     path: Path, pictures: Iterable[Picture], fps: float, keyframe_every: int = 0
 ) -> None:
-    """Writes pictures (height, width, 3) of one size; the file appears when it is complete.
+    """Write pictures (height, width, 3) of one size; the file appears when it is complete.
 
     Args:
-        path: Ending in .mp4, .gif or .webp.
+        path: Ends in .mp4, .gif or .webp.
         pictures: Drawn as they are written.
-        fps: Pictures per second. A GIF or WebP shows 50 at most: it takes every n-th picture where
-            there are more, so that the film lasts as long.
-        keyframe_every: Of an .mp4, how many pictures apart those are that need no other to be
-            shown, for those who jump about in it; 0 for as the encoder likes.
+        fps: Pictures per second. GIF and WebP show at most 50, so above that every n-th picture
+            is written and the duration stays the same.
+        keyframe_every: Pictures between two keyframes of an .mp4, for programs that seek in it;
+            0 leaves the choice to the encoder.
 
     Raises:
-        UsageError: If there is no ffmpeg.
-        CommandError: If it fails, or the file cannot be written.
+        UsageError: If ffmpeg is missing.
+        CommandError: If ffmpeg fails or the file cannot be written.
     """
-    # Pillow is slow to import, and checks come before.
-    from fetch_hand_sim.films.animation import write_animation
-
     with _appearing(path) as hidden:
         if path.suffix.lower() == '.mp4':
             _write_mp4(hidden, pictures, fps, keyframe_every)
@@ -83,23 +120,50 @@ def write_film(
 
 
 def write_picture(path: Path, picture: Picture) -> None:
-    """Writes one picture (height, width, 3) as .png or .jpg; the file appears when it is complete.
+    """Write one picture (height, width, 3) as .png or .jpg; the file appears when it is complete.
 
     Raises:
-        CommandError: If it cannot be written.
+        CommandError: If the file cannot be written.
     """
-    from PIL import Image
-
     with _appearing(path) as hidden:
         Image.fromarray(picture).save(hidden, quality=85, optimize=True)
+
+
+def write_animation(
+    target: Path | IO[bytes], pictures: Iterable[Picture], fps: float, kind: str
+) -> None:
+    """Write pictures (height, width, 3) of one size as `.gif` or `.webp`; see `write_film`."""
+    every, roll, count = math.ceil(fps * _SHORTEST_MS / 1000.0), Roll(), 0
+    for count, picture in enumerate(pictures, start=1):
+        if (count - 1) % every == 0:
+            roll.add(picture)
+    begins = np.append(np.arange(0, count, every), count) * (1000.0 / fps)
+    # Differences of rounded times, so that rounding errors do not add up.
+    lengths = np.diff(np.rint(begins / _UNITS[kind]).astype(int) * _UNITS[kind])
+    timing = {'duration': [max(_SHORTEST_MS, each) for each in lengths.tolist()], 'loop': 0}
+    if kind == '.gif':
+        images = _with_one_palette(roll)
+        next(images).save(
+            target, format='GIF', save_all=True, append_images=images, optimize=True, **timing
+        )
+    else:
+        roll.open().save(target, format='WEBP', save_all=True, quality=72, method=4, **timing)
+
+
+def _with_one_palette(roll: Roll) -> Iterator[Image.Image]:
+    """Yield the pictures as images with a common palette; with separate ones colours flicker."""
+    some = range(0, len(roll), max(1, len(roll) // _PALETTE_SAMPLES))
+    samples = Image.fromarray(np.concatenate([roll.picture(number) for number in some]))
+    palette = samples.quantize(_GIF_COLORS)
+    for number in range(len(roll)):
+        yield Image.fromarray(roll.picture(number)).quantize(palette=palette)
 
 
 def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float, keyframe_every: int) -> None:
     iterator = iter(pictures)
     first = next(iterator)
     height, width = first.shape[:2]
-    # As a ratio: in six digits 500/11 pictures a second are a picture off after some hours, and
-    # who looks one up by its time wants it to the tenth of a millisecond.
+    # A ratio: six digits of 500/11 are a picture off after some hours.
     rate = Fraction(fps).limit_denominator(1000)
     command = [_ffmpeg(), '-y', '-loglevel', 'error', '-f', 'rawvideo', '-pix_fmt', 'rgb24']
     command += ['-s', f'{width}x{height}', '-r', f'{rate.numerator}/{rate.denominator}']
@@ -116,7 +180,7 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float, keyframe_eve
                 process.stdin.write(np.ascontiguousarray(picture).tobytes())
             process.stdin.close()
         except BrokenPipeError:
-            # What is still in the buffer would break the pipe again, at the end of the block.
+            # Buffered data would break the pipe again at the end of the block.
             with suppress(BrokenPipeError):
                 process.stdin.close()
         complaint = process.stderr.read().decode(errors='replace')
@@ -138,10 +202,10 @@ def _ffmpeg() -> str:
 
 @contextmanager
 def _appearing(path: Path) -> Iterator[Path]:
-    """A hidden file beside the path that takes its name when all is written."""
-    # A link stays one: what it leads to is written.
+    """Yield a hidden file beside the path, which replaces the path on success."""
+    # Follow a link, so that it stays a link.
     target = path.resolve()
-    # Named by process: of two that write one film at once the later one's stays, and it is whole.
+    # The process id keeps two processes apart that write the same film.
     hidden = target.with_name(f'.{target.stem}.{os.getpid()}.active{path.suffix.lower()}')
     try:
         yield hidden
@@ -149,6 +213,6 @@ def _appearing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise CommandError(f'{path}: {error.strerror or error}') from error
     finally:
-        # A disk that may only be read refuses to remove what is not there, too.
+        # A read-only disk also refuses to remove a file that does not exist.
         with suppress(OSError):
             hidden.unlink()

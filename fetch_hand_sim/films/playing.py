@@ -1,4 +1,4 @@
-"""Films in memory: a notebook plays them, and `save` writes them."""
+"""Films in memory, which a notebook plays and `save` writes."""
 
 from __future__ import annotations
 
@@ -13,31 +13,33 @@ import gymnasium
 import numpy as np
 from gymnasium.wrappers import TimeLimit
 
-from fetch_hand_sim.films.animation import Roll, write_animation
-from fetch_hand_sim.films.film import MOVING, check_kind, check_size, write_film
-from fetch_hand_sim.films.pictures import Studio
+from fetch_hand_sim.films.film import (
+    MOVING,
+    Roll,
+    check_kind,
+    check_size,
+    write_animation,
+    write_film,
+)
 from fetch_hand_sim.films.recording import load_recordings
+from fetch_hand_sim.films.studio import Studio
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes
 from msgs_spec.arrays import Picture
 from node_runtime.command_line import CommandError, UsageError
 
-# Pictures per second that a file can have.
+# Range of the pictures per second of a file.
 _RATES = (0.001, 1000.0)
 
 
 class Film:
-    """Moving pictures; as the last line of a cell, a notebook plays them.
+    """A film in memory. A notebook plays it as the result of a cell.
 
     Args:
-        pictures: (height, width, 3) uint8, of one size, as `render` of an environment gives them.
-        fps: Pictures per second.
-
-    Attributes:
-        fps: As given.
+        pictures: (height, width, 3) uint8, all of one size, as returned by `render`.
+        fps: Pictures per second, 0.001 ... 1000.
 
     Raises:
-        ValueError: If there is no picture, or something else than a picture of the first one's
-            size, or the rate is not 0.001 ... 1000.
+        ValueError: If there are no pictures, or one has another size or type.
     """
 
     def __init__(self, pictures: Iterable[Picture], fps: float = 25.0) -> None:
@@ -58,17 +60,17 @@ class Film:
     def of_episode(
         cls, path: str | Path, width: int = 640, height: int = 480, camera: str | None = None
     ) -> Film:
-        """Draws a logged episode; of a folder, the first.
+        """Draw a logged episode, or the first episode of a folder.
 
         Args:
-            path: A file of `episodes/`, its folder, or a folder of several.
-            width: Of pictures, pixels.
-            height: Likewise.
-            camera: Of the model, by name; None for the usual view.
+            path: An episode file, its folder, or a folder of several episodes.
+            width: Pixels.
+            height: Pixels.
+            camera: Name of a camera of the model; None for the usual view.
 
         Raises:
-            ValueError: If it cannot be read, or the model has no such camera.
-            RuntimeError: If there is no OpenGL.
+            ValueError: If the episode cannot be read, or the model has no such camera.
+            RuntimeError: Without OpenGL.
         """
         (recording,) = load_recordings(Path(path).expanduser(), count=1)
         studio = Studio(width, height, camera)
@@ -78,19 +80,19 @@ class Film:
             studio.close()
 
     def __len__(self) -> int:
-        """How many pictures there are."""
+        """Return the number of pictures."""
         return len(self._roll)
 
     def __iter__(self) -> Iterator[Picture]:
-        """The pictures, one after the other."""
+        """Yield the pictures, read-only."""
         return (self._roll.picture(number) for number in range(len(self)))
 
     def save(self, path: str | Path) -> Path:
-        """Writes it as .gif, .webp or .mp4; returns where.
+        """Write the film as .gif, .webp or .mp4 and return the path.
 
         Raises:
-            ValueError: If the ending, the folder or the size is not allowed, or .mp4 lacks ffmpeg.
-            OSError: If it cannot be written.
+            ValueError: If suffix, folder or size is not allowed, or ffmpeg is missing for .mp4.
+            OSError: If the file cannot be written.
         """
         file = Path(path).expanduser()
         try:
@@ -106,12 +108,12 @@ class Film:
         return file
 
     def __repr__(self) -> str:
-        """Says how long and how large it is."""
+        """Return the number of pictures, their size and the duration."""
         height, width = self._shape[:2]
         return f'Film({len(self)} pictures of {width}x{height}, {len(self) / self.fps:.1f} s)'
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: the film itself, in the page, so that it is saved with it."""
+        """Return the film as HTML with embedded data, which a notebook saves with the page."""
         if not self._html:
             buffer = io.BytesIO()
             write_animation(buffer, self, self.fps, '.webp')
@@ -132,20 +134,19 @@ class Film:
 
 
 def film_episode(env: gymnasium.Env[Any, Any], policy: Any, seed: int | None = None) -> Film:
-    """Plays one episode of an environment, and films it.
+    """Play one episode of an environment and return its film.
 
-    One without a time limit does not end an episode: one of this package is filmed for as many
-    steps as its task's have.
+    An environment of this package without a time limit is filmed for `episode_ticks` steps.
 
     Args:
         env: Made with `render_mode='rgb_array'`.
-        policy: An actor or any other model with `predict(observation, deterministic=True)`, as
-            those of Stable-Baselines3 are, or a function from observation to action.
-        seed: Of the reset; None lets the random generator go on.
+        policy: An object with `predict(observation, deterministic=True)`, like the models of
+            Stable-Baselines3, or a function from observation to action.
+        seed: Seed of the reset; None continues the random generator.
 
     Raises:
-        ValueError: If the environment does not render pictures, or the policy is none.
-        RuntimeError: If there is no OpenGL.
+        ValueError: If the environment does not render arrays, or the policy is invalid.
+        RuntimeError: Without OpenGL.
     """
     if not isinstance(env, gymnasium.Env):
         raise ValueError(f'env {env!r:.60}; allowed: an environment, as make(...) gives it')
@@ -180,7 +181,7 @@ def _played(
 
 
 def _most_steps(env: gymnasium.Env[Any, Any]) -> int | None:
-    """Ticks of an episode, where nothing limits an environment of this package; else None."""
+    """Return the steps to film if no wrapper limits an environment of this package, else None."""
     while isinstance(env, gymnasium.Wrapper):
         if isinstance(env, TimeLimit):
             return None

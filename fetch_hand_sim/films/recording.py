@@ -1,4 +1,4 @@
-"""An episode file as frames."""
+"""Read episode files as frames that can be drawn."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from msgs_spec.topics import topic
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One episode, ready to be shown.
+    """One episode of N steps, ready to be drawn.
 
     Attributes:
-        arrays: The episode of N steps as arrays.
-        frames: N + 1.
+        arrays: The episode as arrays.
+        frames: N + 1 frames.
         times: (N + 1,) seconds since the first frame.
         title: Name of the file.
     """
@@ -38,29 +38,29 @@ class Recording:
 
     @property
     def spec(self) -> TaskSpec:
-        """The task."""
+        """The task of the episode."""
         return self.arrays.spec
 
     @property
     def metric(self) -> GoalMetric:
-        """Distances by the rule the episode was logged with."""
+        """The metric with the success rule of the episode."""
         return GoalMetric(self.spec, success_rule=self.arrays.record.success_rule)
 
 
 def load_recording(path: Path) -> Recording:
-    """Reads an episode.
+    """Read an episode.
 
     Raises:
-        EpisodeReadError: If it cannot be read; the message is one line.
+        EpisodeReadError: If the episode cannot be read; the message is one line.
     """
     return recording_of(load_episode(path))
 
 
 def recording_of(arrays: EpisodeArrays) -> Recording:
-    """Adds to an episode what its file holds of how things stood.
+    """Add the joint positions and object poses of the file to an episode.
 
     Raises:
-        EpisodeReadError: If it cannot be read; the message is one line.
+        EpisodeReadError: If a topic cannot be read; the message is one line.
     """
     ticks = len(arrays) + 1
     task = arrays.record.task
@@ -83,9 +83,9 @@ def recording_of(arrays: EpisodeArrays) -> Recording:
 
 
 def _vectors(messages: MessageFile, arrays: EpisodeArrays, name: str) -> Array:
-    """The vectors (N + 1, size) of a topic that every tick has, with the stamp of the tick."""
+    """Return the vectors (N + 1, size) of a topic that has one message per tick."""
     resolved = next((each for each in messages.offsets if each.rpartition('/')[2] == name), name)
-    # Of an episode that was cut off, the last tick may be there in part.
+    # An interrupted episode may contain a part of one more tick.
     stamps = arrays.stamps
     try:
         rows = messages.rows(resolved).data[: len(stamps)]
@@ -100,15 +100,16 @@ def _vectors(messages: MessageFile, arrays: EpisodeArrays, name: str) -> Array:
 def load_recordings(
     path: Path, count: int, on_skip: Callable[[EpisodeReadError], None] | None = None
 ) -> list[Recording]:
-    """Reads the first episodes of a path.
+    """Read the first `count` episodes of a file or folder.
 
     Args:
         path: An episode, or a folder of episodes.
-        count: How many at most.
-        on_skip: Called for what cannot be read, which is left out then; None raises instead.
+        count: Maximum number of episodes.
+        on_skip: Called with the error of each unreadable episode, which is left out; None raises
+            that error.
 
     Raises:
-        EpisodeReadError: If there is none, or with `on_skip` None one cannot be read, else none.
+        EpisodeReadError: If no episode is readable, or with `on_skip=None` one is not.
     """
     recordings: list[Recording] = []
     skipped: list[EpisodeReadError] = []
@@ -130,7 +131,7 @@ def load_recordings(
 
 
 def none_readable(errors: Sequence[EpisodeReadError]) -> EpisodeReadError:
-    """Returns what to raise where each of some episodes, one at least, cannot be read."""
+    """Return one error for the errors of several episodes, at least one."""
     first, *others = errors
     if not others:
         return first
@@ -138,10 +139,10 @@ def none_readable(errors: Sequence[EpisodeReadError]) -> EpisodeReadError:
 
 
 def find_playable(path: Path) -> list[Path]:
-    """Returns the episodes of a path, by name; nothing is read.
+    """Return the episodes of a path, sorted by name, without reading them.
 
     Raises:
-        EpisodeReadError: If there are none.
+        EpisodeReadError: If the path holds no episode.
     """
     paths = expand_episodes(path)
     if not paths:

@@ -15,8 +15,8 @@ from fetch_hand_sim.datasets.lerobot_film import color_statistics
 from fetch_hand_sim.datasets.writing import why_apart
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
 from fetch_hand_sim.episode_log.arrays import load_episode
-from fetch_hand_sim.films.pictures import Studio
 from fetch_hand_sim.films.recording import load_recordings
+from fetch_hand_sim.films.studio import Studio
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from policy_node.training import generate_episodes
 from support.episode_recorder import Recorder

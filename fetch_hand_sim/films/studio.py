@@ -1,4 +1,4 @@
-"""From recordings to pictures: one after the other, or many side by side."""
+"""Draw recordings: one picture after the other, or many episodes side by side."""
 
 from __future__ import annotations
 
@@ -14,20 +14,23 @@ from fetch_hand_sim.simulation.scene import Scene, trail_of
 from msgs_spec.arrays import Picture
 
 _GAP = 2
-# Around a tile whose episode has reached its goal.
+# Colour and width of the edge around a tile whose episode has reached its goal.
 _REACHED = np.array([40, 170, 70], dtype=np.uint8)
-_FRAME = 3
-# Seconds, and sheets, by which stamps may be early.
+_EDGE = 3
+# Tolerance of times, in seconds and in sheets.
 _SAME_TIME = 1e-6
 
 
 class Studio:
     """Draws recordings of any tasks in one size; each model is compiled once.
 
+    The methods that draw raise ValueError if the frame or the camera does not exist, and
+    RuntimeError without OpenGL.
+
     Args:
-        width: Of pictures, pixels.
-        height: Likewise.
-        camera: Of the models, by name; None for the usual view.
+        width: Pixels.
+        height: Pixels.
+        camera: Name of a camera of the model; None for the usual view.
     """
 
     def __init__(self, width: int, height: int, camera: str | None = None) -> None:
@@ -36,48 +39,38 @@ class Studio:
         self._renderers: dict[str, SceneRenderer] = {}
 
     def pictures(self, recording: Recording) -> Iterator[Picture]:
-        """Yields the picture (height, width, 3) of every frame.
-
-        Raises:
-            ValueError: If the model has no such camera.
-            RuntimeError: If there is no OpenGL.
-        """
+        """Yield the picture (height, width, 3) of every frame."""
         for index in range(len(recording.frames)):
             yield self.picture(recording, index)
 
     def picture(self, recording: Recording, index: int) -> Picture:
-        """Returns the picture of one frame; negative indices count from the end.
-
-        Raises:
-            ValueError: If there is no such frame, or the model has no such camera.
-            RuntimeError: If there is no OpenGL.
-        """
+        """Return the picture of one frame; negative indices count from the end."""
         frames, index = recording.frames, self._index(recording, index)
         renderer = self._renderer(recording.spec.name)
         return renderer.render(frames[index], trail_of(frames, index))
 
     def plain(self, recording: Recording, index: int) -> Picture:
-        """Returns the same as a camera would see it: no way of the object, a goal of one colour.
-
-        Raises:
-            ValueError: If there is no such frame, or the model has no such camera.
-            RuntimeError: If there is no OpenGL.
-        """
+        """Return one frame as a camera sees it: without trail and with a goal of one colour."""
         frame = recording.frames[self._index(recording, index)]
         frame = replace(frame, is_success=False)
         return self._renderer(recording.spec.name).render(frame, [])
+
+    def framed(self, recording: Recording, index: int) -> Picture:
+        """Return the picture of one frame, with a green edge if the goal is reached."""
+        picture = self.picture(recording, index)
+        return with_edge(picture) if recording.frames[index].is_success else picture
+
+    def close(self) -> None:
+        """Free OpenGL."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
 
     def _index(self, recording: Recording, index: int) -> int:
         count = len(recording.frames)
         if not -count <= index < count:
             raise ValueError(f'{recording.title}: frame {index}; allowed: {-count} ... {count - 1}')
         return index % count
-
-    def close(self) -> None:
-        """Frees OpenGL."""
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers.clear()
 
     def _renderer(self, task: str) -> SceneRenderer:
         if task not in self._renderers:
@@ -88,13 +81,13 @@ class Studio:
 
 
 def sheet_size(count: int, columns: int, width: int, height: int) -> tuple[int, int]:
-    """Returns width and height of so many pictures of one size side by side."""
+    """Return width and height, pixels, of `count` pictures of one size side by side."""
     rows = -(-count // columns)
     return columns * (width + _GAP) - _GAP, rows * (height + _GAP) - _GAP
 
 
 def tile(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Puts pictures of one size side by side, row by row; what is missing stays white."""
+    """Put pictures of one size side by side, row by row; empty places are white."""
     height, width = pictures[0].shape[:2]
     total_width, total_height = sheet_size(len(pictures), columns, width, height)
     sheet = np.full((total_height, total_width, 3), 255, dtype=np.uint8)
@@ -107,15 +100,13 @@ def tile(pictures: Sequence[Picture], columns: int) -> Picture:
 def grid(
     studio: Studio, recordings: Sequence[Recording], columns: int, hz: float
 ) -> Iterator[Picture]:
-    """Yields all recordings side by side at the same time; those that are over wait at their end.
-
-    A green frame says which of them are at their goal.
+    """Yield sheets of all recordings at the same time; finished episodes show their last frame.
 
     Args:
-        studio: Draws them.
+        studio: Draws the tiles.
         recordings: Of any rates.
-        columns: How many are beside each other.
-        hz: Sheets per second of the episodes.
+        columns: Tiles in a row.
+        hz: Sheets per simulated second.
     """
     shown = [-1] * len(recordings)
     pictures: list[Picture] = [np.zeros(0, np.uint8)] * len(recordings)
@@ -124,25 +115,19 @@ def grid(
             at = count / hz + _SAME_TIME
             index = int(np.searchsorted(recording.times, at, side='right')) - 1
             if index != shown[number]:
-                shown[number], pictures[number] = index, framed(studio, recording, index)
+                shown[number], pictures[number] = index, studio.framed(recording, index)
         yield tile(pictures, columns)
 
 
 def sheets(recordings: Sequence[Recording], hz: float) -> int:
-    """How many sheets `grid` yields: to the end of the longest recording."""
+    """Return the number of sheets that `grid` yields, to the end of the longest recording."""
     longest = max(float(recording.times[-1]) for recording in recordings)
     return 1 + math.ceil(longest * hz - _SAME_TIME)
 
 
-def framed(studio: Studio, recording: Recording, index: int) -> Picture:
-    """Returns the picture of one frame as `grid` shows it."""
-    picture = studio.picture(recording, index)
-    return with_frame(picture) if recording.frames[index].is_success else picture
-
-
-def with_frame(picture: Picture) -> Picture:
-    """Returns a picture with a green frame."""
+def with_edge(picture: Picture) -> Picture:
+    """Return a copy of the picture with a green edge."""
     framed = picture.copy()
-    for edge in (np.s_[:_FRAME], np.s_[-_FRAME:], np.s_[:, :_FRAME], np.s_[:, -_FRAME:]):
+    for edge in (np.s_[:_EDGE], np.s_[-_EDGE:], np.s_[:, :_EDGE], np.s_[:, -_EDGE:]):
         framed[edge] = _REACHED
     return framed
