@@ -1,7 +1,7 @@
 """The command line of `view`.
 
-Exit code 0: ended by the user; 1: no robot, no port, a node that failed; 2: bad usage or an
-unreadable file.
+Exit codes: 0 if the user ends it, 1 without a robot or port or if a node fails, 2 for bad usage or
+an unreadable file.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from node_runtime.command_line import CommandParser, FormerOption, require_extra
 
 _LOOPBACK = '127.0.0.1'
 _NAMESPACE = re.compile(r'(?:[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*)?', re.ASCII)
-# ROS takes 245, with the names of topics and services behind it.
+# ROS allows 245, including the names of topics and services.
 _LONGEST_NAMESPACE = 150
 _DESCRIPTION = (
-    'Shows a running robot, or episode files, on a page in the browser. Without arguments: the '
-    'robot that runs; with --task: starts simulation and actor itself if none does.'
+    'Show a running robot, or episode files, on a page in the browser. Without arguments: the '
+    'running robot. With --task: start simulator and policy if no robot runs. Without --host, '
+    'every user of this machine may command the robot.'
 )
 
 
 def _namespace(text: str) -> str:
-    """Reads a namespace, with or without slashes around it."""
+    """Return a namespace without the slashes around it."""
     inner = text.strip('/')
     if _is_namespace(inner):
         return inner
@@ -43,13 +44,11 @@ def _is_namespace(text: str) -> bool:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Reads the command line; what follows `--ros-args` is kept for ROS."""
+    """Parse the command line; arguments after `--ros-args` are for ROS."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     cut = words.index('--ros-args') if '--ros-args' in words else len(words)
     parser = CommandParser(prog='view', description=_DESCRIPTION)
-    parser.add_argument(
-        'path', nargs='?', type=Path, help='an episode, or a folder of episodes, to play'
-    )
+    parser.add_argument('path', nargs='?', type=Path, help='an episode or folder to play')
     parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='one of the tasks')
     parser.add_argument('--robot', type=_namespace, default='', help='namespace of the robot')
     parser.add_argument('--policy', default='', help='policy to start with --task')
@@ -57,9 +56,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument('--episode-dir', default='', help='log episodes of --task here')
     parser.add_argument('--port', type=int, default=0, help='default: the first free from 8080')
     parser.add_argument(
-        '--host', default=_LOOPBACK, help='listen on another interface than this machine alone'
+        '--host', default=_LOOPBACK, help='interface to listen on; default: this machine only'
     )
-    parser.add_argument('--read-only', action='store_true', help='the page may only watch')
+    parser.add_argument('--read-only', action='store_true', help='the page can watch but not act')
     parser.add_argument(
         '--browser', action=argparse.BooleanOptionalAction, default=True, help='open a browser'
     )
@@ -82,15 +81,15 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _given(options: argparse.Namespace, *names: str) -> str:
-    """Which of these options were given, as they are written."""
+    """Return the given ones of these options, as the user writes them."""
     return ' and '.join(f'--{name.replace("_", "-")}' for name in names if getattr(options, name))
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
+    """Run the command; return its exit code."""
     options = parse(arguments)
     if options.path is not None:
-        from fetch_hand_sim.view.file_session import run_files
+        from fetch_hand_sim.view.player import run_files
 
         return run_command('view', lambda: run_files(options))
     return run_command('view', lambda: _run_live(options))

@@ -1,29 +1,29 @@
-"""Curves of the last seconds: distances, reward, commands and what they move."""
+"""The last seconds of an episode as the page shows them: curves, trail and the newest tick."""
 
 from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
-from fetch_hand_sim.simulation.scene import Frame
-from fetch_hand_sim.view.picture import Graphs, Series
+from fetch_hand_sim.simulation.scene import TRAIL_TICKS, Frame, tracked_position
+from fetch_hand_sim.view.picture import Graphs, Picture, Series
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import TaskSpec
 
-# How far each finger of the Fetch slides, metres (`fetch/robot.xml`).
+# Range of each finger of the Fetch, metres (`fetch/robot.xml`).
 _FINGER_RANGE = 0.05
 
 
 class Curves:
-    """The latest ticks as curves.
+    """Distances, reward, commands and positions of the latest ticks.
 
     Args:
         spec: The task.
-        metric: Measures how far its goals are.
-        length: Ticks that are kept.
-
-    Attributes:
-        metric: As given.
+        metric: Measures the distance to the goal.
+        length: Number of ticks to keep.
     """
 
     def __init__(self, spec: TaskSpec, metric: GoalMetric, length: int = 250) -> None:
@@ -45,15 +45,10 @@ class Curves:
         ]
 
     def add(self, time: float, frame: Frame, reward: float | None, command: Array | None) -> None:
-        """Appends a tick.
-
-        Args:
-            time: Simulated seconds.
-            frame: The tick.
-            reward: Its reward; None at a reset.
-            command: (action size,) what was applied; None at a reset.
-        """
+        """Append a tick at `time`, simulated seconds; a reset has no reward and no command."""
         distance, rotation = self.metric.distances(frame.achieved_goal, frame.desired_goal)
+        # The reference's angle between q and -q is 2 pi; the page shows the shorter way.
+        rotation = np.minimum(rotation, 2.0 * np.pi - rotation)
         nothing = np.full(len(self._commanded), np.nan)
         row = self._rows[self._count % len(self._rows)]
         row[:4] = time, distance, rotation, np.nan if reward is None else reward
@@ -61,7 +56,7 @@ class Curves:
         self._count += 1
 
     def graphs(self) -> Graphs:
-        """What is kept, in the order of time."""
+        """Return copies of the curves, sorted by time."""
         commands = len(self._commanded)
         return Graphs(
             distance=self._series(1) if self._spec.position_counts else None,
@@ -72,11 +67,11 @@ class Curves:
         )
 
     def _positions(self, frame: Frame) -> Array:
-        """What the commands move; the axes of a gripper's path are no joints and stay out."""
+        """Return the joints that the commands drive; NaN for the axes of the gripper's path."""
         joints = frame.joint_position
         positions = np.array([np.nan if i is None else joints[i] for i in self._commanded])
         for index in self._grippers:
-            # From -1 to 1, as the command closes and opens.
+            # From -1 (closed) to 1 (open), like the command.
             positions[index] = 2.0 * np.mean(joints[self._fingers]) / _FINGER_RANGE - 1.0
         return positions
 
@@ -85,3 +80,46 @@ class Curves:
         order = np.arange(max(0, self._count - size), self._count) % size
         rows = self._rows[order]
         return Series(rows[:, 0].copy(), rows[:, columns].copy())
+
+
+class History:
+    """The newest tick of a running robot, its trail and its curves."""
+
+    def __init__(self, spec: TaskSpec, metric: GoalMetric) -> None:
+        self.spec = spec
+        self.picture = Picture(spec.name)
+        self._curves = Curves(spec, metric)
+        self._trail: deque[Array] = deque(maxlen=TRAIL_TICKS)
+
+    @property
+    def success_rule(self) -> str:
+        """The success rule of the curves."""
+        return self._curves.metric.success_rule
+
+    def use_metric(self, metric: GoalMetric) -> None:
+        """Begin new curves with another metric."""
+        self._curves = Curves(self.spec, metric)
+
+    def begin_episode(self) -> None:
+        """Forget the trail of the episode before."""
+        self._trail.clear()
+
+    def add(self, stamp_ns: int, frame: Frame, reward: float | None, command: Array | None) -> None:
+        """Append a tick; curves begin again if its time is before the last one."""
+        if stamp_ns < self.picture.stamp_ns:
+            self.use_metric(self._curves.metric)
+        self._trail.append(tracked_position(frame))
+        self._curves.add(stamp_ns * 1e-9, frame, reward, command)
+        self.picture = Picture(
+            self.spec.name, frame, stamp_ns, trail=tuple(self._trail), command=command
+        )
+
+    def show_goal(self, goal: Array) -> None:
+        """Replace the goal of the newest tick."""
+        if self.picture.frame is not None:
+            frame = replace(self.picture.frame, desired_goal=goal)
+            self.picture = replace(self.picture, frame=frame)
+
+    def graphs(self) -> Graphs:
+        """Return copies of the curves."""
+        return self._curves.graphs()

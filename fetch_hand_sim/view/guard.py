@@ -1,13 +1,15 @@
-"""Who may see the page and who may command from it: rules for every request to the web server.
+"""Access rules of the page: which requests the web server answers, and which visitor is in control.
 
-The viewer that comes with MuJoCo answers anybody, takes models from visitors and lets other sites
-read its answers. This is what stands before it.
+MuJoCo's viewer answers every request, loads models from visitors and lets other sites read its
+answers. `guarded_serve` checks the token, the Host and the Origin of each request before it.
 """
 
 from __future__ import annotations
 
 import hmac
+import math
 import secrets
+import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
@@ -19,60 +21,99 @@ from websockets.asyncio.server import serve
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from fetch_hand_sim.view.attendance import Attendance
-
+# Seconds without input after which the visitor counts as absent. A visible page sends input at
+# every frame of its browser; a hidden, sleeping or disconnected page sends none.
+_SILENCE = 3.0
 _IN_CONTROL = '/ui'
 _SOCKETS = frozenset({_IN_CONTROL, '/state'})
-# Seconds for a farewell to be confirmed.
-_FAREWELL = 3.0
-# Carries the token after the first request. Browsers give all ports of a host the same cookies, so
-# that the port is in the name.
+# Seconds to wait until a visitor confirms the end of a connection.
+_CLOSE_TIMEOUT = 3.0
+# The cookie with the token. Browsers share cookies between all ports of a host, so the name
+# contains the port.
 _COOKIE = 'fetch_hand_sim_view_{port}'
 _FORBIDDEN_PATHS = frozenset({'/drop'})
-# Let other sites read the answers, or load them.
+# Headers that let other sites read or embed the answers.
 _OPENING_HEADERS = ('Access-Control-Allow-Origin', 'Cross-Origin-Resource-Policy')
 _CLOSING_HEADERS = {
-    # A frame of another site could lure clicks onto the page.
+    # In a frame, another site could provoke clicks.
     'X-Frame-Options': 'DENY',
     'Content-Security-Policy': "frame-ancestors 'none'",
     'Cross-Origin-Resource-Policy': 'same-origin',
     'Referrer-Policy': 'no-referrer',
     'X-Content-Type-Options': 'nosniff',
 }
+# The viewer's page has no language, and phones shrink a page without viewport.
+_PAGE_START = (
+    b'<html>\n  <head>',
+    b'<html lang="en">\n  <head>\n'
+    b'    <meta name="viewport" content="width=device-width, initial-scale=1" />',
+)
+
+
+class Attendance:
+    """Records whether a visitor is at the page in control; any thread may call it.
+
+    Args:
+        clock: A steady clock, seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._heard = -math.inf
+        self._visits = self._known_visits = 0
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the visitor in control has sent input within the last seconds."""
+        return self._clock() - self._heard < _SILENCE
+
+    def note(self) -> None:
+        """Record input of the visitor in control."""
+        self._heard = self._clock()
+
+    def end_visit(self) -> None:
+        """Record that the visitor in control has disconnected."""
+        self._heard = -math.inf
+        self._visits += 1
+
+    def has_left(self) -> bool:
+        """Return whether the visitor is absent, or has left since the last call."""
+        visits, before = self._visits, self._known_visits
+        self._known_visits = visits
+        return visits != before or not self.is_there
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address is this machine's own, reachable from nowhere else."""
+    """Return whether a host name or address can only be reached from this machine."""
     try:
         return host == 'localhost' or ip_address(host).is_loopback
     except ValueError:
-        # A name, also one that begins like such an address.
+        # A name, which may begin like an address: 127.0.0.1.evil.example.
         return False
 
 
 def new_token() -> str:
-    """Returns a fresh secret for an address."""
+    """Return a new secret for the address of the page."""
     return secrets.token_urlsafe(16)
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a request is not answered."""
+    """HTTP status and reason of a rejected request."""
 
     status: int
     reason: str
 
 
 class Guard:
-    """Decides about requests.
+    """Accepts or rejects requests.
 
-    Without a token only addresses of this machine are served, so that a name which an attacker
-    points at 127.0.0.1 is not. With a token, whoever has it. A web socket must come from the page
-    itself, never from a page of another site.
+    Without a token, only loopback hosts are accepted: a foreign name that resolves to 127.0.0.1
+    is rejected. With a token, every request needs it. A web socket must come from the page itself.
 
     Args:
-        token: What visitors must show; None for nothing.
-        port: That is listened on; two pages of one host know their visitors apart by it.
+        token: Secret that visitors need; None if only this machine can connect.
+        port: Port of the page, which is part of the cookie's name.
     """
 
     def __init__(self, token: str | None = None, port: int = 0) -> None:
@@ -80,12 +121,7 @@ class Guard:
         self._cookie = _COOKIE.format(port=port)
 
     def refusal(self, target: str, headers: Headers) -> Refusal | None:
-        """Returns why a request is refused, or None.
-
-        Args:
-            target: Path and query.
-            headers: Those of the request.
-        """
+        """Return why a request for `target` (path and query) is rejected, or None."""
         try:
             path = urlsplit(target).path
         except ValueError:
@@ -105,11 +141,11 @@ class Guard:
         return None
 
     def admission(self, target: str) -> str | None:
-        """Returns the cookie for whoever came with the token in the address, or None."""
+        """Return the cookie for a visitor with the token in the address, or None."""
         if self.token is None or not self._matches(parse_qs(urlsplit(target).query).get('token')):
             return None
-        # A strict one would be kept from the redirect that a link in a chat leads to. Sockets, with
-        # which alone one commands, ask for the page's origin besides.
+        # Strict cookies are not sent after a link on another site. Only web sockets can command,
+        # and they need the page's origin too.
         return f'{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax'
 
     def _has_token(self, target: str, headers: Headers) -> bool:
@@ -124,7 +160,7 @@ class Guard:
         return self._matches(given)
 
     def _matches(self, given: Sequence[str] | None) -> bool:
-        # Bytes that are no text come as lone surrogates.
+        # Invalid UTF-8 arrives as lone surrogates.
         words = [each.encode('utf-8', 'surrogatepass') for each in given or ()]
         return any(hmac.compare_digest(each, (self.token or '').encode()) for each in words)
 
@@ -146,11 +182,11 @@ def _is_same_origin(origins: Sequence[str], host: str) -> bool:
 
 
 def guarded_serve(guard: Guard, attendance: Attendance) -> Callable[..., Any]:
-    """Returns `websockets.serve` with a guard before it.
+    """Return a replacement of `websockets.serve` that asks the guard about each request.
 
     Args:
-        guard: Decides about requests.
-        attendance: Hears of all that the page in control sends.
+        guard: Accepts or rejects requests.
+        attendance: Records input and departure of the visitor in control.
     """
 
     def guarded(handler: Any, **options: Any) -> Any:
@@ -163,7 +199,7 @@ def guarded_serve(guard: Guard, attendance: Attendance) -> Callable[..., Any]:
                 return _answer(refusal.status, refusal.reason)
             cookie = guard.admission(request.path)
             if cookie is not None:
-                # Away from the address that holds the token, so that nobody copies it by chance.
+                # Redirect, so that the address with the token is not copied by accident.
                 return _answer(303, 'welcome', {'Set-Cookie': cookie, 'Location': '/'})
             answer: Response | None = process_request(connection, request)
             return answer
@@ -175,6 +211,8 @@ def guarded_serve(guard: Guard, attendance: Attendance) -> Callable[..., Any]:
                     del changed.headers[name]
             for name, value in _CLOSING_HEADERS.items():
                 changed.headers[name] = value
+            if changed.headers.get('Content-Type', '').startswith('text/html'):
+                _name_language(changed)
             return changed
 
         attended = _attended(handler, attendance)
@@ -183,29 +221,47 @@ def guarded_serve(guard: Guard, attendance: Attendance) -> Callable[..., Any]:
     return guarded
 
 
+def _name_language(response: Response) -> None:
+    """Add the language and the viewport to the page."""
+    response.body = bytes(response.body or b'').replace(*_PAGE_START, 1)
+    del response.headers['Content-Length']
+    response.headers['Content-Length'] = str(len(response.body))
+
+
 def _attended(handler: Any, attendance: Attendance) -> Callable[[Any], Awaitable[None]]:
-    """A handler of web sockets that tells what is heard, and takes leave in time."""
+    """Return a handler of web sockets that records attendance and closes in time."""
 
     async def handle(connection: Any) -> None:
-        # A browser that hangs confirms no farewell, and whoever takes over would wait for it.
-        connection.close_timeout = _FAREWELL
-        if urlsplit(connection.request.path).path == _IN_CONTROL:
-            _listen(connection, attendance)
-        await handler(connection)
+        # A browser that hangs does not confirm the end, and the next visitor would wait for it.
+        connection.close_timeout = _CLOSE_TIMEOUT
+        if urlsplit(connection.request.path).path != _IN_CONTROL:
+            await handler(connection)
+            return
+        heard = _note_input(connection, attendance)
+        try:
+            await handler(connection)
+        finally:
+            # A second browser is rejected before it sends anything: it was never in control.
+            if heard():
+                attendance.end_visit()
 
     return handle
 
 
-def _listen(connection: Any, attendance: Attendance) -> None:
-    """Notes what a connection receives; iterating over it calls `recv`, too."""
-    receive = connection.recv
+def _note_input(connection: Any, attendance: Attendance) -> Callable[[], bool]:
+    """Record what a connection receives; returns a function that tells whether it received any."""
+    receive, has_received = connection.recv, False
 
+    # Iteration over the connection calls `recv` too.
     async def recv(*arguments: Any, **options: Any) -> Any:
+        nonlocal has_received
         message = await receive(*arguments, **options)
+        has_received = True
         attendance.note()
         return message
 
     connection.recv = recv
+    return lambda: has_received
 
 
 def _answer(status: int, text: str, headers: dict[str, str] | None = None) -> Response:

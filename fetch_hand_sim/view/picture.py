@@ -1,6 +1,6 @@
-"""What the page is told: everything that it shows of one tick.
+"""Messages from the source to the page: everything that the page shows of one tick.
 
-Snapshots are replaced by newer ones, events all arrive (`mujoco.studio.messages`).
+A newer snapshot replaces an older one; every event arrives (`mujoco.studio.messages`).
 """
 
 from __future__ import annotations
@@ -12,36 +12,30 @@ from mujoco.studio import messages
 from fetch_hand_sim.simulation.scene import Frame, Scene
 from msgs_spec.arrays import Array
 
-# Where nobody may act.
-ONLY_WATCHED = 'this page may only watch (--read-only)'
+ONLY_WATCHED = 'this page can only watch (--read-only)'
 
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What the page says in words.
+    """What the page shows as text.
 
     Attributes:
         source: `live` or `file`.
-        phase: Of the episode.
-        episode: Its number.
-        seed: Its seed.
-        tick: Steps of it so far.
-        ticks: Steps it will have.
-        episode_return: Sum of its rewards.
-        commander: Who commands.
-        is_paused: Whether time stands still.
-        speed: Simulated seconds per second, asked for; 0 for as fast as possible.
-        has_speed: Whether that can be chosen; in lockstep commands say how fast time goes.
-        rate: Ticks per second, measured; 0 if unknown.
+        tick: Steps of the episode so far.
+        ticks: Steps of a whole episode.
+        commander: Names of the nodes that command.
+        speed: Requested simulated seconds per second; 0 means as fast as possible.
+        has_speed: Whether the speed can be chosen; not in lockstep.
+        rate: Measured ticks per second; 0 if unknown.
         missed_ticks: Since the robot started.
-        push_limit: Largest force of a push, N; 0 where the robot takes none.
-        may_command: Whether this page may act at all.
-        actors: Actors to choose from; empty where there is no policy.
-        actor: The one of these that acts, the file of another one, or '' if unknown.
-        is_replay: Whether what is live is the replay of an episode.
-        is_silent: Whether nothing is heard of the robot any more; all else is what it said last.
-        is_commanding: Whether the page sends commands.
-        notice: What the last action led to.
+        push_limit: Largest force of a push, N; 0 if the robot accepts none.
+        may_command: Whether this page can act at all.
+        actors: Actors to choose from; empty without a policy node.
+        actor: Name or file of the active actor, or '' if unknown.
+        is_replay: Whether a replay node publishes instead of a robot.
+        is_silent: Whether the robot publishes nothing any more; the other facts are its last ones.
+        is_commanding: Whether the sliders of the page command.
+        notice: Result of the last action.
     """
 
     source: str = 'live'
@@ -68,7 +62,7 @@ class Facts:
 
     @property
     def takes_actions(self) -> bool:
-        """Whether there is a robot that does what this page asks for."""
+        """Whether this page can move goals and robot."""
         return self.source == 'live' and self.may_command and not self.is_replay
 
 
@@ -80,22 +74,21 @@ class Series:
     values: Array
 
     def until(self, time: float) -> Series:
-        """The curve up to a time."""
+        """Return the part up to a time."""
         known = self.times <= time + 1e-9
         return Series(self.times[known], self.values[known])
 
 
 @dataclass(frozen=True, slots=True)
 class Graphs:
-    """The curves of the page; None for what the task does not have.
+    """The curves of the page; None if the task does not have them.
 
     Attributes:
         distance: To the goal, m.
-        rotation: To the goal, rad.
-        reward: Of each tick.
-        commands: One column per command: (ticks,) times and (ticks, commands) values.
-        positions: The joints that the commands drive, likewise; how far a gripper is open, from -1
-            to 1; NaN for its path.
+        rotation: To the goal, rad, 0 ... pi.
+        commands: Values (ticks, commands).
+        positions: Values (ticks, commands) of the joints that the commands drive. A gripper is -1
+            (closed) to 1 (open); the axes of its path are NaN.
     """
 
     distance: Series | None = None
@@ -105,22 +98,22 @@ class Graphs:
     positions: Series | None = None
 
     def until(self, time: float) -> Graphs:
-        """The curves up to a time."""
+        """Return the parts up to a time."""
         series = (getattr(self, each.name) for each in fields(self))
         return Graphs(*(each.until(time) if each is not None else None for each in series))
 
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """Where a file is being played.
+    """Position of the playhead in a file, and of the file in its list.
 
     Attributes:
         index: Frame shown, from 0.
-        frames: How many there are.
-        time: Seconds since the first.
+        frames: Number of frames.
+        time: Seconds since the first frame.
         title: Name of the episode.
-        number: Which one of the list, from 0.
-        count: How many there are in the list.
+        number: Position in the list, from 0.
+        count: Length of the list.
     """
 
     index: int
@@ -133,17 +126,15 @@ class Timeline:
 
 @dataclass(frozen=True, eq=False)
 class Picture(messages.Snapshot):
-    """Everything the page shows of one tick.
+    """Everything that the page shows of one tick.
 
     Attributes:
         task: Name of the task.
         frame: Robot, object and goals; None before the first tick.
         stamp_ns: Simulated time of the frame, nanoseconds.
-        trail: Where the object or gripper was before.
-        facts: In words.
-        graphs: What it did before, as curves.
+        trail: Earlier positions (3,) of the object or gripper.
         command: The last applied command.
-        timeline: Where a file is being played; None for a running robot.
+        timeline: Only for a file.
     """
 
     task: str
@@ -158,6 +149,6 @@ class Picture(messages.Snapshot):
 
 @dataclass(frozen=True, eq=False)
 class ShowScene(messages.Event):
-    """The page shows another robot from now on."""
+    """Makes the page show another robot."""
 
     scene: Scene

@@ -1,7 +1,8 @@
-"""Plays episode files: a playhead over the frames of one of them, and the list they come from."""
+"""Play episode files on a page, without ROS."""
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from fetch_hand_sim.episode_log import EpisodeReadError
-from fetch_hand_sim.films.recording import load_recording, none_readable
+from fetch_hand_sim.films.recording import find_playable, load_recording, none_readable
 from fetch_hand_sim.simulation.scene import trail_of
 from fetch_hand_sim.view.curves import Curves
+from fetch_hand_sim.view.page.page import Page
 from fetch_hand_sim.view.picture import ONLY_WATCHED, Facts, Picture, Timeline
 from fetch_hand_sim.view.requests import (
     ChangeEpisode,
@@ -23,21 +25,53 @@ from fetch_hand_sim.view.requests import (
     SetSpeed,
     StepOnce,
 )
+from fetch_hand_sim.view.session import Requests, Session
+from fetch_hand_sim.view.web import FrameRate, announce, open_page
+from node_runtime.command_line import EXIT_SUCCESS, UsageError
+from node_runtime.node_main import StopSignals
 
-# Seconds the last frame stays before the episode starts again.
+# Seconds for which the last frame stays before the episode starts again.
 _PAUSE_AT_END = 1.0
+_FRAME_TIME = 1.0 / 60.0
+
+
+def run_files(options: argparse.Namespace) -> int:
+    """Play files until the user ends it; return the exit code.
+
+    Raises:
+        UsageError: If no episode can be played.
+        CannotServe: If the page cannot be served.
+    """
+    stop = StopSignals()
+    try:
+        paths = find_playable(options.path)
+        player = Player(paths, may_act=not options.read_only)
+    except EpisodeReadError as error:
+        raise UsageError(str(error)) from None
+    plugins = [Page(tuple(paths)), Requests(player.perform)]
+    handle, address = open_page(
+        options.host, options.port, plugins, FrameRate(), is_read_only=options.read_only
+    )
+    with handle:
+        if not stop:
+            announce(address, options.browser)
+        session = Session(handle, player)
+        while not stop:
+            session.update()
+            time.sleep(_FRAME_TIME)
+    return EXIT_SUCCESS
 
 
 class Player:
-    """Shows one frame after the other, as fast as asked for.
+    """Moves a playhead over the frames of one episode of a list.
 
     Args:
         paths: Episodes, at least one.
         clock: A steady clock, seconds.
-        may_act: Whether the page may stop, seek and choose.
+        may_act: Whether the page may pause, seek and choose.
 
     Raises:
-        EpisodeReadError: If none can be read.
+        EpisodeReadError: If no episode can be read.
     """
 
     def __init__(
@@ -60,13 +94,13 @@ class Player:
 
     @property
     def index(self) -> int:
-        """The frame at the playhead."""
+        """The index of the frame at the playhead."""
         times = self._recording.times
         last = int(np.searchsorted(times, self._position + 1e-9, side='right')) - 1
         return min(max(last, 0), len(times) - 1)
 
     def picture(self) -> Picture | None:
-        """Moves the playhead; returns what to show if that has changed."""
+        """Move the playhead; return what to show if it has changed."""
         self._advance()
         now = (self._number, self.index, self._is_paused, self._speed, self._notice)
         if now == self._shown:
@@ -75,7 +109,7 @@ class Player:
         return self._make_picture()
 
     def perform(self, request: Request | LatestRequest) -> None:
-        """Plays as the page asks for, unless it may only watch."""
+        """Do what the page asks for, unless it may only watch."""
         if not self._may_act:
             self._notice = ONLY_WATCHED
             return
@@ -105,7 +139,7 @@ class Player:
         self._position = float(self._recording.times[min(max(index, 0), last)])
 
     def _open_first(self) -> None:
-        """Opens the first episode that can be read."""
+        """Open the first readable episode."""
         skipped: list[EpisodeReadError] = []
         for number in range(len(self._paths)):
             try:
@@ -120,7 +154,7 @@ class Player:
         raise none_readable(skipped)
 
     def _change(self, by: int) -> None:
-        """Opens the next episode that can be read; says so if none is left, and stays."""
+        """Open the next readable episode; stay, with a notice, if there are no more."""
         number, skipped = self._number, ''
         for _ in self._paths:
             number = (number + by) % len(self._paths)
@@ -134,7 +168,7 @@ class Player:
         self._notice = f'no episode can be read any more; {skipped}'
 
     def _choose(self, number: int) -> None:
-        """Opens an episode, or says why not and stays."""
+        """Open an episode; stay, with a notice, if it is unreadable."""
         if not 0 <= number < len(self._paths):
             return
         try:

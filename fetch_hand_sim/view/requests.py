@@ -1,6 +1,6 @@
-"""What the page asks for, of a running robot or of a file.
+"""Messages from the page to the source: what a visitor asks for.
 
-Snapshots are replaced by newer ones, events all arrive (`mujoco.studio.messages`).
+A newer snapshot replaces an older one; every event arrives (`mujoco.studio.messages`).
 """
 
 from __future__ import annotations
@@ -13,37 +13,37 @@ from msgs_spec.arrays import Array
 
 
 class Request(messages.Event):
-    """What the page asks for, once."""
+    """A request that is sent once."""
 
 
 class LatestRequest(messages.Snapshot):
-    """What the page asks for again and again; only the newest counts."""
+    """A request that is sent repeatedly; only the newest counts."""
 
 
 @dataclass(frozen=True)
 class SetPaused(Request):
-    """Stops time or lets it go on."""
+    """Pauses or resumes."""
 
     is_paused: bool
 
 
 @dataclass(frozen=True)
 class StepOnce(Request):
-    """Runs one tick, or shows the next frames of a file (negative: earlier ones)."""
+    """Runs one tick, or moves the playhead of a file by `frames`."""
 
     frames: int = 1
 
 
 @dataclass(frozen=True)
 class Reset(Request):
-    """Ends the episode; the next one has this seed, or the next in order for None."""
+    """Ends the episode; the next one uses `seed`, or the next seed in order for None."""
 
     seed: int | None = None
 
 
 @dataclass(frozen=True)
 class SetSpeed(Request):
-    """Changes the simulated seconds per second."""
+    """Sets the simulated seconds per second."""
 
     factor: float
 
@@ -57,26 +57,21 @@ class ChooseActor(Request):
 
 @dataclass(frozen=True)
 class SetCommanding(Request):
-    """Lets the page's sliders command, or no longer."""
+    """Switches the commands of the page's sliders on or off."""
 
     is_commanding: bool
 
 
 @dataclass(frozen=True, eq=False)
 class SetCommand(LatestRequest):
-    """The sliders' command (action size,), command units."""
+    """The command (action size,) of the sliders, command units."""
 
     values: Array
 
 
 @dataclass(frozen=True, eq=False)
 class SetGoal(LatestRequest):
-    """A new goal (goal size,).
-
-    Attributes:
-        values: m and quaternion wxyz.
-        is_kept: Whether later episodes get it as well.
-    """
+    """A new goal (goal size,), m and quaternion wxyz; `is_kept` repeats it in later episodes."""
 
     values: Array
     is_kept: bool = True
@@ -89,11 +84,9 @@ class ReleaseGoal(Request):
 
 @dataclass(frozen=True, eq=False)
 class Push(LatestRequest):
-    """A pull at a body, as long as it is sent; what is beyond the robot's limit is made less.
+    """A wrench (6,) on a body, N and N m, world axes at the centre of mass, while it is sent.
 
-    Attributes:
-        body: Name of the body.
-        wrench: (6,) N and N m, world axes, at the centre of mass.
+    A force above the robot's limit is reduced.
     """
 
     body: str

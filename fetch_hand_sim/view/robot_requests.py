@@ -1,4 +1,4 @@
-"""What the page asks of a running robot: topics, services and parameters that anybody may use."""
+"""Pass on what the page asks of a running robot, over public topics, services and parameters."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ import numpy as np
 from rclpy.node import Node
 
 from fetch_hand_sim.episodes.perturbations import bounded_wrench
-from fetch_hand_sim.view.remote_node import RemoteNode
-from fetch_hand_sim.view.replay_watch import Replay
 from fetch_hand_sim.view.requests import (
     ChooseActor,
     LatestRequest,
@@ -27,6 +25,7 @@ from fetch_hand_sim.view.requests import (
     SetSpeed,
     StepOnce,
 )
+from fetch_hand_sim.view.robot_watch import Replay
 from msgs_spec.arrays import Array
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_message
@@ -34,23 +33,132 @@ from msgs_spec.schemas import serialize
 from msgs_spec.services import PAUSE
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
-from node_runtime.ros import rclpy_profile, ros_message_class
+from node_runtime.ros import rclpy_profile, ros_message_class, ros_service_class
 
-# Seconds a goal is shown before the robot confirms it.
-_GOAL_PATIENCE = 0.5
-# What a replay can do, and what is the page's own affair.
+_SET_PARAMETERS = 'rcl_interfaces/srv/SetParameters'
+_GET_PARAMETERS = 'rcl_interfaces/srv/GetParameters'
+_TRIGGER = 'std_srvs/srv/Trigger'
+# Seconds to wait for the answer of a node before it is asked again.
+_ANSWER_TIMEOUT = 3.0
+# Seconds for which a new goal is shown before the robot confirms it.
+_GOAL_TIMEOUT = 0.5
 _OF_A_REPLAY = (SetPaused, SetSpeed, SetCommanding)
 
 
-class RobotRequests:
-    """Passes on what the page asks for to the nodes in the namespace of ours.
+class RemoteNode:
+    """Calls services and sets parameters of another node without waiting for it.
 
     Args:
-        node: Of this process.
-        tell: Gets changed fields of `Facts`, by name.
+        node: The node of this process.
+        name: Name of the other node, relative to our namespace or fully qualified.
+        notice: Called with one line about the result of a call.
+    """
+
+    def __init__(self, node: Node, name: str, notice: Callable[[str], None]) -> None:
+        self._node = node
+        self._name = name
+        self._notice = notice
+        self._clients: dict[str, Any] = {}
+        self._asked: dict[str, tuple[Any, float]] = {}
+
+    def is_there(self) -> bool:
+        """Return whether the node offers its services."""
+        return bool(self._client('set_parameters', _SET_PARAMETERS).service_is_ready())
+
+    def call(
+        self,
+        service: str,
+        type_name: str,
+        then: Callable[[], None] | None = None,
+        **fields: Any,
+    ) -> None:
+        """Call a service whose response has `success` and `message`, and `then` on success."""
+
+        def answered(response: Any) -> None:
+            self._notice(response.message)
+            if response.success and then is not None:
+                then()
+
+        self._call(service, type_name, fields, answered)
+
+    def get_parameter(self, name: str, then: Callable[[Any], None]) -> None:
+        """Call `then` with the value of a parameter when the node answers, if it has one."""
+        from rclpy.parameter import parameter_value_to_python
+
+        def answered(future: Any) -> None:
+            values = [parameter_value_to_python(each) for each in future.result().values]
+            for value in values:
+                if value is not None:
+                    then(value)
+
+        client = self._client('get_parameters', _GET_PARAMETERS)
+        if client.service_is_ready() and not self._awaits(name):
+            request = ros_service_class(_GET_PARAMETERS).Request(names=[name])
+            future = client.call_async(request)
+            self._asked[name] = future, time.monotonic()
+            future.add_done_callback(answered)
+
+    def set_parameter(
+        self, name: str, value: str | int | float, then: Callable[[], None] | None = None
+    ) -> None:
+        """Set a parameter, and call `then` if the node accepts it."""
+        from rclpy.parameter import Parameter
+
+        def answered(response: Any) -> None:
+            result = response.results[0]
+            if not result.successful:
+                self._notice(f'{self._name} refuses {name}: {result.reason}')
+            elif then is not None:
+                then()
+            else:
+                self._notice(f'{name}: {value}')
+
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        self._call('set_parameters', _SET_PARAMETERS, {'parameters': [parameter]}, answered)
+
+    def close(self) -> None:
+        """Destroy the clients; pending answers are dropped."""
+        for client in self._clients.values():
+            self._node.destroy_client(client)
+        self._clients.clear()
+        self._asked.clear()
+
+    def _awaits(self, name: str) -> bool:
+        """Return whether an answer may still arrive: requests pile up in a node that hangs."""
+        future, asked = self._asked.get(name, (None, 0.0))
+        is_recent = time.monotonic() - asked < _ANSWER_TIMEOUT
+        return future is not None and not future.done() and is_recent
+
+    def _call(
+        self,
+        service: str,
+        type_name: str,
+        fields: dict[str, Any],
+        answered: Callable[[Any], None],
+    ) -> None:
+        client = self._client(service, type_name)
+        if not client.service_is_ready():
+            self._notice(f'{self._name} does not answer')
+            return
+        request = ros_service_class(type_name).Request(**fields)
+        client.call_async(request).add_done_callback(lambda future: answered(future.result()))
+
+    def _client(self, service: str, type_name: str) -> Any:
+        if service not in self._clients:
+            name = service if service.startswith('/') else f'{self._name}/{service}'
+            self._clients[service] = self._node.create_client(ros_service_class(type_name), name)
+        return self._clients[service]
+
+
+class RobotRequests:
+    """Passes on what the page asks for to the nodes in our namespace.
+
+    Args:
+        node: The node of this process.
+        tell: Called with changed fields of `Facts`, by name.
 
     Attributes:
-        push_limit: Largest force that the robot takes, N; 0 for none.
+        push_limit: Largest force that the robot accepts, N; 0 for none.
     """
 
     def __init__(self, node: Node, tell: Callable[..., None]) -> None:
@@ -65,28 +173,16 @@ class RobotRequests:
         self._kept_goal: Array | None = None
         self._asked_goal: tuple[float, Array] | None = None
         self._publishers: dict[str, Any] = {}
-        self._actions: dict[type, Callable[[Any], None]] = {
-            SetPaused: self._pause,
-            StepOnce: self._step,
-            Reset: self._reset,
-            SetSpeed: self._set_speed,
-            ChooseActor: self._choose_actor,
-            SetGoal: self._set_goal,
-            ReleaseGoal: self._release_goal,
-            SetCommanding: self._set_commanding,
-            SetCommand: self._command,
-            Push: self._push,
-        }
 
     @property
     def has_policy(self) -> bool:
-        """Whether there is a policy to talk to."""
+        """Whether a policy node runs."""
         return self._policy.is_there()
 
     def take_task(self, spec: TaskSpec) -> None:
-        """Takes the task of the robot; what was asked of another one is forgotten."""
+        """Take the task of the robot; requests to a robot of another task end."""
         if self._spec is not None and self._spec.name != spec.name:
-            self._kept_goal = self._asked_goal = None
+            self.forget_goal()
             # Goals of another task may have another type.
             for name in list(self._publishers):
                 self._withdraw(name)
@@ -94,8 +190,12 @@ class RobotRequests:
             self._tell(is_commanding=False)
         self._spec = spec
 
+    def forget_goal(self) -> None:
+        """Forget the goal that the page has set."""
+        self._kept_goal = self._asked_goal = None
+
     def take_replay(self, replay: Replay | None) -> None:
-        """Takes who replays where a robot would be, or None: it is asked instead of the robot."""
+        """Send requests to a replay node from now on, or to the robot for None."""
         if self._replay is not None:
             self._replay[1].close()
         self._replay = None
@@ -103,100 +203,105 @@ class RobotRequests:
             self._replay = replay, RemoteNode(self._node, replay.name, self._notice)
 
     def begin_episode(self) -> None:
-        """Sends an episode that has begun the goal that people keep."""
+        """Send the kept goal to a new episode."""
         if self._kept_goal is not None and self._replay is None:
             self._send_goal(self._kept_goal)
 
     def read_speed(self) -> None:
-        """Asks how fast time shall go; the answer is told when it comes."""
+        """Ask for the requested speed; `tell` gets the answer."""
         self._time.get_parameter(self._speed_name, lambda value: self._tell(speed=value))
 
     def read_actor(self) -> None:
-        """Asks who acts; the answer is told when it comes."""
+        """Ask for the active actor; `tell` gets the answer."""
         if self._spec is not None:
-            # Without a name it is the one that comes with the task.
+            # An empty parameter means the shipped actor of the task.
             shipped = self._spec.name
             self._policy.get_parameter('policy', lambda name: self._tell(actor=name or shipped))
 
     def perform(self, request: Request | LatestRequest) -> None:
-        """Does what the page asks for; what only files understand is nothing to a robot."""
-        action = self._actions.get(type(request))
-        if action is None or self._spec is None or not self.fits(request):
+        """Do what the page asks for; requests about files are ignored."""
+        if self._spec is None or not self.fits(request):
             return
         if self._replay is not None and not isinstance(request, _OF_A_REPLAY):
-            self._notice('a replay stops, goes on and changes its speed, no more')
+            self._notice('a replay can only be paused and change its speed')
             return
-        action(request)
+        match request:
+            case SetPaused() | StepOnce() | Reset() | SetSpeed():
+                self._control_time(request)
+            case ChooseActor():
+                taken = partial(self._tell, actor=request.name, notice=f'policy: {request.name}')
+                self._policy.set_parameter('policy', request.name, taken)
+            case SetGoal():
+                self._kept_goal = request.values if request.is_kept else None
+                self._send_goal(request.values)
+            case ReleaseGoal():
+                self._kept_goal = None
+                self._notice('the next episode draws its own goal')
+            case SetCommanding():
+                self._set_commanding(request.is_commanding)
+            case SetCommand() if self._is_commanding:
+                self._publish('commands', request.values)
+            case Push():
+                self._push(request)
+
+    def _control_time(self, request: SetPaused | StepOnce | Reset | SetSpeed) -> None:
+        match request:
+            case SetPaused():
+                self._pause(request.is_paused)
+            case StepOnce():
+                self._sim.call('step', _TRIGGER)
+            case Reset():
+                self._reset(request.seed)
+            case SetSpeed():
+                self._set_speed(float(request.factor))
 
     def fits(self, request: Request | LatestRequest) -> bool:
-        """Whether it has the size that the robot of now takes; there may have been another."""
+        """Return whether a goal or command has the size that the current robot needs."""
         if self._spec is None or not isinstance(request, SetGoal | SetCommand):
             return True
         name = 'set_goal' if isinstance(request, SetGoal) else 'commands'
         return request.values.size == topic(self._spec, name).size
 
     def shown_goal(self, goal: Array) -> Array:
-        """The goal (goal size,) the page asked for a moment ago, or the robot's."""
+        """Return the goal (goal size,) that the page has just set, else the robot's goal."""
         if self._asked_goal is not None:
             at, asked = self._asked_goal
-            if time.monotonic() - at < _GOAL_PATIENCE and not np.allclose(goal, asked):
+            if time.monotonic() - at < _GOAL_TIMEOUT and not np.allclose(goal, asked):
                 return asked
             self._asked_goal = None
         return goal
 
     @property
     def _time(self) -> RemoteNode:
-        """The node that makes time go on."""
+        """The node that controls time."""
         return self._sim if self._replay is None else self._replay[1]
 
     @property
     def _speed_name(self) -> str:
         return 'real_time_factor' if self._replay is None else 'rate'
 
-    def _pause(self, request: SetPaused) -> None:
+    def _pause(self, is_paused: bool) -> None:
         service = 'pause' if self._replay is None else self._replay[0].pause
-        paused = partial(self._tell, is_paused=request.is_paused)
-        self._time.call(service, PAUSE.type_name, paused, data=request.is_paused)
+        paused = partial(self._tell, is_paused=is_paused)
+        self._time.call(service, PAUSE.type_name, paused, data=is_paused)
 
-    def _step(self, request: StepOnce) -> None:
-        del request
-        self._sim.call('step', 'std_srvs/srv/Trigger')
-
-    def _reset(self, request: Reset) -> None:
-        reset = partial(self._sim.call, 'reset', 'std_srvs/srv/Trigger')
-        if request.seed is None:
+    def _reset(self, seed: int | None) -> None:
+        reset = partial(self._sim.call, 'reset', _TRIGGER)
+        if seed is None:
             reset()
         else:
-            # The seed holds for the next episode, so it has to be there first.
-            self._sim.set_parameter('seed', request.seed, reset)
+            # The seed is for the next episode, so set it before the reset.
+            self._sim.set_parameter('seed', seed, reset)
 
-    def _set_speed(self, request: SetSpeed) -> None:
-        factor = float(request.factor)
+    def _set_speed(self, factor: float) -> None:
         taken = partial(self._tell, speed=factor, notice=f'{self._speed_name}: {factor:g}')
         self._time.set_parameter(self._speed_name, factor, taken)
 
-    def _choose_actor(self, request: ChooseActor) -> None:
-        taken = partial(self._tell, actor=request.name, notice=f'policy: {request.name}')
-        self._policy.set_parameter('policy', request.name, taken)
-
-    def _set_goal(self, request: SetGoal) -> None:
-        self._kept_goal = request.values if request.is_kept else None
-        self._send_goal(request.values)
-
-    def _release_goal(self, request: ReleaseGoal) -> None:
-        del request
-        self._kept_goal = None
-        self._notice('the next episode draws its own goal')
-
-    def _set_commanding(self, request: SetCommanding) -> None:
-        self._is_commanding = request.is_commanding
-        self._tell(is_commanding=request.is_commanding)
-        if not request.is_commanding:
+    def _set_commanding(self, is_commanding: bool) -> None:
+        self._is_commanding = is_commanding
+        self._tell(is_commanding=is_commanding)
+        if not is_commanding:
             self._withdraw('commands')
-
-    def _command(self, request: SetCommand) -> None:
-        if self._is_commanding:
-            self._publish('commands', request.values)
 
     def _push(self, request: Push) -> None:
         assert self._spec is not None
@@ -215,7 +320,7 @@ class RobotRequests:
 
     def _publish(self, name: str, values: Array) -> None:
         assert self._spec is not None
-        # Without a stamp a goal is for the episode that runs when it arrives.
+        # A goal without stamp is for the episode that runs when it arrives.
         self._send(name, TopicCodec(topic(self._spec, name)).encode(0, values))
 
     def _send(self, name: str, data: bytes) -> None:
@@ -228,7 +333,7 @@ class RobotRequests:
         self._publishers[name].publish(data)
 
     def _withdraw(self, name: str) -> None:
-        """Leaves a topic: who publishes commands counts as a commander."""
+        """Destroy a publisher: a publisher of commands counts as a commander."""
         publisher = self._publishers.pop(name, None)
         if publisher is not None:
             self._node.destroy_publisher(publisher)

@@ -1,18 +1,18 @@
-"""Follows a robot over its topics: what it does, and every tick as one piece.
+"""Follow a robot, or a replay of one, over its topics; assemble each tick from its messages.
 
-It is one subscriber among others, in a process of its own. State comes best effort, so that a
-viewer that hangs leaves nothing for the robot to send again.
+Subscriptions are best effort, so the robot never sends a message again to a viewer that hangs.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 
 from fetch_hand_sim.simulation.scene import Frame
 from msgs_spec.arrays import Array
@@ -21,40 +21,44 @@ from msgs_spec.codecs import decode_status
 from msgs_spec.latest_tick import split_messages
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.schemas import deserialize
+from msgs_spec.services import PAUSE, RESET
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import LATEST_TICK, QosSpec, TopicSpec, topic
-from node_runtime.ros import count_publishers, rclpy_profile, ros_message_class
+from node_runtime.ros import count_publishers, full_name, rclpy_profile, ros_message_class
 
-# Nothing is sent twice for a viewer.
+# QoS of a viewer.
 WATCHING = QosSpec(depth=5, reliability='best_effort', durability='volatile')
-# For every tick: two seconds of a robot at 25 Hz, should the viewer get no processor so long.
+# QoS for every tick: two seconds at 25 Hz.
 _FOLLOWING = replace(WATCHING, depth=50)
 ANY_TASK = next(iter(TASKS.values()))
-# What a tick consists of, as it is published. The first step leads to the first reward and command:
-# `episode_status` is the last that is said of the tick before it.
+# Topics of a tick in the order of publication. A reset has no reward and no command.
 _FIRST, _LAST = 'joint_states', 'applied_command'
 _NEEDED = (_FIRST, 'desired_goal', 'achieved_goal', 'is_success')
 _STATE = (*_NEEDED, 'reward', _LAST)
-# Seconds between leaving the topics of a robot and subscribing to those of another: until a topic
-# is let go of, which the executor does after the callback, it cannot have another type.
+# Seconds between the end of a robot's subscriptions and those to another robot. The executor
+# removes the old ones after the callback; until then a topic cannot have another type.
 _CHANGE_TIME = 0.2
-# What a codec says of messages without one.
+# Stamp of messages without one.
 _NO_STAMP = 0
-# Seconds between two looks at whether there is `latest_tick`.
+# Seconds between two looks for a publisher of `latest_tick`.
 _CHOICE_PERIOD = 0.5
+# Seconds over which the ticks of a replay are counted.
+_COUNT_PERIOD = 1.0
+# Looks after which a tick was certainly published after the pause.
+_SETTLED = 2
 
 
 @dataclass(frozen=True, slots=True)
 class SeenTick:
-    """What a robot said at one tick.
+    """One tick of a robot.
 
     Attributes:
         stamp_ns: Simulated time, nanoseconds.
-        frame: Where robot, object and goals are.
-        reward: Of the tick; None at a reset.
-        command: (action size,) what was applied, command units; None at a reset.
-        status: Of the episode at this tick; None where that did not come along.
+        frame: Robot, object and goals.
+        reward: None at a reset.
+        command: (action size,) applied command; None at a reset.
+        status: Status of the episode at this tick; None if it was not published together.
     """
 
     stamp_ns: int
@@ -68,14 +72,14 @@ class RobotWatch:
     """Subscribes to the robot in the node's namespace.
 
     Args:
-        node: Of this process.
-        on_status: Gets what the robot says of its episode; it may be another robot.
-        on_tick: Gets every tick, or the latest.
-        every_tick: Whether each counts, also of a robot that is faster than eyes are. If not,
-            `latest_tick` is taken where there is one; replays have none.
+        node: The node of this process.
+        on_status: Called with each status, which may come from another robot than before.
+        on_tick: Called with each tick.
+        every_tick: Whether each tick is needed. If not, `latest_tick` is used if it exists;
+            replays do not publish it.
 
     Attributes:
-        status: The latest status; None until there is a robot.
+        status: The latest status; None before the first.
     """
 
     def __init__(
@@ -97,35 +101,35 @@ class RobotWatch:
         self._subscriptions: list[Any] = []
         self._change: Any = None
         self._status_topic = status = topic(ANY_TASK, 'episode_status')
-        self.subscribe(status, status.qos, self._hear_status)
-        # In wall time: simulated time stands still with a robot that is gone.
+        self.subscribe(status, status.qos, self._on_status_message)
+        # Steady time, because simulated time stops with the robot.
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         if not every_tick:
             node.create_timer(_CHOICE_PERIOD, self._choose, clock=self._clock)
 
     @property
     def spec(self) -> TaskSpec | None:
-        """The robot's task; None until there is one."""
+        """The robot's task; None before the first status."""
         status = self.status
         return task_spec(status.task, status.joint_prefix, status.control_hz) if status else None
 
     @property
     def joint_prefix(self) -> str:
-        """What the names of the robot's joints begin with."""
+        """The prefix of the robot's joint names."""
         return self.status.joint_prefix if self.status else JOINT_PREFIX
 
     def subscribe(
         self, source: TopicSpec, qos: QosSpec, callback: Callable[[Any], None], raw: bool = False
     ) -> Any:
-        """Subscribes to a topic; returns rclpy's subscription."""
+        """Subscribe to a topic and return the subscription of rclpy."""
         message_class = ros_message_class(source.type_name)
         profile = rclpy_profile(qos)
         return self._node.create_subscription(
             message_class, source.name, callback, profile, raw=raw
         )
 
-    def _hear_status(self, message: Any) -> None:
-        """Takes a status from its own topic: `latest_tick` brings that of a robot which ticks."""
+    def _on_status_message(self, message: Any) -> None:
+        """Take a status from its own topic, unless `latest_tick` brings it."""
         status = _read_status(message)
         if status is None:
             return
@@ -133,7 +137,7 @@ class RobotWatch:
             self._take_status(status)
 
     def _is_other(self, status: EpisodeStatus) -> bool:
-        """Whether this is said by another robot than before."""
+        """Return whether a status is from another robot than the last."""
         return self.status is None or not self.status.is_of_same_robot(status)
 
     def _take_status(self, status: EpisodeStatus) -> None:
@@ -158,7 +162,7 @@ class RobotWatch:
         if status is None:
             return
         self._take_status(status)
-        # Not where that was another robot's, whose topics are still to come.
+        # Without subscriptions, this was the first status of another robot.
         if self._subscriptions:
             self._values = {name: values for name, (_, values) in given.items()}
             self._stamp_ns = stamp_ns
@@ -212,11 +216,11 @@ class RobotWatch:
             except ValueError:
                 return
             if source.name == _FIRST:
-                # The tick before ends here too, where its last message was lost.
+                # Finish the tick before, in case its last message was lost.
                 self._finish_tick()
                 self._values, self._stamp_ns = {}, stamp
             elif stamp not in (_NO_STAMP, self._stamp_ns):
-                # A tick whose first message was lost must not pass for this one.
+                # The first message of this tick was lost: drop the tick.
                 self._finish_tick()
                 self._values = {}
             self._values[source.name] = values
@@ -226,7 +230,7 @@ class RobotWatch:
         return collect
 
     def _finish_tick(self, status: EpisodeStatus | None = None) -> None:
-        """Passes the tick on if there is one; nothing of it is left for the next."""
+        """Pass the tick on if it is complete."""
         values, spec = self._values, self.spec
         if spec is None or any(name not in values for name in _NEEDED):
             return
@@ -244,10 +248,97 @@ class RobotWatch:
 
 
 def _read_status(message: Any) -> EpisodeStatus | None:
-    """What an `episode_status` says; None if that is no robot of ours."""
+    """Return the parsed `episode_status`; None if the task is unknown here."""
     try:
         status = EpisodeStatus.from_values(decode_status(message))
         task_spec(status.task, status.joint_prefix, status.control_hz)
     except ValueError:
         return None
     return status
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """A node that replays an episode: fully qualified names of the node and its pause service."""
+
+    name: str
+    pause: str
+
+
+class ReplayWatch:
+    """Finds a replay in the graph and counts its ticks, because it publishes no diagnostics.
+
+    Attributes:
+        replay: The replay node; None without one, or if a robot runs too.
+        rate: Ticks per second in the last period.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.replay: Replay | None = None
+        self.rate = 0.0
+        self._ticks = 0
+        self._since = time.monotonic()
+        self._moved = False
+        self._paused_looks = 0
+
+    def count_tick(self) -> None:
+        """Count a tick."""
+        self._ticks += 1
+        self._moved = True
+
+    def look(self) -> bool:
+        """Look at the graph; return whether the replay is another one than before."""
+        found, before = _find_replay(self._node), self.replay
+        self.replay = found
+        now = time.monotonic()
+        if found != before:
+            self.rate, self._paused_looks = 0.0, 0
+        elif (elapsed := now - self._since) >= _COUNT_PERIOD:
+            self.rate = self._ticks / elapsed
+        else:
+            return False
+        self._ticks, self._since = 0, now
+        return found != before
+
+    def stands_still(self, is_paused: bool) -> bool:
+        """Return whether a replay is still paused: another client may have resumed it.
+
+        Args:
+            is_paused: Whether it was paused at the last look.
+        """
+        moved, self._moved = self._moved, False
+        self._paused_looks = self._paused_looks + 1 if is_paused else 0
+        return is_paused and not (moved and self._paused_looks > _SETTLED)
+
+
+def status_publishers(node: Node) -> frozenset[bytes]:
+    """Return the identities of the publishers of `episode_status`: another robot has others."""
+    return frozenset(bytes(info.endpoint_gid) for info in _publishers(node))
+
+
+def _publishers(node: Node) -> list[Any]:
+    found: list[Any] = node.get_publishers_info_by_topic(node.resolve_topic_name('episode_status'))
+    return found
+
+
+def _find_replay(node: Node) -> Replay | None:
+    found = [_as_replay(node, info) for info in _publishers(node)]
+    # Beside a robot, a replay is not followed.
+    return found[0] if found and None not in found else None
+
+
+def _as_replay(node: Node, info: Any) -> Replay | None:
+    """Return the replay if the node of a publisher can be paused but not reset, else None."""
+    name, namespace = info.node_name, info.node_namespace
+    if not namespace.startswith('/'):
+        # The publisher was discovered before its node.
+        return None
+    try:
+        services = node.get_service_names_and_types_by_node(name, namespace)
+    except NodeNameNonExistentError:
+        return None
+    if any(RESET.type_name in types for _, types in services):
+        return None
+    pauses = [service for service, types in services if PAUSE.type_name in types]
+    return Replay(full_name(namespace, name), pauses[0]) if pauses else None

@@ -1,4 +1,4 @@
-"""Keeps a page fed: pictures from a source to the viewer, requests back."""
+"""Connect a page with its source: send pictures to the viewer, and requests back."""
 
 from __future__ import annotations
 
@@ -14,77 +14,74 @@ from fetch_hand_sim.view.requests import LatestRequest, Push, Request
 from msgs_spec.text import one_line
 from node_runtime.command_line import CommandError
 
+Perform = Callable[[Request | LatestRequest], None]
+
 
 class Source(Protocol):
-    """What is shown: a running robot or a file."""
+    """A running robot or an episode file."""
 
     def picture(self) -> Picture | None:
-        """Returns what to show if it has changed since the last call."""
+        """Return what to show if it has changed since the last call."""
 
     def perform(self, request: Request | LatestRequest) -> None:
-        """Does what the page asks for."""
+        """Do what the page asks for."""
 
 
 class Requests(plugin.SimPlugin):
-    """Hands what the page asks for to a source.
+    """Passes the requests of the page to a source.
 
-    What the viewer's own tools send would change a model that is only looked at: pulls at bodies
-    are passed on, all else is dropped.
+    The viewer's own tools would change the model that is shown. Of their messages, only pulls at
+    bodies are passed on; the others are dropped.
 
     Args:
-        perform: Does what is asked for.
+        perform: Called with each request.
     """
 
-    def __init__(self, perform: Callable[[Request | LatestRequest], None]) -> None:
+    def __init__(self, perform: Perform) -> None:
         self._perform = perform
 
     @messages.handler
     def on_request(self, request: Request) -> bool:
-        """Passes on."""
+        """Pass on a request."""
         self._perform(request)
         return True
 
     @messages.handler
     def on_latest(self, request: LatestRequest) -> bool:
-        """Passes on."""
+        """Pass on a request."""
         self._perform(request)
         return True
 
     @messages.handler
-    def on_state(self, event: messages.StateEvent) -> bool:
-        """Drops."""
-        return True
-
-    @messages.handler
     def on_perturb(self, event: messages.PerturbSnapshot) -> bool:
-        """Passes on who is pulled at, and how hard."""
+        """Pass on pulls at bodies."""
         for body, wrench in pulls(self.handle.model, event):
             self._perform(Push(body, wrench))
         return True
 
     @messages.handler
+    def on_state(self, event: messages.StateEvent) -> bool:
+        """Drop the event."""
+        return True
+
+    @messages.handler
     def on_load(self, event: messages.LoadModelEvent) -> bool:
-        """Drops."""
+        """Drop the event."""
         return True
 
     @messages.handler
     def on_reset(self, event: messages.ResetEvent) -> bool:
-        """Drops."""
+        """Drop the event."""
         return True
 
     @messages.handler
     def on_option(self, event: messages.MjOptionSnapshot) -> bool:
-        """Drops."""
+        """Drop the event."""
         return True
 
 
 class Session:
-    """One page and what it shows.
-
-    Args:
-        handle: The viewer's.
-        source: What there is to see.
-    """
+    """One page and its source."""
 
     def __init__(self, handle: viewer_handle.ViewerHandle, source: Source) -> None:
         self._handle = handle
@@ -92,10 +89,10 @@ class Session:
         self._scene: Scene | None = None
 
     def update(self) -> bool:
-        """Shows what is new and does what the page asked for; returns whether there was news.
+        """Show what is new and pass on requests; return whether anything was new.
 
         Raises:
-            Exception: What ended the viewer's thread.
+            Exception: The error that ended the viewer's thread.
         """
         self._handle.is_running()
         picture = self._source.picture()
@@ -115,10 +112,10 @@ class Session:
 
 
 def _scene_of(task: str) -> Scene:
-    """The scene of a task.
+    """Return the scene of a task.
 
     Raises:
-        CommandError: If it cannot be made, as of a robot whose package is not installed here.
+        CommandError: If the task or its robot is not installed here.
     """
     try:
         return Scene(task)

@@ -1,8 +1,9 @@
-"""Starts MuJoCo's web viewer behind a guard, on a socket of our choice."""
+"""Serve the page: MuJoCo's web viewer behind the guard, on a socket of our choice."""
 
 from __future__ import annotations
 
 import ctypes
+import errno
 import http.client
 import logging
 import os
@@ -28,42 +29,41 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.web import web_server
 from websockets.exceptions import ConnectionClosed
 
-from fetch_hand_sim.view.attendance import Attendance
-from fetch_hand_sim.view.frame_rate import FrameRate, Touch
-from fetch_hand_sim.view.guard import Guard, guarded_serve, is_loopback, new_token
+from fetch_hand_sim.view.guard import Attendance, Guard, guarded_serve, is_loopback, new_token
+from msgs_spec.topics import LATEST_TICKS_PER_SECOND
 from node_runtime.command_line import CommandError
 
+# Seconds between two frames of an untouched page, for a robot in real time and for a faster one.
+FOLLOWING = 1.0 / LATEST_TICKS_PER_SECOND
+OVERLOOKING = 1.0 / 12.0
+# Seconds after the last touch during which frames come as fast as possible.
+_ATTENTION = 0.5
 _LOOPBACK = '127.0.0.1'
 _EVERYWHERE = ('::', '0.0.0.0')
-# Addresses of networks that exist in documents alone; nothing is sent there.
-_SOMEBODY = ((socket.AF_INET, '203.0.113.1'), (socket.AF_INET6, '2001:db8::1'))
+_PORTS = range(8080, 8100)
+# Addresses reserved for documentation, used to look up the route to other hosts.
+_OTHER_HOSTS = ((socket.AF_INET, '203.0.113.1'), (socket.AF_INET6, '2001:db8::1'))
 _START_TIMEOUT = 10.0
-# Option of prctl(2), and nanoseconds that a timer may be late: little beside a picture's 16 ms.
+# Option of prctl(2), and the tolerance of timers in nanoseconds; a frame takes 16 ms.
 _SET_TIMER_SLACK, _SLACK_NS = 29, 5_000_000
-_bind_public_socket = web_server.bind_public_socket
 
 
 class CannotServe(CommandError):
-    """The page cannot be served; the message is one line that says why."""
+    """The page cannot be served; the message is one line."""
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where the page is.
-
-    Attributes:
-        host: Interface that is listened on.
-        port: Its port.
-        token: What visitors must show; None where only this machine can connect.
-    """
+    """Address of the page; `token` is None if only this machine can connect."""
 
     host: str
     port: int
     token: str | None
+    is_read_only: bool = False
 
     @property
     def url(self) -> str:
-        """What to open in a browser."""
+        """The address to open in a browser."""
         host = outside_host() if self.host in _EVERYWHERE else self.host
         host = f'[{host}]' if ':' in host else host
         query = f'?token={self.token}' if self.token else ''
@@ -71,27 +71,62 @@ class Address:
 
     @property
     def warning(self) -> str | None:
-        """What to say where others can connect."""
+        """The warning to print if other machines can connect, else None."""
         if self.token is None:
             return None
+        can = 'watch' if self.is_read_only else 'watch and command the robot'
         return (
-            f'listening on {self.host}: whoever has this address can watch and command the robot, '
-            'and nothing is encrypted. Browsers draw the page only over HTTPS or on this machine: '
-            f'ssh -L {self.port}:localhost:{self.port} is safer and works everywhere'
+            f'listening on {self.host}: everyone with this address can {can}, and nothing is '
+            f'encrypted. ssh -L {self.port}:localhost:{self.port} is safer'
         )
 
 
-class _Viewer(web_viewer.WebViewer):
-    """The web viewer without what it tells the terminal, and without files from visitors.
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """Input of one frame; the page counts as touched while a button is held or `mouse` changes."""
 
-    Attributes:
-        frame_rate: How often to build the page; None is as often as it can, 60 times a second.
+    mouse: tuple[float, float] = (0.0, 0.0)
+    wheel: float = 0.0
+    is_down: bool = False
+    is_typing: bool = False
+
+
+class FrameRate:
+    """Decides when the next frame begins. Times are seconds of one steady clock.
+
+    Frames are rare while nobody touches the page: on two processors, a robot in lockstep beside
+    the viewer loses ticks with every frame.
+
+    Args:
+        period: Returns the seconds between two frames of an untouched page.
     """
+
+    def __init__(self, period: Callable[[], float] = lambda: FOLLOWING) -> None:
+        self.period = period
+        self._touch = Touch()
+        self._touched = 0.0
+        self._began = 0.0
+
+    def wait_time(self, now: float, touch: Touch) -> float:
+        """Return the seconds until the next frame, which is assumed to begin then."""
+        is_held = touch.is_down or touch.is_typing or touch.wheel != 0.0
+        if is_held or touch.mouse != self._touch.mouse:
+            self._touched = now
+        self._touch = touch
+        wait = 0.0
+        if now - self._touched > _ATTENTION:
+            wait = max(0.0, self._began + self.period() - now)
+        self._began = now + wait
+        return wait
+
+
+class _Viewer(web_viewer.WebViewer):
+    """The web viewer without files from visitors; `frame_rate` None means 60 frames a second."""
 
     frame_rate: FrameRate | None = None
 
     def prepare_next_frame(self) -> bool:
-        """Waits for the next frame and begins it."""
+        """Wait for the next frame and begin it."""
         if self.frame_rate is not None:
             time.sleep(self.frame_rate.wait_time(time.monotonic(), _read_touch()))
         begun: bool = super().prepare_next_frame()
@@ -99,16 +134,16 @@ class _Viewer(web_viewer.WebViewer):
 
     @messages.handler(priority=messages.Priority.INTERNAL)
     def _on_post_model(self, event: messages.PostModelEvent) -> None:
+        # As in the base class, but without its message on stdout.
         del event
         self._update_model()
 
     def get_drop_file(self) -> str:
-        """Takes none."""
+        """Return no file."""
         return ''
 
 
 def _read_touch() -> Touch:
-    """What mouse and keyboard of the page did in the last frame."""
     io = imgui.GetIO()
     return Touch(
         mouse=(io.MousePos.x, io.MousePos.y),
@@ -119,7 +154,7 @@ def _read_touch() -> Touch:
 
 
 def outside_host() -> str:
-    """Returns by what others reach this machine: its name, else its address, where it has one."""
+    """Return the name by which other machines reach this one, else its address."""
     name = socket.getfqdn()
     for each in (name, socket.gethostname()):
         if _leads_outside(each):
@@ -128,7 +163,6 @@ def outside_host() -> str:
 
 
 def _leads_outside(name: str) -> bool:
-    """Whether a name is that of an address which is not this machine's own."""
     try:
         found = socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
@@ -137,9 +171,9 @@ def _leads_outside(name: str) -> bool:
 
 
 def _outside_address() -> str | None:
-    """The address from which this machine would send, if it could."""
-    for family, other in _SOMEBODY:
-        # `connect` of a datagram socket chooses the route and sends nothing.
+    """Return the address from which this machine would send, or None without a network."""
+    for family, other in _OTHER_HOSTS:
+        # `connect` of a datagram socket only chooses the route; it sends nothing.
         with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as route:
             route.connect((other, 9))
             own = str(route.getsockname()[0])
@@ -154,29 +188,26 @@ def open_page(
     plugins: Sequence[plugin.Plugin],
     frame_rate: FrameRate | None = None,
     attendance: Attendance | None = None,
+    is_read_only: bool = False,
 ) -> tuple[viewer_handle.ViewerHandle, Address]:
-    """Binds, serves the page from a thread and checks that the guard stands; once per process.
+    """Serve the page from a thread and check that the guard works; once per process.
 
     Args:
         host: Interface to listen on.
         port: A port, or 0 for the first free one from 8080.
-        plugins: Of the page and of the robot's side.
-        frame_rate: How often to build the page; None is 60 times a second.
-        attendance: Hears of the page in control.
+        plugins: Plugins of the page and of the robot's side.
+        frame_rate: When to build frames; None means 60 times a second.
+        attendance: Records whether a visitor is at the page in control.
+        is_read_only: Whether the page cannot act, for the warning.
 
     Raises:
-        CannotServe: If the port is taken or the host is not ours.
+        CannotServe: If the port is taken, or the host is no address of this machine.
     """
-    needs_token = not is_loopback(host)
-    listening = _bind(host, port)
-    guard = Guard(new_token() if needs_token else None, listening.getsockname()[1])
-    address = Address(host, listening.getsockname()[1], guard.token)
-    # The two places where the viewer meets the network; it offers no option for either.
-    web_server.bind_public_socket = lambda *_: listening
-    web_server.serve = guarded_serve(guard, attendance or Attendance())
-    web_viewer._print_url_banner = lambda *_: None
-    logging.getLogger('WebServer').setLevel(logging.WARNING)
-    logging.getLogger('asyncio').addFilter(is_no_farewell)
+    listening = _listen(host, port)
+    port = listening.getsockname()[1]
+    guard = Guard(None if is_loopback(host) else new_token(), port)
+    address = Address(host, port, guard.token, is_read_only)
+    _replace_server(listening, guard, attendance or Attendance())
     viewer_plugins, sim_plugins = plugin.split_plugins(plugins)
 
     def run(endpoint: endpoints.ViewerEndpoint) -> None:
@@ -195,52 +226,57 @@ def open_page(
     return handle, address
 
 
-def _wake_seldom() -> None:
-    """Lets timers of this thread, and of those that it starts, be a little late.
+def _replace_server(listening: socket.socket, guard: Guard, attendance: Attendance) -> None:
+    """Make the viewer use our socket and our guard.
 
-    One of the viewer's looks for news 2,000 times a second, which on two processors costs a robot
-    in lockstep beside it some of its ticks.
+    MuJoCo 4.0 has no option for these: the viewer always binds all interfaces, calls
+    `websockets.serve` itself and prints its own address.
+    """
+    web_server.bind_public_socket = lambda *_: listening
+    web_server.serve = guarded_serve(guard, attendance)
+    web_viewer._print_url_banner = lambda *_: None
+    logging.getLogger('WebServer').setLevel(logging.WARNING)
+    logging.getLogger('asyncio').addFilter(is_no_farewell)
+
+
+def _wake_seldom() -> None:
+    """Allow timers of this thread and its children to be late, which saves processor time.
+
+    A thread of the viewer polls 2,000 times a second.
     """
     if sys.platform == 'linux':
         ctypes.CDLL(None).prctl(_SET_TIMER_SLACK, ctypes.c_ulong(_SLACK_NS))
 
 
 def is_no_farewell(record: logging.LogRecord) -> bool:
-    """Whether a line of the log is about more than a visitor who has left."""
+    """Return whether a log record is about more than a visitor who has left."""
     error = record.exc_info[1] if record.exc_info else None
     return not isinstance(error, ConnectionClosed)
 
 
-def _bind(host: str, port: int) -> socket.socket:
-    _require_own(host)
-    try:
-        listening: socket.socket = _bind_public_socket(host, port)
-        # At once, so that nobody else can take the port before the server is up.
-        listening.listen()
-    except (RuntimeError, OSError, OverflowError) as error:
-        line = str(error).split('.')[0]
-        raise CannotServe(f'cannot listen on {host} port {port or "8080 ..."}: {line}') from None
-    return listening
-
-
-def _require_own(host: str) -> None:
-    """Refuses what is no address of this machine; the viewer's helper calls every failure a port.
+def _listen(host: str, port: int) -> socket.socket:
+    """Return a listening socket on `port`, or on the first free port for 0.
 
     Raises:
-        CannotServe: If nothing can be bound to it.
+        CannotServe: If the host is no address of this machine, or no port is free.
     """
-    try:
-        family, kind, _, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as probe:
-            probe.bind(place)
-    except (OSError, UnicodeError) as error:
-        why = getattr(error, 'strerror', None) or error
-        line = f'cannot listen on {host}: no address of this machine ({why})'
-        raise CannotServe(line) from None
+    reason = ''
+    for each in [port] if port else _PORTS:
+        try:
+            family = socket.getaddrinfo(host, each, type=socket.SOCK_STREAM)[0][0]
+            has_both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
+            return socket.create_server((host, each), family=family, dualstack_ipv6=has_both)
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, 'strerror', None) or str(error)
+            if getattr(error, 'errno', None) not in (errno.EADDRINUSE, errno.EACCES):
+                line = f'cannot listen on {host}: no address of this machine ({reason})'
+                raise CannotServe(line) from None
+    wanted = port or f'{_PORTS[0]} ... {_PORTS[-1]}'
+    raise CannotServe(f'cannot listen on {host} port {wanted}: {reason}')
 
 
 def _check_guarded(address: Address) -> None:
-    """Asks as a foreign site would; a server that answers must not run."""
+    """Send a request with a foreign Host and require its rejection."""
     host = _LOOPBACK if address.host in _EVERYWHERE else address.host
     deadline = time.monotonic() + _START_TIMEOUT
     while True:
@@ -257,32 +293,31 @@ def _check_guarded(address: Address) -> None:
             connection.close()
         if status != 403:
             raise CannotServe(
-                f'mujoco.studio serves past the guard (status {status}); this version of mujoco '
-                'is not supported'
+                f'mujoco.studio does not use the guard (status {status}). '
+                'Install the version of mujoco that setup.py names.'
             )
         return
 
 
 def announce(address: Address, wants_browser: bool) -> None:
-    """Prints the address and opens it where a browser could show itself."""
+    """Print the address, and open it in a browser if there is a display."""
     if address.warning:
         print(f'Warning: {address.warning}', flush=True)
-    # Once: a name server may be slow to answer.
+    # Compute it once: a name server may be slow.
     url = address.url
     print(f'The page is at {url} (Ctrl-C ends)', flush=True)
-    if wants_browser and has_display():
+    if wants_browser and _has_display():
         open_browser(url)
 
 
-def has_display() -> bool:
-    """Whether a browser could show itself."""
+def _has_display() -> bool:
     if not sys.platform.startswith('linux'):
         return True
     return bool(os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
 
 
 def open_browser(url: str, browser: Callable[[str], bool] = webbrowser.open) -> threading.Thread:
-    """Opens a page without waiting for the browser; says so where there is none."""
+    """Open an address in a browser from a thread; print a line if there is no browser."""
 
     def open_it() -> None:
         if not browser(url):

@@ -73,7 +73,7 @@ VIEW = """
 import os
 os.environ['MUJOCO_GL'] = 'egl'
 import gymnasium
-from fetch_hand_sim.view.page.introduction import introduction
+from fetch_hand_sim.view.page.robot_panel import introduction
 from msgs_spec.tasks import task_spec
 
 print(introduction(task_spec('FetchReachOriented')))
@@ -91,7 +91,7 @@ def test_it_is_shown(site: Path) -> None:
     pytest.importorskip('mujoco.studio')
     result = run(site, '-c', VIEW)
     assert result.stdout.splitlines() == [
-        f'{TASK} is a task of another package. The goal turns green when it is reached.',
+        f'{TASK} is a third-party task. The goal turns green when it is reached.',
         'True',
     ], result.stderr
 
@@ -99,7 +99,7 @@ def test_it_is_shown(site: Path) -> None:
 ANOTHER_REWARD = """
 import gymnasium, numpy as np
 from fetch_hand_sim.commands.main import main
-from fetch_hand_sim.view.page.introduction import introduction
+from fetch_hand_sim.view.page.robot_panel import introduction
 from msgs_spec.tasks import task_spec
 
 env = gymnasium.make('fetch_hand_sim:fetch_hand_sim/FetchPushNear-v0')

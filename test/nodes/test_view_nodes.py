@@ -199,7 +199,7 @@ def test_a_replay_is_told_from_a_robot_and_paused(start_process: Start, tmp_path
         follower.until(lambda p: p.facts.speed == 2.0, 'other speed')
         goal = follower.picture.frame.desired_goal
         follower.robot.perform(SetGoal(goal + 0.1))
-        follower.until(lambda p: 'a replay stops' in p.facts.notice, 'a word about goals')
+        follower.until(lambda p: 'a replay can only' in p.facts.notice, 'a word about goals')
         np.testing.assert_array_equal(follower.picture.frame.desired_goal, goal)
         follower.robot.perform(SetPaused(True))
         picture = follower.robot.picture() or follower.picture

@@ -33,8 +33,6 @@ NODES = (
     'fetch_hand_sim.sim_node',
     'fetch_hand_sim.view.live',
     'fetch_hand_sim.view.live_session',
-    'fetch_hand_sim.view.remote_node',
-    'fetch_hand_sim.view.replay_watch',
     'fetch_hand_sim.view.robot_requests',
     'fetch_hand_sim.view.robot_watch',
     'fetch_hand_sim.visualization_node.messages',

@@ -1,1 +1,1 @@
-"""What is drawn in the browser, and what the mouse and the keys do there."""
+"""The page that MuJoCo's viewer draws: panels, curves and the mouse over the scene."""

@@ -1,4 +1,4 @@
-"""Pulling at a body with the mouse: MuJoCo's perturbation, as a spring between body and mouse."""
+"""Pull at a body with the mouse: MuJoCo's perturbation, a spring between body and mouse."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from msgs_spec.arrays import Array
 _FORCES = mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
 _TRANSLATE = mujoco.mjtPertBit.mjPERT_TRANSLATE.value
 _IN_THE_PICTURE = mujoco.mjtMouse.mjMOUSE_MOVE_V.value
-# Pulling this far, a share of the distance to what is looked at, pulls as hard as is allowed.
+# Length of a pull with the largest force, as a share of the camera's distance.
 _REACH = 0.1
 
 
 def can_be_pulled(model: mujoco.MjModel, body: int) -> bool:
-    """Whether a body moves when it is pulled: it has a name, and is neither world nor ghost."""
+    """Return whether a body can move, has a name, and is neither world nor ghost."""
     if body <= 0 or model.body(body).name in ('', GHOST):
         return False
     while body:
@@ -31,10 +31,9 @@ def can_be_pulled(model: mujoco.MjModel, body: int) -> bool:
 
 
 def pulls(model: mujoco.MjModel, snapshot: messages.PerturbSnapshot) -> list[tuple[str, Array]]:
-    """Returns the bodies that a viewer pulls at, with their wrenches (6,) in N and N m.
+    """Return the pulled bodies of a snapshot with their wrenches (6,) in N and N m.
 
-    Forces and torques are along the axes of the world, at the centre of mass; a snapshot of another
-    model holds none.
+    Wrenches are along the world axes, at the centre of mass. A snapshot of another model has none.
     """
     size = mujoco.mj_stateSize(model, _FORCES)
     if snapshot.state_sig != _FORCES or snapshot.state.shape != (size,):
@@ -49,11 +48,7 @@ def pulls(model: mujoco.MjModel, snapshot: messages.PerturbSnapshot) -> list[tup
 
 
 class BodyDrag:
-    """A spring between the mouse and the body at which it was pressed.
-
-    Args:
-        perturb: The perturbation that a viewer draws.
-    """
+    """A spring between the mouse and a body; changes the perturbation that the viewer draws."""
 
     def __init__(self, perturb: mujoco.MjvPerturb) -> None:
         self._perturb = perturb
@@ -72,15 +67,9 @@ class BodyDrag:
         ray: Ray,
         limit: float,
     ) -> bool:
-        """Takes the body under the mouse; False if there is none that could move.
+        """Grab the body under the mouse; return False if no body there can move.
 
-        Args:
-            model: What is shown.
-            data: Its state.
-            camera: From where.
-            options: What of it is drawn.
-            ray: Under the mouse.
-            limit: Largest force, N.
+        `limit` is the largest force, N. `options` selects the geoms that are drawn.
         """
         body, point = _body_under(model, data, options, ray)
         if not can_be_pulled(model, body):
@@ -90,7 +79,7 @@ class BodyDrag:
         perturb.localpos = data.xmat[body].reshape(3, 3).T @ (point - data.xpos[body])
         ux.InitPerturb(model, data, camera, perturb, _TRANSLATE)
         perturb.active = _TRANSLATE
-        # A spring that reaches the limit where people expect it, whatever the body weighs.
+        # The force reaches the limit at the same length, whatever the mass of the body.
         perturb.localmass = limit / (model.vis.map.stiffness * _REACH * camera.distance)
         return True
 
@@ -101,14 +90,9 @@ class BodyDrag:
         camera: mujoco.MjvCamera,
         delta: Sequence[float],
     ) -> messages.PerturbSnapshot:
-        """Follows the mouse; returns what pulls now.
+        """Follow the mouse and return the forces, which are also written into `data` to draw them.
 
-        Args:
-            model: What is shown.
-            data: Its state; gets the force, so that it is drawn.
-            camera: From where.
-            delta: (2,) how far the mouse went since the last call, in widths and heights of the
-                picture.
+        `delta` (2,) is the movement since the last call, in widths and heights of the picture.
         """
         if any(delta):
             ux.MovePerturb(model, data, camera, self._perturb, _IN_THE_PICTURE, *delta)
@@ -117,7 +101,7 @@ class BodyDrag:
         return messages.PerturbSnapshot(data.xfrc_applied.ravel().copy(), _FORCES)
 
     def end(self, data: mujoco.MjData) -> None:
-        """Lets go."""
+        """Release the body."""
         self._perturb.active = self._perturb.select = 0
         data.xfrc_applied[:] = 0.0
 
@@ -125,7 +109,7 @@ class BodyDrag:
 def _body_under(
     model: mujoco.MjModel, data: mujoco.MjData, options: mujoco.MjvOption, ray: Ray
 ) -> tuple[int, Array]:
-    """The first body on a ray and where it is met; a ghost is looked through, -1 for none."""
+    """Return the first body on a ray except the ghost, or -1, and the point of contact."""
     ghost = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY.value, GHOST)
     geom = np.full((1, 1), -1, dtype=np.int32)
     distance = mujoco.mj_ray(

@@ -1,24 +1,81 @@
-"""Commanding a robot from the page: sliders, and the arrow keys."""
+"""Command a robot from the page: with sliders, and with the arrow keys."""
 
 from __future__ import annotations
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.page.teleoperation import Teleoperation
-from fetch_hand_sim.view.page.windows import ITEM_WIDTH, Send, say
+from fetch_hand_sim.view.page.widgets import ITEM_WIDTH, Send, say
 from fetch_hand_sim.view.picture import Facts, Picture
 from fetch_hand_sim.view.requests import SetCommand, SetCommanding
+from msgs_spec.actions import resting_command
+from msgs_spec.arrays import Array
+from msgs_spec.robots import CommandPart, RobotSpec
 from msgs_spec.tasks import TaskSpec
 
 _SELECTED = imgui.Vec4(0.1, 0.45, 0.85, 1.0)
+# Seconds in which a held key moves a slider from end to end.
+_SWEEP = 2.0
+# Units of relative commands begin with this: 'x 0.05 m' in each tick.
+_MOVES = 'x '
+
+
+def is_move(part: CommandPart) -> bool:
+    """Return whether a command is relative: a distance in each tick, 0 at rest."""
+    return part.unit.startswith(_MOVES)
+
+
+class Teleoperation:
+    """A command that sliders and keys change.
+
+    Args:
+        robot: The robot.
+        start: (action size,) the last command; None for the resting one.
+
+    Attributes:
+        values: (action size,) command units.
+        selected: Index of the part that the keys change.
+    """
+
+    def __init__(self, robot: RobotSpec, start: Array | None) -> None:
+        self._parts = robot.command
+        self.values = resting_command(robot) if start is None else start.copy()
+        for index, part in enumerate(self._parts):
+            if is_move(part):
+                self.values[index] = 0.0
+        self.selected = 0
+        self._held: int | None = None
+
+    def select(self, by: int) -> None:
+        """Select another part, relative to this one."""
+        self.selected = (self.selected + by) % len(self._parts)
+
+    def hold(self, direction: int, seconds: float) -> None:
+        """Apply a held key; call it in every frame, also without a key.
+
+        Absolute commands change slowly and stay; relative ones are at their limit while a key is
+        held, and 0 after it.
+
+        Args:
+            direction: -1, 0 (no key) or 1.
+            seconds: Since the last call.
+        """
+        if self._held is not None and (not direction or self._held != self.selected):
+            self.values[self._held] = 0.0
+            self._held = None
+        if not direction:
+            return
+        part = self._parts[self.selected]
+        if is_move(part):
+            self._held = self.selected
+            self.values[self.selected] = part.upper if direction > 0 else part.lower
+            return
+        step = direction * (part.upper - part.lower) * seconds / _SWEEP
+        value = self.values[self.selected] + step
+        self.values[self.selected] = min(max(value, part.lower), part.upper)
 
 
 class CommandPanel:
-    """The part of the robot's panel that commands, where nobody else does.
-
-    Args:
-        send: Gets the commands.
-    """
+    """The part of the robot's panel that commands while no other node does."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -26,7 +83,7 @@ class CommandPanel:
         self._teleoperation: Teleoperation | None = None
 
     def draw(self, spec: TaskSpec, picture: Picture) -> None:
-        """Draws it, and sends a command for every frame while it is switched on."""
+        """Draw the panel, and send a command in every frame while it is switched on."""
         facts = picture.facts
         if self._task != spec.name or not facts.is_commanding:
             self._task, self._teleoperation = spec.name, None
@@ -47,10 +104,10 @@ class CommandPanel:
 
 
 def _draw_switch(facts: Facts, send: Send) -> None:
-    somebody = facts.commander not in ('', '-') and not facts.is_commanding
-    if somebody:
+    has_other = facts.commander not in ('', '-') and not facts.is_commanding
+    if has_other:
         say(f'{facts.commander} commands. Stop it to take over.')
-    imgui.BeginDisabled(somebody)
+    imgui.BeginDisabled(has_other or facts.is_silent)
     changed, on = imgui.Checkbox('My sliders command', facts.is_commanding)
     if changed:
         send(SetCommanding(on))
@@ -75,7 +132,7 @@ def _draw_sliders(spec: TaskSpec, teleoperation: Teleoperation) -> None:
 
 def _take_keys(teleoperation: Teleoperation) -> None:
     key = imgui.Key
-    # What is typed into a field is no command.
+    # Arrow keys in an input field do not command.
     is_free = not imgui.IsAnyItemActive()
     if is_free and imgui.IsKeyPressed(key.UpArrow):
         teleoperation.select(-1)

@@ -1,28 +1,28 @@
-"""Setting a goal by numbers."""
+"""Set a goal with sliders."""
 
 from __future__ import annotations
 
 import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.page.windows import ITEM_WIDTH, Send
+from fetch_hand_sim.view.page.widgets import ITEM_WIDTH, Send
 from fetch_hand_sim.view.requests import ReleaseGoal, SetGoal
 from msgs_spec.arrays import Array
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler
 from msgs_spec.tasks import GoalKind, TaskSpec
 
-# Where goals make sense, metres: about where the tasks draw theirs.
+# Ranges of useful goals, metres: about those of the tasks.
 _FETCH_RANGES = ((1.05, 1.6), (0.4, 1.1), (0.42, 0.9))
 _SLIDE_RANGES = ((1.1, 2.0), (0.4, 1.1), (0.4, 0.45))
 _HAND_RANGES = ((0.94, 1.06), (0.78, 0.96), (0.15, 0.32))
-# Where fingertips get to.
+# Reach of the fingertips, metres.
 _FINGERTIP_RANGES = ((0.87, 1.12), (0.76, 0.96), (0.06, 0.27))
-# In the order of `FINGERTIPS`.
+# In the order of `msgs_spec.FINGERTIPS`.
 _FINGERS = ('first finger', 'middle finger', 'ring finger', 'little finger', 'thumb')
 
 
 def position_ranges(spec: TaskSpec) -> tuple[tuple[float, float], ...]:
-    """Lower and upper ends of the sliders for x, y and z, metres."""
+    """Return the ranges of the sliders for x, y and z, metres."""
     if spec.goal is GoalKind.FINGERTIPS:
         return _FINGERTIP_RANGES
     if not spec.robot.has_gripper_command:
@@ -31,13 +31,10 @@ def position_ranges(spec: TaskSpec) -> tuple[tuple[float, float], ...]:
 
 
 class GoalPanel:
-    """The part of the robot's panel with the goal, as far as the task has position and rotation.
-
-    Args:
-        send: Gets the goals.
+    """The part of the robot's panel that sets the goal.
 
     Attributes:
-        keeps_goal: Whether goals that people set are for later episodes as well.
+        keeps_goal: Whether the visitor's goals are repeated in later episodes.
     """
 
     def __init__(self, send: Send) -> None:
@@ -46,7 +43,7 @@ class GoalPanel:
         self.keeps_goal = True
 
     def draw(self, spec: TaskSpec, goal: Array) -> None:
-        """Draws it for a goal (goal size,), and sends another where something was moved."""
+        """Draw the sliders of a goal (goal size,), and send another goal if one was moved."""
         self.keeps_goal = imgui.Checkbox('Keep my goal in new episodes', self.keeps_goal)[1]
         changed = goal.copy()
         if spec.goal is GoalKind.FINGERTIPS:
@@ -64,7 +61,7 @@ class GoalPanel:
 
 
 def _draw_position(spec: TaskSpec, position: Array) -> None:
-    """Sliders for a position (3,), metres, which they change."""
+    """Draw sliders that change a position (3,), metres."""
     for axis, (lower, upper) in enumerate(position_ranges(spec)):
         imgui.SetNextItemWidth(ITEM_WIDTH)
         name, value = f'{"xyz"[axis]} (m)', float(position[axis])
@@ -72,17 +69,14 @@ def _draw_position(spec: TaskSpec, position: Array) -> None:
 
 
 def _draw_angles(spec: TaskSpec, quaternion: Array) -> Array:
-    """Sliders for the Euler angles of a goal; the quaternion as it was if none moved.
-
-    Turned about x of the world, then about y and z as they are by then: `rotations.py`.
-    """
+    """Draw sliders for the Euler angles (`rotations.py`) and return the new quaternion."""
     angles = quaternion_to_euler(quaternion)
     axes = (2,) if spec.looks_like == 'HandManipulateBlockRotateZ' else (0, 1, 2)
     has_changed = False
     for axis in axes:
         imgui.SetNextItemWidth(ITEM_WIDTH)
         degrees = float(np.degrees(angles[axis]))
-        # Beyond a right angle about y the same turn has other angles, to which sliders would jump.
+        # Beyond 90 degrees about y, the other angles of the same rotation would jump.
         end = 90.0 if axis == 1 else 180.0
         moved, degrees = imgui.SliderFloat(f'about {"xyz"[axis]} (deg)', degrees, -end, end)
         if moved:

@@ -1,4 +1,4 @@
-"""The page: scene, panels and mouse, as a plugin of MuJoCo's viewer."""
+"""The page as a plugin of MuJoCo's viewer: scene, panels and mouse."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from fetch_hand_sim.simulation.rendering import make_options
 from fetch_hand_sim.simulation.scene import Frame, Scene
 from fetch_hand_sim.view.page.body_drag import BodyDrag
-from fetch_hand_sim.view.page.goal_drag import Handle, find_handle, moved_goal
-from fetch_hand_sim.view.page.introduction import drag_hint
+from fetch_hand_sim.view.page.goal_drag import Handle, drag_hint, find_handle, moved_goal
 from fetch_hand_sim.view.page.panels import Panels
 from fetch_hand_sim.view.page.ray import MousePlace, Ray, mouse_ray
 from fetch_hand_sim.view.picture import Picture, ShowScene
@@ -32,10 +31,10 @@ class _GoalDrag:
 
 
 class Page(plugin.ViewerPlugin):
-    """Draws what pictures say and sends what people do.
+    """Draws pictures, and sends what the visitor asks for.
 
     Args:
-        episodes: Files to choose from, where files are played.
+        episodes: Episode files to choose from.
     """
 
     def __init__(self, episodes: tuple[Path, ...] = ()) -> None:
@@ -48,23 +47,21 @@ class Page(plugin.ViewerPlugin):
     def _send(self, request: Request | LatestRequest) -> None:
         self.viewer.send_to_sim(request)
 
-    # What arrives
-
     @messages.handler
     def on_viewer_init(self, event: plugin.ViewerInitEvent) -> None:
-        """Sets the looks of the page."""
+        """Set theme and rendering options."""
         ux.setup_theme(ux.GuiTheme.LIGHT)
         event.viewer.vis_options = make_options()
         self._body_drag = BodyDrag(event.viewer.perturb)
 
     @messages.handler
     def on_scene(self, event: ShowScene) -> None:
-        """Takes another robot; its model follows."""
+        """Take another robot, whose model follows."""
         self._scene, self._picture, self._goal_drag = event.scene, None, None
 
     @messages.handler
     def on_post_model(self, event: messages.PostModelEvent) -> None:
-        """Looks at the robot from where it is seen best."""
+        """Set the camera of the task."""
         del event
         if self._body_drag is not None:
             self._body_drag.end(self.viewer.data)
@@ -73,19 +70,17 @@ class Page(plugin.ViewerPlugin):
 
     @messages.handler
     def on_picture(self, picture: Picture) -> None:
-        """Takes what is to be shown."""
+        """Take the newest picture."""
         self._picture = picture
 
     @messages.handler
     def on_theme(self, event: plugin.ThemeEvent) -> None:
-        """Follows the visitor's choice of colours."""
+        """Use the theme that the visitor has chosen."""
         ux.setup_theme(event.theme)
-
-    # What is drawn
 
     @messages.handler
     def on_update(self, event: messages.UpdateEvent) -> None:
-        """Follows the mouse and draws the markers."""
+        """Handle the mouse and draw the markers."""
         del event
         self._follow_mouse()
         picture = self._picture
@@ -101,11 +96,9 @@ class Page(plugin.ViewerPlugin):
 
     @messages.handler
     def on_build_gui(self, event: messages.BuildGuiEvent) -> None:
-        """Draws the panels."""
+        """Draw the panels."""
         del event
         self._panels.draw(self._picture)
-
-    # The mouse
 
     def _follow_mouse(self) -> None:
         picture, scene, body_drag = self._picture, self._scene, self._body_drag
@@ -138,7 +131,7 @@ class Page(plugin.ViewerPlugin):
         if not imgui.IsMouseDown(imgui.MouseButton.Left):
             drag.end(viewer.data)
             return
-        # Else the browser would turn the camera.
+        # Without this the browser turns the camera.
         imgui.SetNextFrameWantCaptureMouse(True)
         delta = (io.MouseDelta.x / io.DisplaySize.x, io.MouseDelta.y / io.DisplaySize.y)
         viewer.send_to_sim(drag.move(viewer.model, viewer.data, viewer.camera, delta))

@@ -1,39 +1,45 @@
-"""All panels of the page, and where they are."""
+"""All panels of the page and their layout."""
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.page.episode_list import EpisodeList
+from fetch_hand_sim.episode_log import EpisodeReadError
+from fetch_hand_sim.episode_log.summary import read_summary
 from fetch_hand_sim.view.page.plots import draw_plots
 from fetch_hand_sim.view.page.robot_panel import RobotPanel
-from fetch_hand_sim.view.page.timeline import draw_timeline
-from fetch_hand_sim.view.page.windows import (
+from fetch_hand_sim.view.page.widgets import (
     MARGIN,
     WIDTH,
     Send,
     Windows,
+    draw_pause,
+    draw_speed,
+    draw_step,
     say,
     untitled_window,
 )
 from fetch_hand_sim.view.picture import Facts, Graphs, Picture, Timeline
+from fetch_hand_sim.view.requests import ChangeEpisode, OpenEpisode, Seek
 from msgs_spec.tasks import TaskSpec, task_spec
 
+# Pixels.
 _TIMELINE_HEIGHT = 74.0
 _LEAST_LIST = 100.0
-# The narrowest page with room for two columns, pixels: a telephone that is held upright has none.
-_TWO_COLUMNS = 2.0 * WIDTH + 3.0 * MARGIN
 _BUTTON_HEIGHT = 3.0 * MARGIN
+# The narrowest page with two columns; an upright phone has less.
+_TWO_COLUMNS = 2.0 * WIDTH + 3.0 * MARGIN
 
 
 class Panels:
-    """All panels, with what people have typed into them.
+    """All panels, with the input of the visitor.
 
     Args:
-        send: Gets what people ask for.
-        episodes: What there is to choose from, of files.
+        send: Called with the requests of the visitor.
+        episodes: Episode files to choose from.
     """
 
     def __init__(self, send: Send, episodes: tuple[Path, ...] = ()) -> None:
@@ -41,16 +47,16 @@ class Panels:
         self._windows = Windows()
         self._robot_panel = RobotPanel(send)
         self._episode_list = EpisodeList(episodes, send)
-        # Where the next window of the left column begins.
+        # Upper edge of the next window in the left column.
         self._below = 0.0
 
     @property
     def keeps_goal(self) -> bool:
-        """Whether goals that people set are for later episodes as well."""
+        """Whether the visitor's goals are repeated in later episodes."""
         return self._robot_panel.keeps_goal
 
     def draw(self, picture: Picture | None) -> None:
-        """Draws everything for one frame."""
+        """Draw everything for one frame."""
         size = imgui.GetIO().DisplaySize
         if picture is None:
             x, y = (size.x - WIDTH) / 2.0, size.y / 2.0 - 40.0
@@ -67,7 +73,7 @@ class Panels:
             self._draw_file(picture.timeline, picture.facts)
 
     def _draw_curves(self, spec: TaskSpec, graphs: Graphs) -> None:
-        """Draws them on the right, or where there is no room in the left column."""
+        """Draw the curves on the right, or in the left column of a narrow page."""
         width = imgui.GetIO().DisplaySize.x
         is_narrow = width < _TWO_COLUMNS
         x, y = width - WIDTH - MARGIN, MARGIN
@@ -94,5 +100,73 @@ class Panels:
 
 
 def _height(is_shown: bool) -> float:
-    """How high the window that is being drawn is, or the button in place of one that is not."""
+    """Return the height of the current window, or of the button that replaces it, pixels."""
     return float(imgui.GetWindowSize().y) if is_shown else _BUTTON_HEIGHT
+
+
+class EpisodeList:
+    """A list of episodes to click; only visible ones are read."""
+
+    def __init__(self, paths: tuple[Path, ...], send: Send) -> None:
+        self._paths = paths
+        self._send = send
+        self._describe = cache(describe)
+        self._played = self._clicked = -1
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def draw(self, number: int) -> None:
+        """Draw the visible part of the list; episode `number` is being played."""
+        if number != self._played and number != self._clicked:
+            # Scroll to an episode that was chosen elsewhere on the page.
+            height = imgui.GetTextLineHeightWithSpacing()
+            imgui.SetScrollY(max(0.0, (number - 3) * height))
+        self._played = number
+        clipper = imgui.ListClipper()
+        clipper.Begin(len(self._paths))
+        while clipper.Step():
+            for index in range(clipper.DisplayStart, clipper.DisplayEnd):
+                label = f'{self._describe(self._paths[index])}##{index}'
+                if imgui.Selectable(label, index == number):
+                    self._clicked = index
+                    self._send(OpenEpisode(index))
+
+
+def describe(path: Path) -> str:
+    """Return name and outcome of an episode; takes about 1 ms."""
+    name = path.name.removesuffix('.mcap')
+    try:
+        outcome = read_summary(path).outcome
+    except (EpisodeReadError, ValueError):
+        return f'{name}  unreadable'
+    if not outcome.is_complete:
+        return f'{name}  interrupted'
+    return f'{name}  {"reached" if outcome.is_success else "missed"}'
+
+
+def draw_timeline(timeline: Timeline, facts: Facts, send: Send) -> None:
+    """Draw the buttons of a file, the speed and the slider over all frames."""
+    imgui.BeginDisabled(not facts.may_command)
+    if imgui.Button('<< Episode'):
+        send(ChangeEpisode(-1))
+    imgui.SameLine()
+    draw_step('< Step', -1, send)
+    imgui.SameLine()
+    draw_pause(facts.is_paused, 'Play', send)
+    imgui.SameLine()
+    draw_step('Step >', 1, send)
+    imgui.SameLine()
+    if imgui.Button('Episode >>'):
+        send(ChangeEpisode(1))
+    imgui.SameLine()
+    draw_speed(facts.speed, send)
+    imgui.SameLine()
+    where = f'{timeline.time:.2f} s   {timeline.title} ({timeline.number + 1} of {timeline.count})'
+    imgui.Text(where)
+    imgui.SetNextItemWidth(-1.0)
+    last = timeline.frames - 1
+    moved, index = imgui.SliderInt('##timeline', timeline.index, 0, last, 'frame %d')
+    if moved:
+        send(Seek(index))
+    imgui.EndDisabled()

@@ -1,4 +1,4 @@
-"""Curves of the page."""
+"""Draw the curves of the page."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 
-from fetch_hand_sim.view.page.teleoperation import is_move
+from fetch_hand_sim.view.page.command_panel import is_move
 from fetch_hand_sim.view.picture import Graphs, Series
 from msgs_spec.robots import CommandPart
 from msgs_spec.tasks import TaskSpec
 
 _HEIGHT = 140.0
 _SECONDS = 8.0
-# Above and below what is drawn, of its height: what lies on an edge is not seen.
+# Space above and below the curves, as a share of their height.
 _ROOM = 0.15
 
 
 def draw_plots(spec: TaskSpec, graphs: Graphs, width: float) -> None:
-    """Draws distances with their thresholds, the reward, and commands against joints."""
+    """Draw distances with their thresholds, the reward, and commands beside joints."""
     if graphs.distance is not None:
         curves = {'distance (m)': graphs.distance}
         _plot('##Distance', curves, width, threshold=spec.distance_threshold)
@@ -39,13 +39,7 @@ def draw_plots(spec: TaskSpec, graphs: Graphs, width: float) -> None:
 
 
 def command_curves(part: CommandPart, graphs: Graphs, index: int) -> dict[str, Series]:
-    """A command and what can be compared with it, by their names on the page.
-
-    Args:
-        part: The command.
-        graphs: With commands.
-        index: Which one it is.
-    """
+    """Return a command and the positions that it drives, by their names on the page."""
     assert graphs.commands is not None
     command = _column(graphs.commands, index)
     if is_move(part):
@@ -61,14 +55,7 @@ def command_curves(part: CommandPart, graphs: Graphs, index: int) -> dict[str, S
 def value_limits(
     curves: Iterable[Series], threshold: float | None, begin: float, end: float
 ) -> tuple[float, float]:
-    """Lower and upper end of an axis on which curves and threshold are seen, none of it at an end.
-
-    Args:
-        curves: What is drawn, one value per time.
-        threshold: What must be seen too; None for nothing.
-        begin: Time from which it is drawn, seconds.
-        end: Time up to which.
-    """
+    """Return the limits of an axis that shows curves and threshold from `begin` to `end`, s."""
     parts = [each.values[(each.times >= begin) & (each.times <= end)] for each in curves]
     values = np.concatenate([*parts, [] if threshold is None else [threshold]])
     values = values[np.isfinite(values)]
@@ -90,7 +77,7 @@ def _plot(
         return
     implot.SetupAxes('', '', int(implot.AxisFlags.NoTickLabels))
     legend = implot.LegendFlags
-    # Else it covers what it explains.
+    # Inside, the legend would cover the curves.
     implot.SetupLegend(int(implot.Location.North), int(legend.Outside) | int(legend.Horizontal))
     newest = max((s.times[-1] for s in curves.values() if len(s.times)), default=0.0)
     always = int(implot.Cond.Always)

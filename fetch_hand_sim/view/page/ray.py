@@ -1,4 +1,4 @@
-"""From the mouse to the world: rays through pixels of a free camera."""
+"""Rays from a free camera through the mouse into the world."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from msgs_spec.arrays import Array
 
 @dataclass(frozen=True, slots=True)
 class MousePlace:
-    """Where the mouse is.
+    """Position of the mouse in the picture.
 
     Attributes:
         x: 0 ... 1 from the left.
@@ -28,14 +28,14 @@ class MousePlace:
 
 @dataclass(frozen=True, slots=True)
 class Ray:
-    """A half line, and the axes of the camera it comes from.
+    """A half line, and the axes of its camera.
 
     Attributes:
         origin: (3,) m.
         direction: (3,) unit length.
-        forward: (3,) where the camera looks.
-        right: (3,) its right.
-        up: (3,) its up.
+        forward: (3,) axis of the camera.
+        right: (3,) axis of the camera.
+        up: (3,) axis of the camera.
     """
 
     origin: Array
@@ -45,7 +45,7 @@ class Ray:
     up: Array
 
     def distance_to(self, point: Array) -> float:
-        """How far a point (3,) is from the line, metres; infinite behind the camera."""
+        """Return the distance of a point (3,) from the line, metres; infinite behind the camera."""
         offset = point - self.origin
         along = float(offset @ self.direction)
         if along <= 0.0:
@@ -53,7 +53,7 @@ class Ray:
         return float(np.linalg.norm(offset - along * self.direction))
 
     def meets_plane(self, point: Array, normal: Array) -> Array | None:
-        """Where the line meets a plane, (3,); None if it does not."""
+        """Return the intersection (3,) with a plane, or None."""
         slope = float(self.direction @ normal)
         if abs(slope) < 1e-6:
             return None
@@ -62,13 +62,7 @@ class Ray:
 
 
 def mouse_ray(camera: View | mujoco.MjvCamera, fovy: float, mouse: MousePlace) -> Ray:
-    """Returns the ray under the mouse.
-
-    Args:
-        camera: A free camera.
-        fovy: Its vertical field of view, degrees.
-        mouse: Where the mouse is.
-    """
+    """Return the ray under the mouse; `fovy` is the camera's vertical field of view, degrees."""
     a, e = np.radians(camera.azimuth), np.radians(camera.elevation)
     forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([np.sin(a), -np.cos(a), 0.0])

@@ -1,4 +1,4 @@
-"""What the robot does in words, and what one may do to it."""
+"""The panel of the robot: its state as text, and the controls to act on it."""
 
 from __future__ import annotations
 
@@ -8,27 +8,47 @@ import numpy as np
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
 from fetch_hand_sim.view.page.command_panel import CommandPanel
+from fetch_hand_sim.view.page.goal_drag import drag_hint
 from fetch_hand_sim.view.page.goal_panel import GoalPanel
-from fetch_hand_sim.view.page.introduction import drag_hint, introduction
-from fetch_hand_sim.view.page.push_panel import PushPanel
-from fetch_hand_sim.view.page.time_controls import draw_pause, draw_speed, draw_step
-from fetch_hand_sim.view.page.windows import ITEM_WIDTH, Send, say
+from fetch_hand_sim.view.page.widgets import (
+    ITEM_WIDTH,
+    Send,
+    draw_pause,
+    draw_speed,
+    draw_step,
+    say,
+)
 from fetch_hand_sim.view.picture import Facts, Picture
-from fetch_hand_sim.view.requests import ChooseActor, Reset
+from fetch_hand_sim.view.requests import ChooseActor, Push, Reset
 from msgs_spec.tasks import TaskSpec
 
 _GREEN = imgui.Vec4(0.1, 0.55, 0.2, 1.0)
 _RED = imgui.Vec4(0.75, 0.2, 0.15, 1.0)
-_WAITING = 'The robot waits for somebody who commands it.'
-_SILENT = 'Nothing is heard of the robot: it has ended, or hangs. This is what it did last.'
+_WAITING = 'The robot waits for its first command.'
+_SILENT = 'The robot is silent: it has shut down, or hangs. This is its last state.'
+_READ_ONLY = 'This page can only watch (--read-only).'
+_INTRODUCTIONS = {
+    'FetchReach': 'The arm brings its gripper to the red ball.',
+    'FetchPush': 'The arm pushes the box to the red ball on the table.',
+    'FetchSlide': 'The arm hits the puck so that it slides to the red ball, out of its reach.',
+    'FetchPickAndPlace': 'The arm picks the box up and holds it at the red ball.',
+    'HandReach': 'The hand brings its fingertips to the red balls: thumb and finger meet.',
+}
+
+
+def introduction(spec: TaskSpec) -> str:
+    """Return the purpose of a task in a line."""
+    text = _INTRODUCTIONS.get(spec.name)
+    things = (word for word in ('Block', 'Egg', 'Pen') if f'HandManipulate{word}' in spec.name)
+    if spec.formulas is None and (thing := next(things, '').lower()):
+        how = ' and moves it there' if spec.position_counts else ''
+        text = f'The hand turns the {thing} until it looks like the tinted ghost{how}.'
+    text = text or f'{spec.name} is a third-party task.'
+    return f'{text} The goal turns green when it is reached.'
 
 
 class RobotPanel:
-    """The panel, with what people have typed into it.
-
-    Args:
-        send: Gets what people ask for.
-    """
+    """The panel of the robot, with the input of the visitor."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -39,20 +59,22 @@ class RobotPanel:
 
     @property
     def keeps_goal(self) -> bool:
-        """Whether goals that people set are for later episodes as well."""
+        """Whether the visitor's goals are repeated in later episodes."""
         return self._goal_panel.keeps_goal
 
     def draw(self, spec: TaskSpec, picture: Picture) -> None:
-        """Draws its content."""
+        """Draw the content of the panel."""
         facts = picture.facts
         say(introduction(spec))
         if facts.takes_actions:
             say(f'{drag_hint(spec)}: the robot follows.')
             if facts.push_limit:
                 say('Drag robot or object with Ctrl to pull at it.')
+        if not facts.may_command:
+            say(_READ_ONLY)
         imgui.Separator()
         _draw_state(spec, picture)
-        if facts.source == 'live':
+        if facts.source == 'live' and facts.may_command:
             self._draw_actions(spec, picture)
         if facts.notice:
             imgui.Separator()
@@ -60,9 +82,6 @@ class RobotPanel:
 
     def _draw_actions(self, spec: TaskSpec, picture: Picture) -> None:
         facts = picture.facts
-        if not facts.may_command:
-            imgui.TextDisabled('This page may only watch.')
-            return
         imgui.Separator()
         draw_pause(facts.is_paused, 'Run', self._send)
         if facts.is_replay:
@@ -95,7 +114,7 @@ class RobotPanel:
 
 
 def draw_actors(facts: Facts, send: Send) -> None:
-    """A choice of actors that begins with who acts, so that whatever is chosen is a change."""
+    """Draw a choice of actors; an unknown actor is listed first."""
     names, index = list(facts.actors), 0
     if facts.actor in names:
         index = names.index(facts.actor)
@@ -112,7 +131,7 @@ def _draw_state(spec: TaskSpec, picture: Picture) -> None:
     if facts.is_silent:
         say(_SILENT)
     elif picture.frame is None:
-        say('Nothing is seen yet.' if facts.is_replay else _WAITING)
+        say('No tick has arrived yet.' if facts.is_replay else _WAITING)
     elif picture.frame.is_success:
         imgui.TextColored(_GREEN, 'Goal reached')
     else:
@@ -131,3 +150,28 @@ def _draw_state(spec: TaskSpec, picture: Picture) -> None:
     if facts.source == 'live':
         state = 'paused' if facts.is_paused else f'{facts.rate:.2f} ticks/s'
         imgui.Text(state if facts.is_replay else f'{state}, {facts.missed_ticks} missed')
+
+
+class PushPanel:
+    """A body, a force, and a button that pushes while it is held."""
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self._body = 0
+        self._force = np.zeros(3)
+
+    def draw(self, spec: TaskSpec, limit: float) -> None:
+        """Draw the panel for forces up to `limit`, N."""
+        bodies = [spec.object_name] if spec.object_name else []
+        bodies.append('robot0:gripper_link' if spec.robot.has_gripper_command else 'robot0:palm')
+        imgui.SetNextItemWidth(ITEM_WIDTH)
+        self._body = imgui.Combo('body', min(self._body, len(bodies) - 1), bodies)[1]
+        for axis, name in enumerate('xyz'):
+            imgui.SetNextItemWidth(ITEM_WIDTH)
+            value = float(self._force[axis])
+            self._force[axis] = imgui.SliderFloat(f'{name} (N)', value, -limit, limit)[1]
+        length = float(np.linalg.norm(self._force))
+        imgui.Button(f'Push with {min(length, limit):.1f} N while held')
+        if imgui.IsItemActive() and length > 0.0:
+            wrench = np.concatenate([self._force, np.zeros(3)])
+            self._send(Push(bodies[self._body], wrench))

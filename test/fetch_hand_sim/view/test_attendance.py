@@ -1,4 +1,4 @@
-"""Who left the page, or sleeps, holds nothing any more."""
+"""Commands of the page end when its visitor leaves, and when the robot does."""
 
 from __future__ import annotations
 
@@ -12,33 +12,38 @@ import rclpy
 from websockets.asyncio.client import connect
 
 from fetch_hand_sim.simulation.scene import Frame
-from fetch_hand_sim.view import guard, remote_node
-from fetch_hand_sim.view.attendance import Attendance
-from fetch_hand_sim.view.guard import Guard, guarded_serve
+from fetch_hand_sim.view import guard, live, robot_requests
+from fetch_hand_sim.view.guard import Attendance, Guard, guarded_serve
 from fetch_hand_sim.view.live import LiveRobot
-from fetch_hand_sim.view.remote_node import RemoteNode
-from fetch_hand_sim.view.requests import SetCommanding, SetGoal
+from fetch_hand_sim.view.requests import ReleaseGoal, SetCommanding, SetGoal
+from fetch_hand_sim.view.robot_requests import RemoteNode
 from fetch_hand_sim.view.robot_watch import SeenTick
 from msgs_spec.tick import EpisodeStatus
 
 
-def test_silence_says_that_nobody_is_there():
+def test_a_silent_visitor_is_absent_and_a_departed_one_is_noticed_once():
     now = [100.0]
     attendance = Attendance(lambda: now[0])
     assert not attendance.is_there
     attendance.note()
     now[0] += 2.9
-    assert attendance.is_there
+    assert attendance.is_there and not attendance.has_left()
     now[0] += 0.2
-    assert not attendance.is_there
+    assert not attendance.is_there and attendance.has_left()
+    attendance.note()
+    attendance.end_visit()
+    # The next visitor is in control before anyone asks.
+    attendance.note()
+    assert attendance.is_there and attendance.has_left() and not attendance.has_left()
 
 
 @pytest.mark.parametrize('path', ['/ui', '/state'])
 def test_the_page_in_control_is_heard_and_a_hanging_one_is_left_in_time(path, monkeypatch):
-    attendance, took = Attendance(), []
+    attendance, took, was_there = Attendance(), [], []
 
     async def handle(connection):
         async for _ in connection:
+            was_there.append(attendance.is_there)
             began = time.monotonic()
             await connection.close()
             took.append(time.monotonic() - began)
@@ -59,9 +64,10 @@ def test_the_page_in_control_is_heard_and_a_hanging_one_is_left_in_time(path, mo
                     await asyncio.sleep(0.05)
                 visitor.transport.abort()
 
-    monkeypatch.setattr(guard, '_FAREWELL', 0.3)
+    monkeypatch.setattr(guard, '_CLOSE_TIMEOUT', 0.3)
     asyncio.run(asyncio.wait_for(visit(), 20.0))
-    assert took[0] < 10.0 and attendance.is_there == (path == '/ui')
+    assert took[0] < 10.0 and was_there == [path == '/ui']
+    assert not attendance.is_there
 
 
 @pytest.fixture
@@ -89,15 +95,48 @@ def follow(robot, said, stamps=()):
         robot._on_tick(SeenTick(stamp, frame, -1.0, np.zeros(4), None))
 
 
-def test_a_robot_is_left_alone_by_a_page_that_nobody_sees(robot):
+def test_commands_end_when_the_visitor_leaves(robot):
     follow(robot, status(), [10])
     robot.perform(SetCommanding(True))
     assert robot.picture().facts.is_commanding
     robot.leave()
     facts = robot.picture().facts
-    assert not facts.is_commanding and 'nobody was at the page' in facts.notice
+    assert not facts.is_commanding and 'the visitor left' in facts.notice
     robot.leave()
     assert robot.picture() is None
+
+
+def test_commands_end_when_the_robot_has_another_task(robot):
+    follow(robot, status(), [10])
+    robot.perform(SetCommanding(True))
+    follow(robot, status(task='FetchPush', episode=3))
+    facts = robot.picture().facts
+    assert not facts.is_commanding and 'restarted' in facts.notice
+
+
+def test_commands_end_when_the_robot_falls_silent(robot, monkeypatch):
+    follow(robot, status(), [10])
+    robot.perform(SetCommanding(True))
+    monkeypatch.setattr(live, '_SILENCE', 0.0)
+    robot._look()
+    facts = robot.picture().facts
+    assert facts.is_silent and not facts.is_commanding and 'silent' in facts.notice
+    robot.perform(SetCommanding(True))
+    assert not robot.picture().facts.is_commanding
+
+
+def test_a_notice_ends_with_its_episode(robot, monkeypatch):
+    follow(robot, status(), [10])
+    robot.perform(ReleaseGoal())
+    follow(robot, status(tick=3, phase='running'), [20])
+    robot._look()
+    assert 'draws its own goal' in robot.picture().facts.notice
+    follow(robot, status(episode=1), [30])
+    robot._look()
+    assert robot.picture().facts.notice, 'time to read it'
+    monkeypatch.setattr(live, '_NOTICE_TIME', 0.0)
+    robot._look()
+    assert robot.picture().facts.notice == ''
 
 
 def test_a_goal_is_seen_at_once_also_of_a_robot_that_stands_still(robot):
@@ -143,7 +182,7 @@ def test_a_node_that_hangs_is_asked_seldom(robot, monkeypatch):
             remote.get_parameter(name, print)
         assert [request.names for request in asked] == [['rate'], ['policy']]
         # Another one may be in its place by now.
-        monkeypatch.setattr(remote_node, '_PATIENCE', 0.0)
+        monkeypatch.setattr(robot_requests, '_ANSWER_TIMEOUT', 0.0)
         remote.get_parameter('rate', print)
         assert [request.names for request in asked] == [['rate'], ['policy'], ['rate']]
     finally:

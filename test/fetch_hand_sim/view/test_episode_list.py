@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fetch_hand_sim.episode_log import EpisodeDirectory
-from fetch_hand_sim.view.page.episode_list import describe
+from fetch_hand_sim.view.page.panels import describe
 from support.episode_recorder import Recorder
 
 

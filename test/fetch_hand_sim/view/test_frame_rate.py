@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from fetch_hand_sim.view.frame_rate import FrameRate, Touch
+from fetch_hand_sim.view.web import FrameRate, Touch
 
 
 def frames(rate, begin, end, touch=lambda now: Touch(), work=1 / 60):

@@ -147,6 +147,12 @@ def test_the_address_is_one_by_which_others_come(monkeypatch, name, addresses, r
     assert Address('10.0.0.1', 8080, TOKEN).url == f'http://10.0.0.1:8080/?token={TOKEN}'
 
 
+@pytest.mark.parametrize('is_read_only', [True, False])
+def test_the_warning_names_what_others_can_do(is_read_only):
+    warning = Address('0.0.0.0', 8080, TOKEN, is_read_only).warning
+    assert ('command' in warning) != is_read_only
+
+
 def test_loopback_is_told_from_the_rest():
     assert is_loopback('127.0.0.1') and is_loopback('127.9.9.9') and is_loopback('localhost')
     for name in ('127.evil.example', '127.0.0.1.evil.example', '127.1.evil', ''):
@@ -178,6 +184,8 @@ def test_server_gives_the_page_and_opens_it_to_no_other_site(address):
         assert response.getheader('Access-Control-Allow-Origin') is None
         assert response.getheader('X-Frame-Options') == 'DENY'
     assert get(address, '/', Host='evil.example').status == 403
+    page = get(address, '/').read().decode()
+    assert '<html lang="en">' in page and 'name="viewport"' in page and '</html>' in page
     assert get(address, '/drop').status == 403
 
 

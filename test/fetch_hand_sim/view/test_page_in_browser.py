@@ -35,11 +35,8 @@ from support.episode_recorder import Recorder
 from support.graph import Client, client, ros_args
 from support.pace import assert_keeps_pace
 
-if find_browser() is None:
-    # For all of them, so that it is one line.
-    pytest.skip('no Chromium: apt install chromium', allow_module_level=True)
-
 pytestmark = [
+    pytest.mark.skipif(find_browser() is None, reason='no Chromium: apt install chromium'),
     # A browser is slow.
     pytest.mark.release,
     pytest.mark.timeout(1500),

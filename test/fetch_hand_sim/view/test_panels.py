@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from fetch_hand_sim.view.page import panels
-from fetch_hand_sim.view.page.windows import MARGIN, WIDTH, Windows
+from fetch_hand_sim.view.page.widgets import MARGIN, WIDTH, Windows
 from fetch_hand_sim.view.picture import Picture, Timeline
 
 HEIGHT = 180.0

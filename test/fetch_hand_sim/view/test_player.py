@@ -234,6 +234,18 @@ def test_fingers_are_comparable_with_the_command_of_the_gripper():
     assert opening[9] == pytest.approx(1.0, abs=0.1) and opening[-1] == pytest.approx(-1.0, abs=0.1)
 
 
+def test_a_rotation_is_at_most_180_degrees():
+    spec = TASKS['HandManipulateBlockFull']
+    curves, place = Curves(spec, GoalMetric(spec)), np.zeros(3)
+    for angle in np.radians([10.0, 170.0, 190.0, 268.0, 350.0]):
+        pose = [np.cos(angle / 2.0), 0.0, 0.0, np.sin(angle / 2.0)]
+        achieved, desired = np.r_[place, pose], np.r_[place, 1.0, 0.0, 0.0, 0.0]
+        joints = np.zeros(len(spec.robot.joints))
+        curves.add(0.0, Frame(joints, desired, achieved, None, False), None, None)
+    shown = np.degrees(curves.graphs().rotation.values)
+    np.testing.assert_allclose(shown, [10.0, 170.0, 170.0, 92.0, 10.0])
+
+
 @pytest.mark.parametrize('threshold', [0.01, 0.1])
 @pytest.mark.parametrize('values', [[0.3, 0.2], [0.3, 0.001], [0.005, 0.004], [0.1, 0.1], []])
 def test_the_threshold_is_seen_whatever_the_curve_does(values, threshold):

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import rclpy
 
-from fetch_hand_sim.view.page import robot_panel, time_controls
+from fetch_hand_sim.view.page import robot_panel, widgets
 from fetch_hand_sim.view.picture import Facts, Picture
-from fetch_hand_sim.view.replay_watch import Replay
 from fetch_hand_sim.view.requests import (
     ChooseActor,
     OpenEpisode,
@@ -21,6 +20,7 @@ from fetch_hand_sim.view.requests import (
     SetSpeed,
 )
 from fetch_hand_sim.view.robot_requests import RobotRequests
+from fetch_hand_sim.view.robot_watch import Replay
 from msgs_spec.codecs import decode
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic
@@ -157,8 +157,8 @@ def test_every_choice_of_an_actor_is_a_change(monkeypatch, actor, wanted):
     ('speed', 'shown'), [(1.0, 'x 1'), (0.123, 'x 0.123'), (3.0, 'x 3'), (0.0, 'fastest')]
 )
 def test_any_speed_is_shown(monkeypatch, speed, shown):
-    monkeypatch.setattr(time_controls, 'imgui', choice := Choice())
-    time_controls.draw_speed(speed, lambda request: pytest.fail(f'{request} is no choice'))
+    monkeypatch.setattr(widgets, 'imgui', choice := Choice())
+    widgets.draw_speed(speed, lambda request: pytest.fail(f'{request} is no choice'))
     assert choice.shown == shown and 'x 5' in choice.names
 
 
@@ -169,4 +169,5 @@ def test_the_page_says_of_a_robot_that_it_is_gone(is_silent, monkeypatch):
     monkeypatch.setattr(robot_panel, 'say', said.append)
     facts = Facts(may_command=False, is_silent=is_silent)
     robot_panel.RobotPanel(None).draw(SPEC, Picture(SPEC.name, facts=facts))
-    assert any('Nothing is heard' in line for line in said) is is_silent
+    assert any('--read-only' in line for line in said)
+    assert any('The robot is silent' in line for line in said) is is_silent

@@ -11,12 +11,13 @@ import rclpy
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.view import live
+from fetch_hand_sim.view.requests import SetCommand, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_watch import RobotWatch
 from msgs_spec.diagnostics import Report, encode_reports
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import task_spec
 from msgs_spec.tick import TickEncoder
-from msgs_spec.topics import DIAGNOSTICS
+from msgs_spec.topics import DIAGNOSTICS, topic
 from node_runtime.ros import rclpy_profile, ros_message_class
 
 JOINTS = len(task_spec('FetchReach').robot.joints)
@@ -96,6 +97,43 @@ def test_a_tick_that_lost_its_first_message_does_not_pass_for_the_one_before(nod
         assert np.array_equal(each.frame.achieved_goal, tick.achieved_goal)
         assert np.array_equal(each.frame.joint_position, tick.readings['joint_states'][:JOINTS])
         assert 'joint_states' not in lost and 'achieved_goal' not in lost
+
+
+@pytest.mark.parametrize('task', ['FetchReach', 'FetchPush'])
+def test_commands_of_the_page_never_reach_the_next_robot(node, task):
+    first = Robot(node, Simulation('FetchReach', num_threads=1), JOINT_PREFIX, 0)
+    viewer = live.LiveRobot(node, may_command=True)
+
+    def wait_for(condition, act):
+        deadline, picture = time.monotonic() + 20.0, None
+        while picture is None or not condition(picture):
+            assert time.monotonic() < deadline
+            act()
+            rclpy.spin_once(node, timeout_sec=0.02)
+            picture = viewer.picture() or picture
+
+    wait_for(lambda picture: picture.frame is not None, first.tick)
+    viewer.perform(SetCommanding(True))
+    viewer.perform(SetCommand(np.ones(4)))
+    viewer.perform(SetGoal(np.array([1.3, 0.7, 0.5])))
+    assert node.count_publishers('/commands') == 1
+    first.leave()
+    second = Robot(node, Simulation(task, num_threads=1), JOINT_PREFIX, 0)
+    second.tick()
+    viewer.perform(SetCommand(np.ones(4)))
+    assert node.count_publishers('/commands') == 0
+    sent = []
+    source = topic(task_spec(task), 'set_goal')
+    node.create_subscription(
+        ros_message_class(source.type_name), 'set_goal', sent.append, rclpy_profile(source.qos)
+    )
+
+    def is_over(picture):
+        return picture.task == task and picture.facts.episode > 0
+
+    wait_for(is_over, second.tick)
+    assert not viewer.picture() or not viewer.picture().facts.is_commanding
+    assert not sent, 'the goal was kept for the first robot'
 
 
 REPORT = {'mode': 'real time', 'paused': 'False', 'rate (Hz)': '25.00', 'commanders': '/somebody'}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fetch_hand_sim.view.page.teleoperation import Teleoperation, is_move
+from fetch_hand_sim.view.page.command_panel import Teleoperation, is_move
 from msgs_spec.robots import FETCH, SHADOW_HAND
 
 FRAME = 1.0 / 60.0

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -10,7 +12,9 @@ import pytest
 from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.view import main
 from fetch_hand_sim.view.command import parse
+from fetch_hand_sim.view.live_session import check_alive
 from fetch_hand_sim.view.web import open_browser
+from node_runtime.node_main import NodeFailure
 from support.episode_recorder import Recorder
 
 
@@ -128,6 +132,23 @@ def test_a_port_that_is_in_use(capsys, episode):
         code, (line,) = error_of(capsys, [episode, '--no-browser', '--port', port])
     assert code == 1
     assert line.startswith(f'view: cannot listen on 127.0.0.1 port {port}: ')
+
+
+@pytest.mark.parametrize(
+    ('code', 'said'),
+    [
+        ('import os; os.kill(os.getpid(), 9)', 'sim_node was killed by SIGKILL'),
+        ('exit("no such task")', 'sim_node ended with exit code 1: no such task'),
+    ],
+)
+def test_a_node_that_dies_is_named_with_its_cause(code, said, tmp_path):
+    with (tmp_path / 'log').open('w') as log:
+        running = subprocess.Popen([sys.executable, '-c', 'input()'], stdin=subprocess.PIPE)
+        dead = subprocess.Popen([sys.executable, '-c', code], stderr=log)
+        dead.wait()
+        with running, pytest.raises(NodeFailure) as failure:
+            check_alive({'policy_node': running, 'sim_node': dead}, log)
+    assert str(failure.value) == said
 
 
 @pytest.mark.parametrize('answer', [True, False])

@@ -1,4 +1,4 @@
-"""Windows of the page: where they are, and how to hide them."""
+"""Windows of the page, and the buttons that a running robot and a file share."""
 
 from __future__ import annotations
 
@@ -8,40 +8,41 @@ from contextlib import contextmanager
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.view.requests import LatestRequest, Request
+from fetch_hand_sim.view.requests import LatestRequest, Request, SetPaused, SetSpeed, StepOnce
 
 Send = Callable[[Request | LatestRequest], None]
 
+# Pixels. Items leave room for their names.
 MARGIN = 10.0
 WIDTH = 330.0
-# Width of sliders and lists, pixels, which leaves room for their names.
 ITEM_WIDTH = 210.0
 _LETTERS = 46
+_SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0)
+_AS_FAST_AS_POSSIBLE = 0.0
 
 
 class Windows:
-    """Windows that can be hidden."""
+    """Windows that the visitor can hide."""
 
     def __init__(self) -> None:
-        """Shows all."""
         self._hidden: set[str] = set()
         self._has_folded = False
 
     def fold_once(self, *names: str) -> None:
-        """Hides windows at the first call; what is shown again stays."""
+        """Hide windows at the first call only."""
         if not self._has_folded:
             self._has_folded = True
             self._hidden.update(names)
 
     @contextmanager
     def column(self, title: str, x: float, y: float, height: float = 0.0) -> Iterator[bool]:
-        """A window of the usual width; False where a button in its place shows it again.
+        """Draw a window of the usual width; yield False if a button replaces a hidden one.
 
         Args:
-            title: What it is called; what follows `###` names it where the title changes.
+            title: Title, which may change; text after `###` identifies the window.
             x: Left edge, pixels.
             y: Upper edge, pixels.
-            height: Pixels; 0 for what its content takes.
+            height: Pixels; 0 fits the content.
         """
         name = title.partition('###')[0]
         if name in self._hidden:
@@ -62,7 +63,7 @@ class Windows:
 
 @contextmanager
 def untitled_window(name: str, x: float, y: float, width: float, height: float) -> Iterator[bool]:
-    """A window without a title that cannot be hidden; False where nothing of it is seen."""
+    """Draw a window without title that cannot be hidden; yield whether it is visible."""
     _place(x, y, width, height)
     flags = _flags() | int(imgui.WindowFlags.NoTitleBar) | int(imgui.WindowFlags.NoScrollbar)
     try:
@@ -72,9 +73,31 @@ def untitled_window(name: str, x: float, y: float, width: float, height: float) 
 
 
 def say(text: str) -> None:
-    """Text over several lines; the browser's font is none that ImGui could wrap by itself."""
+    """Draw text over several lines; ImGui cannot wrap the font of the browser."""
     for line in textwrap.wrap(text, _LETTERS):
         imgui.Text(line)
+
+
+def draw_pause(is_paused: bool, resume: str, send: Send) -> None:
+    """Draw a button that pauses, or resumes with the label `resume`."""
+    if imgui.Button(resume if is_paused else 'Pause'):
+        send(SetPaused(not is_paused))
+
+
+def draw_step(label: str, frames: int, send: Send) -> None:
+    """Draw a button that shows another tick."""
+    if imgui.Button(label):
+        send(StepOnce(frames))
+
+
+def draw_speed(speed: float, send: Send) -> None:
+    """Draw a choice of speeds, which includes the current one."""
+    speeds = sorted({*_SPEEDS, speed})
+    imgui.SetNextItemWidth(90.0)
+    names = ['fastest' if each == _AS_FAST_AS_POSSIBLE else f'x {each:g}' for each in speeds]
+    changed, chosen = imgui.Combo('##speed', speeds.index(speed), names)
+    if changed:
+        send(SetSpeed(speeds[chosen]))
 
 
 def _place(x: float, y: float, width: float, height: float) -> None:
