@@ -50,7 +50,7 @@ class Studio:
         return renderer.render(frames[index], trail_of(frames, index))
 
     def plain(self, recording: Recording, index: int) -> Picture:
-        """Return one frame as a camera sees it: without trail and with a goal of one colour."""
+        """Return the picture of one frame without trail, and with a goal of one colour."""
         frame = recording.frames[self._index(recording, index)]
         frame = replace(frame, is_success=False)
         return self._renderer(recording.spec.name).render(frame, [])

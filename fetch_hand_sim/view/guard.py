@@ -64,7 +64,7 @@ class Attendance:
 
     @property
     def is_there(self) -> bool:
-        """Whether the visitor in control has sent input within the last seconds."""
+        """True if the visitor in control has sent input within the last seconds."""
         return self._clock() - self._heard < _SILENCE
 
     def note(self) -> None:
@@ -182,7 +182,7 @@ def _is_same_origin(origins: Sequence[str], host: str) -> bool:
 
 
 def guarded_serve(guard: Guard, attendance: Attendance) -> Callable[..., Any]:
-    """Return a replacement of `websockets.serve` that asks the guard about each request.
+    """Return a replacement of `websockets.serve` that checks each request.
 
     Args:
         guard: Accepts or rejects requests.
@@ -249,7 +249,7 @@ def _attended(handler: Any, attendance: Attendance) -> Callable[[Any], Awaitable
 
 
 def _note_input(connection: Any, attendance: Attendance) -> Callable[[], bool]:
-    """Record what a connection receives; returns a function that tells whether it received any."""
+    """Record input of a connection; return a function with the result "has sent input"."""
     receive, has_received = connection.recv, False
 
     # Iteration over the connection calls `recv` too.

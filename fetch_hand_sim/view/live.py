@@ -1,4 +1,4 @@
-"""Follow a running robot for the page, and pass on what the page asks for."""
+"""Follow a running robot for the page, and pass on the requests of the page."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from node_runtime.ros import full_name
 
 # A robot counts as fast above its real-time rate times this factor.
 _HURRY = 1.5
-# Seconds between two looks at the graph and at the settings of nodes.
+# Seconds between two checks of the graph and of the settings of nodes.
 _LOOK_PERIOD = 0.5
 # Seconds without a message after which a robot is silent; a robot reports every second.
 _SILENCE = 4.0
@@ -52,7 +52,7 @@ _NOTICE_TIME = 3.0
 
 
 class LiveRobot:
-    """Follows the robot in the node's namespace and passes on what the page asks for.
+    """Follows the robot in the node's namespace and passes on the requests of the page.
 
     Args:
         node: The node of this process.
@@ -115,7 +115,7 @@ class LiveRobot:
         return dataclasses.replace(history.picture, graphs=history.graphs(), facts=facts)
 
     def perform(self, request: Request | LatestRequest) -> None:
-        """Do what the page asks for, unless it may only watch."""
+        """Perform a request, unless the page may only watch."""
         if not self._may_command:
             self._update_facts(notice=ONLY_WATCHED)
             return

@@ -17,7 +17,7 @@ ONLY_WATCHED = 'this page can only watch (--read-only)'
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What the page shows as text.
+    """State of robot and episode that the page shows as text.
 
     Attributes:
         source: `live` or `file`.
@@ -62,7 +62,7 @@ class Facts:
 
     @property
     def takes_actions(self) -> bool:
-        """Whether this page can move goals and robot."""
+        """True if this page can move goals and robot."""
         return self.source == 'live' and self.may_command and not self.is_replay
 
 

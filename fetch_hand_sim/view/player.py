@@ -109,7 +109,7 @@ class Player:
         return self._make_picture()
 
     def perform(self, request: Request | LatestRequest) -> None:
-        """Do what the page asks for, unless it may only watch."""
+        """Perform a request, unless the page may only watch."""
         if not self._may_act:
             self._notice = ONLY_WATCHED
             return
@@ -154,7 +154,7 @@ class Player:
         raise none_readable(skipped)
 
     def _change(self, by: int) -> None:
-        """Open the next readable episode; stay, with a notice, if there are no more."""
+        """Open the next readable episode. Without one, stay and set a notice."""
         number, skipped = self._number, ''
         for _ in self._paths:
             number = (number + by) % len(self._paths)
@@ -168,7 +168,7 @@ class Player:
         self._notice = f'no episode can be read any more; {skipped}'
 
     def _choose(self, number: int) -> None:
-        """Open an episode; stay, with a notice, if it is unreadable."""
+        """Open an episode. If it is unreadable, stay and set a notice."""
         if not 0 <= number < len(self._paths):
             return
         try:

@@ -1,4 +1,4 @@
-"""Messages from the page to the source: what a visitor asks for.
+"""Messages from the page to the source: requests of the visitor.
 
 A newer snapshot replaces an older one; every event arrives (`mujoco.studio.messages`).
 """

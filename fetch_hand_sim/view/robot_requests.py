@@ -1,4 +1,4 @@
-"""Pass on what the page asks of a running robot, over public topics, services and parameters."""
+"""Pass requests of the page to a running robot, over public topics, services and parameters."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from node_runtime.ros import rclpy_profile, ros_message_class, ros_service_class
 _SET_PARAMETERS = 'rcl_interfaces/srv/SetParameters'
 _GET_PARAMETERS = 'rcl_interfaces/srv/GetParameters'
 _TRIGGER = 'std_srvs/srv/Trigger'
-# Seconds to wait for the answer of a node before it is asked again.
+# Seconds to wait for the answer of a node before the next request.
 _ANSWER_TIMEOUT = 3.0
 # Seconds for which a new goal is shown before the robot confirms it.
 _GOAL_TIMEOUT = 0.5
@@ -151,7 +151,7 @@ class RemoteNode:
 
 
 class RobotRequests:
-    """Passes on what the page asks for to the nodes in our namespace.
+    """Passes requests of the page to the nodes in our namespace.
 
     Args:
         node: The node of this process.
@@ -176,7 +176,7 @@ class RobotRequests:
 
     @property
     def has_policy(self) -> bool:
-        """Whether a policy node runs."""
+        """True if a policy node runs."""
         return self._policy.is_there()
 
     def take_task(self, spec: TaskSpec) -> None:
@@ -219,7 +219,7 @@ class RobotRequests:
             self._policy.get_parameter('policy', lambda name: self._tell(actor=name or shipped))
 
     def perform(self, request: Request | LatestRequest) -> None:
-        """Do what the page asks for; requests about files are ignored."""
+        """Perform a request; requests about files are ignored."""
         if self._spec is None or not self.fits(request):
             return
         if self._replay is not None and not isinstance(request, _OF_A_REPLAY):

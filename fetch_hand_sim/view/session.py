@@ -24,7 +24,7 @@ class Source(Protocol):
         """Return what to show if it has changed since the last call."""
 
     def perform(self, request: Request | LatestRequest) -> None:
-        """Do what the page asks for."""
+        """Perform a request."""
 
 
 class Requests(plugin.SimPlugin):

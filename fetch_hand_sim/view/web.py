@@ -54,7 +54,7 @@ class CannotServe(CommandError):
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Address of the page; `token` is None if only this machine can connect."""
+    """Address of the page; `token` is None if the page is local."""
 
     host: str
     port: int
@@ -94,8 +94,8 @@ class Touch:
 class FrameRate:
     """Decides when the next frame begins. Times are seconds of one steady clock.
 
-    Frames are rare while nobody touches the page: on two processors, a robot in lockstep beside
-    the viewer loses ticks with every frame.
+    Frames are rare while the page is untouched: on two processors, each frame costs a robot in
+    lockstep some ticks.
 
     Args:
         period: Returns the seconds between two frames of an untouched page.

@@ -795,7 +795,7 @@ def processes_of_session(session: int) -> list[str]:
         (['--wait', '0.2', '--robot', 'nosuch'], 1, 'no robot in namespace /nosuch'),
         (['--wait', '0.2'], 1, 'start sim_node'),
         (['--host', '203.0.113.1'], 1, 'cannot listen on 203.0.113.1'),
-        (['--task', 'FetchReach', '--policy', 'nosuch'], 1, 'a node ended'),
+        (['--task', 'FetchReach', '--policy', 'nosuch'], 1, 'policy_node ended'),
         (['--port', '99999'], 2, '--port 99999; allowed: 0 ... 65535'),
         (['--task', 'FetchWalk'], 2, 'FetchWalk'),
         (['episodes', '--task', 'FetchReach'], 2, 'exclude each other'),

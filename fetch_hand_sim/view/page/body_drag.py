@@ -55,7 +55,7 @@ class BodyDrag:
 
     @property
     def is_pulling(self) -> bool:
-        """Whether the mouse holds a body."""
+        """True while the mouse holds a body."""
         return bool(self._perturb.active)
 
     def begin(
@@ -79,7 +79,7 @@ class BodyDrag:
         perturb.localpos = data.xmat[body].reshape(3, 3).T @ (point - data.xpos[body])
         ux.InitPerturb(model, data, camera, perturb, _TRANSLATE)
         perturb.active = _TRANSLATE
-        # The force reaches the limit at the same length, whatever the mass of the body.
+        # The force reaches the limit at the same length for every mass.
         perturb.localmass = limit / (model.vis.map.stiffness * _REACH * camera.distance)
         return True
 

@@ -34,7 +34,7 @@ class GoalPanel:
     """The part of the robot's panel that sets the goal.
 
     Attributes:
-        keeps_goal: Whether the visitor's goals are repeated in later episodes.
+        keeps_goal: True if later episodes repeat the visitor's goals.
     """
 
     def __init__(self, send: Send) -> None:

@@ -31,7 +31,7 @@ class _GoalDrag:
 
 
 class Page(plugin.ViewerPlugin):
-    """Draws pictures, and sends what the visitor asks for.
+    """Draws pictures, and sends the visitor's requests.
 
     Args:
         episodes: Episode files to choose from.

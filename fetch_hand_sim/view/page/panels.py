@@ -52,7 +52,7 @@ class Panels:
 
     @property
     def keeps_goal(self) -> bool:
-        """Whether the visitor's goals are repeated in later episodes."""
+        """True if later episodes repeat the visitor's goals."""
         return self._robot_panel.keeps_goal
 
     def draw(self, picture: Picture | None) -> None:

@@ -59,7 +59,7 @@ class RobotPanel:
 
     @property
     def keeps_goal(self) -> bool:
-        """Whether the visitor's goals are repeated in later episodes."""
+        """True if later episodes repeat the visitor's goals."""
         return self._goal_panel.keeps_goal
 
     def draw(self, spec: TaskSpec, picture: Picture) -> None:
