@@ -62,14 +62,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     from fetch_hand_sim.films.film import check_kind
 
-    check_kind(options.out)
-    _check_is_used(options)
     try:
+        check_kind(options.out)
+        _check_is_used(options)
         _render(options)
     except ValueError as error:
         # Unreadable episodes too.
         raise UsageError(str(error)) from None
-    except RuntimeError as error:
+    except (RuntimeError, OSError) as error:
         raise CommandError(str(error)) from None
     say(f'{options.out}: {options.out.stat().st_size / 1024:.0f} KiB')
     return EXIT_SUCCESS

@@ -62,8 +62,7 @@ def export_lerobot(
     Raises:
         ExportError: If pyarrow is missing, or a dataset exists or cannot be written; none is
             created.
-        UsageError: If a film is asked for and there is no ffmpeg.
-        ValueError: If a model has no such camera.
+        ValueError: If a model has no such camera, or ffmpeg is missing for a film.
         RuntimeError: If there is no OpenGL to draw with.
     """
     require_module('pyarrow.parquet')

@@ -73,8 +73,8 @@ def write_episodes(
     Raises:
         ValueError: If the model has no such camera, or an episode cannot be read.
         RuntimeError: If there is no OpenGL.
-        UsageError: If there is no ffmpeg.
-        CommandError: If the film cannot be written.
+        ValueError: If ffmpeg is missing.
+        OSError: If the film cannot be written.
     """
     studio = Studio(camera.width, camera.height, camera.name)
     histograms = [np.zeros((3, _LEVELS), dtype=np.int64) for _ in episodes]

@@ -18,7 +18,6 @@ import numpy as np
 from PIL import Image, TiffImagePlugin
 
 from msgs_spec.arrays import Picture
-from node_runtime.command_line import CommandError, UsageError
 
 MOVING = ('.mp4', '.gif', '.webp')
 STILL = ('.png', '.jpg')
@@ -68,15 +67,17 @@ def check_kind(path: Path) -> None:
     """Check that a file can be written, before anything is drawn.
 
     Raises:
-        UsageError: If the suffix is unknown, the folder does not exist, or ffmpeg is missing.
+        ValueError: If the suffix is unknown, the folder does not exist, or ffmpeg is missing.
     """
     kind = path.suffix.lower()
     if kind not in (*MOVING, *STILL):
-        raise UsageError(f'--out {path}; allowed: {", ".join((*MOVING, *STILL))}')
+        raise ValueError(
+            f'{path.name} has no known suffix; allowed: {", ".join((*MOVING, *STILL))}'
+        )
     if path.is_dir():
-        raise UsageError(f'--out {path} is a directory; a file is allowed')
+        raise ValueError(f'{path} is a directory; a file is allowed')
     if not path.absolute().parent.is_dir():
-        raise UsageError(f'--out {path}: {path.absolute().parent} is no directory')
+        raise ValueError(f'{path}: {path.absolute().parent} is no directory')
     if kind == '.mp4':
         _ffmpeg()
 
@@ -85,14 +86,14 @@ def check_size(path: Path, width: int, height: int) -> None:
     """Check that the format can store pictures of a size, before they are drawn.
 
     Raises:
-        UsageError: If the size exceeds the limit of the format.
+        ValueError: If the size exceeds the limit of the format.
     """
     kind = path.suffix.lower()
     largest = _LARGEST_SIDE.get(kind)
     if largest is not None and max(width, height) > largest:
-        raise UsageError(f'{width}x{height} pixels; allowed: {largest} a side of a {kind} file')
+        raise ValueError(f'{width}x{height} pixels; allowed: {largest} a side of a {kind} file')
     if width * height > _MOST_PIXELS:
-        raise UsageError(f'{width}x{height} pixels; allowed: {_MOST_PIXELS} in all')
+        raise ValueError(f'{width}x{height} pixels; allowed: {_MOST_PIXELS} in all')
 
 
 def write_film(
@@ -109,8 +110,8 @@ def write_film(
             0 leaves the choice to the encoder.
 
     Raises:
-        UsageError: If ffmpeg is missing.
-        CommandError: If ffmpeg fails or the file cannot be written.
+        ValueError: If ffmpeg is missing.
+        OSError: If ffmpeg fails or the file cannot be written.
     """
     with _appearing(path) as hidden:
         if path.suffix.lower() == '.mp4':
@@ -123,7 +124,7 @@ def write_picture(path: Path, picture: Picture) -> None:
     """Write one picture (height, width, 3) as .png or .jpg; the file appears when it is complete.
 
     Raises:
-        CommandError: If the file cannot be written.
+        OSError: If the file cannot be written.
     """
     with _appearing(path) as hidden:
         Image.fromarray(picture).save(hidden, quality=85, optimize=True)
@@ -185,7 +186,7 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float, keyframe_eve
                 process.stdin.close()
         complaint = process.stderr.read().decode(errors='replace')
     if process.returncode:
-        raise CommandError(f'ffmpeg: {complaint or process.returncode}')
+        raise OSError(f'ffmpeg: {complaint or process.returncode}')
 
 
 def _ffmpeg() -> str:
@@ -196,7 +197,7 @@ def _ffmpeg() -> str:
     except (ImportError, RuntimeError):
         found = shutil.which('ffmpeg')
     if found is None:
-        raise UsageError("mp4 needs ffmpeg: pip install 'fetch_hand_sim[film]'; or write a .gif")
+        raise ValueError("mp4 needs ffmpeg: pip install 'fetch_hand_sim[film]'; or write a .gif")
     return found
 
 
@@ -211,7 +212,9 @@ def _appearing(path: Path) -> Iterator[Path]:
         yield hidden
         os.replace(hidden, target)
     except OSError as error:
-        raise CommandError(f'{path}: {error.strerror or error}') from error
+        if error.strerror is None:
+            raise
+        raise OSError(f'{path}: {error.strerror}') from error
     finally:
         # A read-only disk also refuses to remove a file that does not exist.
         with suppress(OSError):

@@ -25,7 +25,6 @@ from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.films.studio import Studio
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes
 from msgs_spec.arrays import Picture
-from node_runtime.command_line import CommandError, UsageError
 
 # Range of the pictures per second of a file.
 _RATES = (0.001, 1000.0)
@@ -95,16 +94,11 @@ class Film:
             OSError: If the file cannot be written.
         """
         file = Path(path).expanduser()
-        try:
-            if file.suffix.lower() not in MOVING:
-                raise UsageError(f'a film ends in {", ".join(MOVING)}, not {file.name!r}')
-            check_kind(file)
-            check_size(file, self._shape[1], self._shape[0])
-            write_film(file, self, self.fps)
-        except UsageError as error:
-            raise ValueError(str(error).removeprefix('--out ')) from None
-        except CommandError as error:
-            raise OSError(str(error)) from error
+        if file.suffix.lower() not in MOVING:
+            raise ValueError(f'a film ends in {", ".join(MOVING)}, not {file.name!r}')
+        check_kind(file)
+        check_size(file, self._shape[1], self._shape[0])
+        write_film(file, self, self.fps)
         return file
 
     def __repr__(self) -> str:

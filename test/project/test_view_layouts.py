@@ -71,47 +71,6 @@ def test_foxglove_shows_topics_that_there_are():
     assert placed == set(panels)
 
 
-def test_foxglove_gets_what_its_panels_read():
-    """The keys that its 3D and Plot panels keep in layouts, by its last open source and exports."""
-    layout = json.loads((ROOT / 'config/foxglove_layout.json').read_text())
-    assert set(layout) == {
-        'configById',
-        'globalVariables',
-        'userNodes',
-        'playbackConfig',
-        'layout',
-    }
-    panels = layout['configById']
-    assert {name.partition('!')[0] for name in panels} == {'3D', 'Plot', 'DiagnosticSummary'}
-    for identity, layer in panels['3D!robot']['layers'].items():
-        assert layer['instanceId'] == identity
-        assert layer['sourceType'] == 'topic' and layer['displayMode'] == 'visual'
-        assert layer['framePrefix'] == '' and layer['frameLocked'] and layer['visible']
-    sizes = {'target': 3, 'targetOffset': 3, 'targetOrientation': 4}
-    camera = panels['3D!robot']['cameraState']
-    assert {name: len(camera[name]) for name in sizes} == sizes
-    # It follows `world`, and then moves by the offset alone.
-    assert camera['target'] == [0, 0, 0] and camera['targetOffset'] != [0, 0, 0]
-    # The default turns STL files of URDFs by 90 degrees.
-    assert panels['3D!robot']['scene']['meshUpAxis'] == 'z_up'
-    for plot in (config for name, config in panels.items() if name.startswith('Plot')):
-        assert plot['foxglovePanelTitle'] == plot['lichtblickPanelTitle'] != ''
-        for path in plot['paths']:
-            # Stamps are simulated time, far away from a recording or a bridge on wall time.
-            assert path['timestampMethod'] == 'receiveTime'
-            assert path['enabled'] is True
-            # All values of a slice would be one line.
-            assert ':' not in path['value']
-    sizes_of_commands = [task.robot.action_size for task in TASKS.values()]
-    assert len(panels['Plot!command']['paths']) == max(sizes_of_commands)
-    children = [layout['layout']]
-    while children:
-        child = children.pop()
-        if isinstance(child, dict):
-            assert child['direction'] in ('row', 'column')
-            children += [child['first'], child['second']]
-
-
 def curves(name, message):
     """The numbers of a message by the names that PlotJuggler 3.17.2 was seen to give them."""
     if name == '/joint_states':

@@ -213,10 +213,6 @@ class Browser:
         )
         self.wait(0.25)
 
-    def hang(self) -> None:
-        """Stops all of its processes; only `close` is left to do."""
-        os.killpg(self._process.pid, signal.SIGSTOP)
-
     def close(self) -> None:
         if self._process.poll() is None:
             # Those that are stopped too.

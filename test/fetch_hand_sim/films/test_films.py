@@ -25,7 +25,6 @@ from fetch_hand_sim.films.recording import load_recordings
 from fetch_hand_sim.films.studio import Studio, grid, sheets
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.simulation.opengl import prepare_opengl
-from node_runtime.command_line import CommandError, UsageError
 from support.crafted_files import Crafter
 from support.episode_recorder import Recorder
 from support.full_disk import files_at_most
@@ -136,26 +135,9 @@ def test_what_ffmpeg_says_is_not_lost_with_the_pipe(side, tmp_path, monkeypatch)
     ffmpeg.chmod(0o755)
     monkeypatch.setenv('IMAGEIO_FFMPEG_EXE', str(ffmpeg))
     picture = np.zeros((side, side, 3), dtype=np.uint8)
-    with pytest.raises(CommandError, match='ffmpeg: No space left on device'):
+    with pytest.raises(OSError, match='ffmpeg: No space left on device'):
         write_film(tmp_path / 'film.mp4', (picture for _ in range(200)), fps=25.0)
     assert [each.name for each in tmp_path.iterdir()] == ['ffmpeg']
-
-
-@pytest.mark.parametrize('name', ['film.gif', 'picture.PNG'])
-@pytest.mark.parametrize('is_there', [True, False])
-def test_a_link_stays_one_and_what_it_leads_to_is_written(name, is_there, tmp_path):
-    (tmp_path / 'store').mkdir()
-    target, link = tmp_path / 'store' / 'newest', tmp_path / name
-    if is_there:
-        target.write_bytes(b'older')
-    link.symlink_to(target)
-    if link.suffix == '.gif':
-        write_film(link, iter(PICTURES), fps=25.0)
-    else:
-        write_picture(link, PICTURES[0])
-    assert link.is_symlink() and [each.name for each in target.parent.iterdir()] == ['newest']
-    with Image.open(target) as image:
-        assert image.size == (7, 5)
 
 
 def test_two_processes_that_write_one_film_leave_a_whole_one(tmp_path):
@@ -191,16 +173,16 @@ def test_a_disk_that_may_only_be_read_is_one_line(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr('pathlib.Path.unlink', refuse)
         patch.setattr('PIL.Image.Image.save', lambda image, path, **options: refuse(path))
-        with pytest.raises(CommandError, match=r'picture\.png: Read-only file system'):
+        with pytest.raises(OSError, match=r'picture\.png: Read-only file system'):
             write_picture(tmp_path / 'picture.png', PICTURES[0])
 
 
 @pytest.mark.parametrize('out', ['film.avi', 'film', 'nosuch/film.gif'])
 def test_what_cannot_be_written_is_said_before_drawing(out, tmp_path):
-    with pytest.raises(UsageError):
+    with pytest.raises(ValueError, match=out.rpartition('/')[2] or out):
         check_kind(tmp_path / out)
     (tmp_path / 'film.webp').mkdir()
-    with pytest.raises(UsageError, match=r'film\.webp is a directory'):
+    with pytest.raises(ValueError, match=r'film\.webp is a directory'):
         check_kind(tmp_path / 'film.webp')
 
 
@@ -216,7 +198,7 @@ def test_a_sheet_that_a_file_cannot_hold_is_one_line_before_drawing(
         f'render_episode: 81958x48 pixels; allowed: {largest} a side of a .{kind} file\n'
     )
     check_size(out, largest, min(largest, 2**28 // largest))
-    with pytest.raises(UsageError, match='allowed: 268435456 in all'):
+    with pytest.raises(ValueError, match='allowed: 268435456 in all'):
         check_size(out.with_suffix('.png'), 2**14, 2**14 + 1)
 
 

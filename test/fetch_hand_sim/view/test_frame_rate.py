@@ -17,30 +17,25 @@ def frames(rate, begin, end, touch=lambda now: Touch(), work=1 / 60):
     return times
 
 
-def test_nobody_touches_the_page():
-    assert len(frames(FrameRate(), 10.0, 12.0)) == pytest.approx(60, abs=2)
-
-
-def test_a_robot_in_a_hurry_is_shown_less_often():
-    assert len(frames(FrameRate(lambda: 0.05), 10.0, 12.0)) == pytest.approx(40, abs=2)
-
-
-def test_a_frame_that_takes_longer_is_followed_at_once():
-    assert len(frames(FrameRate(), 10.0, 12.0, work=0.05)) == 40
-
-
 @pytest.mark.parametrize(
-    'touch',
+    ('touch', 'options', 'count'),
     [
-        lambda now: Touch(mouse=(100.0 * now, 5.0)),
-        lambda now: Touch(wheel=1.0),
-        lambda now: Touch(is_down=True),
-        lambda now: Touch(is_typing=True),
+        (Touch(), {}, 60),
+        (Touch(), {'work': 0.05}, 40),
+        (Touch(wheel=1.0), {}, 120),
+        (Touch(is_down=True), {}, 120),
+        (Touch(is_typing=True), {}, 120),
     ],
-    ids=['moving', 'turning', 'holding', 'typing'],
 )
-def test_a_hand_at_the_page(touch):
-    assert len(frames(FrameRate(), 10.0, 12.0, touch)) == pytest.approx(120, abs=2)
+def test_frames_are_rare_unless_the_page_is_touched(touch, options, count):
+    times = frames(FrameRate(), 10.0, 12.0, lambda now: touch, **options)
+    assert len(times) == pytest.approx(count, abs=2)
+
+
+def test_a_fast_robot_is_drawn_less_often_and_a_moving_mouse_often():
+    assert len(frames(FrameRate(lambda: 0.05), 10.0, 12.0)) == pytest.approx(40, abs=2)
+    moving = frames(FrameRate(), 10.0, 12.0, lambda now: Touch(mouse=(100.0 * now, 5.0)))
+    assert len(moving) == pytest.approx(120, abs=2)
 
 
 def test_a_hand_that_rests_is_forgotten():

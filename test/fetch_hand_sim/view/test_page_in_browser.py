@@ -33,7 +33,6 @@ from msgs_spec.topics import topic
 from support.browser import SIZE, Browser, find_browser
 from support.episode_recorder import Recorder
 from support.graph import Client, client, ros_args
-from support.pace import assert_keeps_pace
 
 pytestmark = [
     pytest.mark.skipif(find_browser() is None, reason='no Chromium: apt install chromium'),
@@ -484,20 +483,3 @@ def test_the_robot_is_where_it_stands_and_a_second_visitor_sees_it(browser, star
         watcher.open(url)
         # From a camera of its own.
         keep('watched', wait_for(watcher, has_blue_parts, 'robot for who watches'))
-
-
-def test_pages_that_are_closed_or_hang_are_not_noticed(start_process, robot):
-    url = address_of(start_process(*VIEW))
-
-    @contextmanager
-    def one_closed_and_one_that_hangs():
-        with closing(Browser()) as hanging:
-            hanging.open(url)
-            wait_for_scene(hanging)
-            with closing(Browser()) as leaving:
-                leaving.open(url)
-                wait_for_scene(leaving)
-            hanging.hang()
-            yield
-
-    assert_keeps_pace(robot, one_closed_and_one_that_hangs)

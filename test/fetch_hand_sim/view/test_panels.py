@@ -1,4 +1,4 @@
-"""Where the panels of the page are."""
+"""Layout of the panels, and the list of episodes."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.view.page import panels
+from fetch_hand_sim.view.page.panels import describe
 from fetch_hand_sim.view.page.widgets import MARGIN, WIDTH, Windows
 from fetch_hand_sim.view.picture import Picture, Timeline
+from support.episode_recorder import Recorder
 
 HEIGHT = 180.0
 EPISODES = (Path('a'), Path('b'))
@@ -72,3 +75,15 @@ def test_on_a_telephone_nothing_lies_on_another_and_the_robot_is_seen(places_on)
     drawn._hidden.discard('Curves')
     places = places_on(390.0).places
     assert places['Curves'][2] and places['Episodes'][1] >= places['Curves'][1] + HEIGHT
+
+
+def test_an_episode_says_how_it_ended(tmp_path):
+    path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
+    assert describe(path) in (f'{path.name}  reached', f'{path.name}  missed')
+
+
+def test_what_cannot_be_read_is_listed_all_the_same(tmp_path):
+    damaged = tmp_path / 'damaged.mcap'
+    damaged.write_bytes(b'nothing')
+    assert describe(damaged) == 'damaged  unreadable'
+    assert describe(tmp_path / 'gone.mcap') == 'gone  unreadable'

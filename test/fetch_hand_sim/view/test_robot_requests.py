@@ -12,7 +12,6 @@ from fetch_hand_sim.view.page import robot_panel, widgets
 from fetch_hand_sim.view.picture import Facts, Picture
 from fetch_hand_sim.view.requests import (
     ChooseActor,
-    OpenEpisode,
     Push,
     SetCommand,
     SetCommanding,
@@ -106,12 +105,6 @@ def test_sliders_command_only_while_they_are_switched_on(desk):
     desk.requests.perform(SetCommand(values))
     assert desk.count_publishers() == 0
     assert desk.told['is_commanding'] is False
-
-
-@pytest.mark.parametrize('desk', ['perturb'], indirect=True)
-def test_what_only_files_understand_is_nothing_to_a_robot(desk):
-    desk.requests.perform(OpenEpisode(1))
-    assert desk.told == {}
 
 
 @pytest.mark.parametrize('desk', ['perturb'], indirect=True)

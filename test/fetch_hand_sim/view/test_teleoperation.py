@@ -26,14 +26,6 @@ def test_an_axis_of_fetch_moves_while_the_key_is_held():
     assert keys.values.tolist()[:3] == [0.0, 0.0, 0.0]
 
 
-def test_an_axis_rests_when_another_one_is_chosen_under_the_key():
-    keys = Teleoperation(FETCH, None)
-    keys.hold(1, FRAME)
-    keys.select(1)
-    keys.hold(1, FRAME)
-    assert keys.values.tolist()[:3] == [0.0, 1.0, 0.0]
-
-
 def test_an_axis_starts_at_rest_and_the_gripper_as_it_is():
     keys = Teleoperation(FETCH, np.array([1.0, -1.0, 0.5, -0.7]))
     assert keys.values.tolist() == [0.0, 0.0, 0.0, -0.7]
@@ -54,13 +46,6 @@ def test_a_joint_goes_on_and_stays_within_its_limits():
     assert keys.values[3] == part.lower
     others = np.delete(np.arange(len(before)), 3)
     np.testing.assert_array_equal(keys.values[others], before[others])
-
-
-def test_a_slider_that_people_set_is_left_alone():
-    keys = Teleoperation(FETCH, None)
-    keys.values[0] = 0.3
-    keys.hold(0, FRAME)
-    assert keys.values[0] == 0.3
 
 
 @pytest.mark.parametrize('robot', [FETCH, SHADOW_HAND])
