@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import logging
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from fetch_hand_sim.simulation.arguments import (
     require_whole,
     selected_simulations,
 )
+from fetch_hand_sim.simulation.disturber import Disturber
 from fetch_hand_sim.simulation.divergence import DivergenceWatch
 from fetch_hand_sim.simulation.first_reset import (
     require_as_declared,
@@ -40,6 +42,7 @@ from fetch_hand_sim.simulation.tasks import Task, make_task
 from fetch_hand_sim.simulation.trial import TRIED, try_out
 from msgs_spec.actions import command_from_action
 from msgs_spec.arrays import Array
+from msgs_spec.disturbances import Disturbances, read_disturbances
 from msgs_spec.observations import Readings
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
@@ -91,6 +94,9 @@ class Simulation:
             gives as MuJoCo left it.
         timing: What another rate than 25 Hz leaves as it is: `seconds` of an episode and the speed
             of the Fetch gripper, or `ticks` and its step, as up to 1.0 and as the reference does.
+        disturbances: Delays, noise, other physics (`msgs_spec.disturbances.read_disturbances`).
+            `observation` is then what the disturbed sensors measure. `achieved_goal`, rewards and
+            success follow the true state.
 
     Attributes:
         spec: The task as data, `episode_ticks` at this rate.
@@ -116,6 +122,7 @@ class Simulation:
         control_hz: float = DEFAULT_CONTROL_HZ,
         keeps_data: bool = False,
         timing: Timing = 'seconds',
+        disturbances: Disturbances | Mapping[str, Any] | str | None = None,
     ) -> None:
         require_whole('num_envs', num_envs)
         require_whole('num_threads', num_threads)
@@ -149,6 +156,10 @@ class Simulation:
         self._is_pushed = False
         self._is_started = np.zeros(num_envs, dtype=np.bool_)
         self._process = os.getpid()
+        self._disturber: Disturber | None = None
+        chosen = read_disturbances(disturbances)
+        if not chosen.is_off:
+            self._disturber = Disturber(self._task, chosen)
         # The thirteen are held to their specification by tests.
         self._is_as_declared = self.spec.reference_id is not None
 
@@ -358,13 +369,31 @@ class Simulation:
         """Commands (N, action size) that let the robots stay as they are."""
         return self._task.resting_commands()
 
+    @property
+    def disturbances(self) -> Disturbances:
+        """What is disturbed."""
+        return Disturbances() if self._disturber is None else self._disturber.disturbances
+
+    def variation(self, index: int) -> dict[str, float]:
+        """Return what the running episode of a simulation drew from its disturbances."""
+        if self._disturber is None:
+            return {}
+        return {name: float(values[index]) for name, values in self._disturber.variations.items()}
+
     def readings(self) -> Readings:
-        """What the sensors say now, (N, topic.size) for each topic, fresh arrays."""
+        """Return what the sensors measure, (N, topic.size) for each topic, fresh arrays."""
+        return self.true_readings() if self._disturber is None else self._disturber.readings()
+
+    def true_readings(self) -> Readings:
+        """Return what undisturbed sensors would measure, as `readings`."""
         return self._task.readings()
 
     def observe(self) -> Observation:
-        """The observation as it is now, fresh arrays."""
-        return self._observation(*self._task.observe())
+        """Return the present observation, fresh arrays."""
+        if self._disturber is None:
+            return self._observation(*self._task.observe())
+        sensed, _ = self._task.observe_from(self._disturber.readings())
+        return self._observation(sensed, self._task.observe()[1])
 
     def __copy__(self) -> Simulation:
         """As `copy.deepcopy`: two simulations have no physics or generators in common."""
@@ -373,7 +402,12 @@ class Simulation:
     def __getstate__(self) -> dict[str, Any]:
         """Arguments and everything that decides the future, for `pickle` and `copy.deepcopy`."""
         return {
-            'arguments': {'task': self.spec.name, **self._arguments},
+            'arguments': {
+                'task': self.spec.name,
+                **self._arguments,
+                'disturbances': self.disturbances,
+            },
+            'disturbed': None if self._disturber is None else self._disturber.state(),
             'model': self.model if self._model_may_change else None,
             'pairs': self._task.pairs if self._model_may_change else None,
             'metric': self.metric,
@@ -394,6 +428,8 @@ class Simulation:
         self.metric = state['metric']
         self._task.set_physics_state(state['physics'])
         self._divergence.forget()
+        if self._disturber is not None:
+            self._disturber.set_state(state['disturbed'])
         self.goals[:] = state['goals']
         self._generators = state['generators']
         self.divergences = state['divergences']
@@ -416,6 +452,9 @@ class Simulation:
             waiting = np.flatnonzero(~self._is_started).tolist()
             raise ResetNeeded(f'reset comes before the first step: simulations {waiting!s:.60}')
         self._require_threads()
+        if self._disturber is not None:
+            commands = self._disturber.command(commands)
+            self._is_pushed |= self._disturber.push(self._pushes)
         self._task.apply_commands(commands)
         try:
             self._task.step()
@@ -426,6 +465,8 @@ class Simulation:
             self._pushes[:] = 0.0
             self._is_pushed = False
         diverged = failed | self._divergence.found()
+        if self._disturber is not None:
+            self._disturber.sense()
         if diverged.any():
             self._restart(diverged)
         return diverged
@@ -448,7 +489,14 @@ class Simulation:
     def _start(self, ids: NDArray[np.intp]) -> None:
         """Begins episodes; what MuJoCo warned of before counts no more."""
         self._require_threads()
-        goals = self._task.reset(ids, [self.generator(i) for i in ids.tolist()])
+        own = [self.generator(i) for i in ids.tolist()]
+        # A far part of each generator's own sequence: start and goal draw the same without it.
+        streams = [np.random.Generator(_jumped(each)) for each in own] if self._disturber else []
+        if self._disturber is not None:
+            self._disturber.start_nominal(ids)
+        goals = self._task.reset(ids, own)
+        if self._disturber is not None:
+            self._disturber.start(ids, streams)
         if not self._is_as_declared:
             require_goals(self.spec, goals, ids.size)
             require_as_declared(self._task, self.metric, goals, ids)
@@ -490,3 +538,10 @@ class Simulation:
 
     def _select(self, ids: ArrayLike | None) -> NDArray[np.intp]:
         return self._all if ids is None else selected_simulations(ids, self.num_envs)
+
+
+def _jumped(generator: np.random.Generator) -> np.random.BitGenerator:
+    """Return a stream that no number of draws from `generator` reaches."""
+    source: Any = generator.bit_generator
+    jumped: np.random.BitGenerator = source.jumped()
+    return jumped

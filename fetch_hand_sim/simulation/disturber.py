@@ -1,0 +1,411 @@
+"""Applies `Disturbances` to a batch: commands, physics, pushes, start states and sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.tasks import Task
+from fetch_hand_sim.simulation.varied_physics import VariedPhysics, joint_dofs
+from msgs_spec.actions import command_limits
+from msgs_spec.arrays import Array
+from msgs_spec.disturbances import MOST_TICKS, Disturbances
+from msgs_spec.observations import Readings
+from msgs_spec.robots import FINGERTIPS
+from msgs_spec.rotations import quaternion_multiply
+
+Ids = NDArray[np.intp]
+# Ticks whose random numbers are drawn at once.
+_BLOCK = 64
+# Tracking that is lost comes back after half a second.
+_LOST_TICKS = 12
+# What an episode draws once, by the name of its field; `_drawn` says from what.
+_SPANS = {
+    'action_latency': ('action', 'latency'),
+    'joint_latency': ('joints', 'latency'),
+    'object_latency': ('object', 'latency'),
+    'object_period': ('object', 'period'),
+    'friction': ('physics', 'friction'),
+    'object_mass': ('physics', 'object_mass'),
+    'object_size': ('physics', 'object_size'),
+    'gain': ('physics', 'gain'),
+    'force_limit': ('physics', 'force_limit'),
+    'damping': ('physics', 'damping'),
+    'table_height': ('physics', 'table_height'),
+}
+VARIATIONS = (*_SPANS, 'gravity_tilt', 'gravity_direction')
+# Topics computed from the joint sensors, and the sites whose poses they hold.
+_LED = {
+    'end_effector_pose': ('robot0:grip',),
+    'fingertip_poses': tuple(f'robot0:S_{name}' for name in FINGERTIPS),
+}
+_JOINT_TOPICS = ('joint_states', 'end_effector_pose', 'end_effector_twist', 'fingertip_poses')
+_OBJECT_TOPICS = ('object_pose', 'object_twist', 'object_joint')
+
+
+class Disturber:
+    """The disturbances of N simulations of one task.
+
+    All random numbers of an episode come from one stream that belongs to the episode's seed and is
+    independent of the draws of start and goal.
+
+    Args:
+        task: The simulations.
+        disturbances: What is disturbed.
+
+    Attributes:
+        disturbances: As given.
+        variations: What the running episodes drew, (N,) each, by the names in `VARIATIONS`.
+    """
+
+    def __init__(self, task: Task, disturbances: Disturbances) -> None:
+        self.disturbances = disturbances
+        self._task = task
+        count, size = task.batch.nsim, task.spec.robot.action_size
+        self._all = np.arange(count)
+        self.variations = {name: np.zeros(count) for name in VARIATIONS}
+        is_angle = np.array([unit == 'rad' for unit in task.spec.robot.joint_units])
+        self._angles = np.flatnonzero(is_angle)
+        self._widths = {
+            'action': size,
+            'joint': self._angles.size,
+            'velocity': self._angles.size,
+            'object': 6,
+            'push': 3,
+        }
+        ends = np.cumsum(list(self._widths.values()))
+        self._columns = {
+            name: slice(int(end) - width, int(end))
+            for (name, width), end in zip(self._widths.items(), ends, strict=True)
+        }
+        self._streams: list[np.random.Generator | None] = [None] * count
+        self._tick = np.zeros(count, np.int64)
+        self._normal = np.zeros((count, _BLOCK, int(ends[-1])))
+        self._uniform = np.zeros((count, _BLOCK, 5))
+        self._biases = {name: np.zeros((count, self._widths[name])) for name in self._widths}
+        self._start_shift = np.zeros((count, 2))
+        self._start_joints = np.zeros((count, self._angles.size))
+        self._lower, self._upper = command_limits(task.spec.robot)
+        self._sent = np.zeros((MOST_TICKS + 1, count, size))
+        self._applied = np.zeros((count, size))
+        self._lost = np.zeros(count, np.int64)
+        self._true: dict[str, Array] = {}
+        self._held: dict[str, Array] = {}
+        self._physics = VariedPhysics(task, disturbances.physics)
+        self._pushed_body = _pushed_body(task)
+        self._object = _object_address(task.model)
+        model, names = task.model, task.spec.robot.joints
+        self._joint_qpos = np.array([int(model.joint(names[i]).qposadr[0]) for i in self._angles])
+        self._levers = _levers(task) if self._moves_joint_readings() else {}
+
+    def _moves_joint_readings(self) -> bool:
+        joints = self.disturbances.joints
+        return bool(joints.noise or joints.bias or joints.resolution)
+
+    # Episodes
+
+    def start_nominal(self, ids: Ids) -> None:
+        """Restore the model's physics, in which the task draws its start state."""
+        self._physics.restore(ids)
+
+    def start(
+        self,
+        ids: Ids,
+        streams: Sequence[np.random.Generator],
+        given: Mapping[str, float] | None = None,
+    ) -> None:
+        """Begin episodes whose start state the task has set.
+
+        Args:
+            ids: The simulations, (n,).
+            streams: A random stream for each.
+            given: Variations that are not drawn, by the names in `VARIATIONS`.
+        """
+        for index, stream in zip(ids.tolist(), streams, strict=True):
+            self._streams[index] = stream
+            self._draw_episode(index, stream, given or {})
+            self._draw_block(index)
+        self._tick[ids] = 0
+        self._lost[ids] = 0
+        self._sent[:, ids] = self._task.resting_commands()[ids]
+        self._applied[ids] = self._sent[0, ids]
+        has_changed = self._physics.apply(ids, self.variations)
+        has_changed |= self._shift_start(ids)
+        if has_changed:
+            self._task.batch.forward(ids)
+        self._sense(ids, is_first=True)
+
+    def _draw_episode(
+        self, index: int, stream: np.random.Generator, given: Mapping[str, float]
+    ) -> None:
+        uniform = stream.random(len(VARIATIONS))
+        for name, share in zip(VARIATIONS, uniform.tolist(), strict=True):
+            self.variations[name][index] = given.get(name, self._drawn(name, share))
+        spread = {
+            'action': self.disturbances.action.bias,
+            'joint': self.disturbances.joints.bias,
+        }
+        for name, values in self._biases.items():
+            values[index] = spread.get(name, 0.0) * stream.standard_normal(self._widths[name])
+        pose = self._biases['object'][index]
+        pose[:] = stream.standard_normal(6)
+        pose[:3] *= self.disturbances.object.bias
+        pose[3:] *= self.disturbances.object.rotation_bias
+        self._start_shift[index] = stream.uniform(-1.0, 1.0, 2)
+        self._start_joints[index] = stream.standard_normal(self._angles.size)
+
+    def _drawn(self, name: str, share: float) -> float:
+        """A value from the range of a variation, `share` of the way through it."""
+        if name == 'gravity_tilt':
+            return share * self.disturbances.physics.gravity_tilt
+        if name == 'gravity_direction':
+            return share * 2.0 * np.pi
+        group, field_name = _SPANS[name]
+        values = getattr(self.disturbances, group)
+        lowest, highest = getattr(values, field_name)
+        kind = next(each.metadata['kind'] for each in fields(values) if each.name == field_name)
+        if kind in ('ticks', 'period'):
+            return float(lowest + int(share * (highest - lowest + 1)))
+        if kind == 'factor':
+            return float(lowest * (highest / lowest) ** share)
+        return float(lowest + share * (highest - lowest))
+
+    def _draw_block(self, index: int) -> None:
+        stream = self._streams[index]
+        assert stream is not None, 'every episode has begun'
+        self._normal[index] = stream.standard_normal(self._normal.shape[1:])
+        self._uniform[index] = stream.random(self._uniform.shape[1:])
+
+    def _shift_start(self, ids: Ids) -> bool:
+        """Move objects and joints of new episodes; return whether something has moved."""
+        start, moved = self.disturbances.start, False
+        qpos: Array = self._task.batch.bind('qpos')
+        if self._object is not None:
+            lift = self.variations['table_height'][ids]
+            if start.object_position or lift.any():
+                shift = start.object_position * self._start_shift[ids]
+                qpos[ids, self._object : self._object + 2] += shift
+                qpos[ids, self._object + 2] += lift
+                moved = True
+        if start.joints and not self._task.spec.robot.has_gripper_command:
+            qpos[np.ix_(ids, self._joint_qpos)] += start.joints * self._start_joints[ids]
+            moved = True
+        return moved
+
+    # Commands
+
+    def command(self, commands: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Return what reaches the motors in this tick, (N, action size), in the type given."""
+        self._next_tick()
+        action, row = self.disturbances.action, self._tick % _BLOCK
+        self._sent = np.roll(self._sent, 1, axis=0)
+        self._sent[0] = commands
+        delay = self.variations['action_latency'].astype(np.intp)
+        arrived = self._sent[delay, self._all]
+        chance = self._uniform[self._all, row]
+        kept = self._applied
+        if self._task.spec.robot.has_gripper_command:
+            dropped = np.zeros_like(kept)
+        else:
+            dropped = kept
+        arrived = np.where((chance[:, 0] < action.drop)[:, None], dropped, arrived)
+        self._applied = np.where((chance[:, 1] < action.repeat)[:, None], kept, arrived)
+        noise = action.noise * self._normal[self._all, row, self._columns['action']]
+        moved = noise + self._biases['action']
+        if not moved.any():
+            return self._applied.astype(commands.dtype)
+        half = (self._upper - self._lower) / 2.0
+        disturbed = np.clip(self._applied + half * moved, self._lower, self._upper)
+        return disturbed.astype(commands.dtype)
+
+    def pending_commands(self) -> Array:
+        """Return the last `MOST_TICKS` commands, newest first, (N, MOST_TICKS, action size)."""
+        return np.moveaxis(self._sent[:MOST_TICKS], 0, 1).copy()
+
+    def push(self, forces: Array) -> bool:
+        """Add the pushes of this tick to (N, bodies, 6) wrenches; return whether there are any."""
+        pushes = self.disturbances.pushes
+        if not pushes.force:
+            return False
+        row = self._tick % _BLOCK
+        per_tick = pushes.rate * self._task.tick_duration
+        pushed = self._uniform[self._all, row, 2] < per_tick
+        force = pushes.force * self._normal[self._all, row, self._columns['push']]
+        forces[pushed, self._pushed_body, :3] += force[pushed]
+        return bool(pushed.any())
+
+    def _next_tick(self) -> None:
+        self._tick += 1
+        for index in np.flatnonzero(self._tick % _BLOCK == 0).tolist():
+            self._draw_block(index)
+
+    # Sensors
+
+    def sense(self) -> None:
+        """Take the measurements of this tick; `readings` returns them until the next."""
+        self._sense(self._all, is_first=False)
+
+    def readings(self) -> Readings:
+        """Return what the disturbed sensors measured last, fresh arrays."""
+        return {name: values.copy() for name, values in self._held.items()}
+
+    def _sense(self, ids: Ids, is_first: bool) -> None:
+        true = self._task.readings()
+        for name, values in true.items():
+            if name not in self._true:
+                self._true[name] = np.zeros((MOST_TICKS + 1, *values.shape))
+                self._held[name] = values.copy()
+            past = self._true[name]
+            if is_first:
+                past[:, ids] = values[ids]
+            else:
+                past[1:] = past[:-1].copy()
+                past[0] = values
+        self._sense_joints(ids, true)
+        self._sense_object(ids, true, is_first)
+        for name in true.keys() - {*_JOINT_TOPICS, *_OBJECT_TOPICS}:
+            self._held[name][ids] = true[name][ids]
+
+    def _delayed(self, name: str, latency: str) -> Array:
+        return self._true[name][self.variations[latency].astype(np.intp), self._all]
+
+    def _sense_joints(self, ids: Ids, true: Readings) -> None:
+        joints, row = self.disturbances.joints, self._tick % _BLOCK
+        measured = {
+            name: self._delayed(name, 'joint_latency') for name in _JOINT_TOPICS if name in true
+        }
+        states, count = measured['joint_states'], len(self._task.spec.robot.joints)
+        if joints.velocity_noise:
+            noise = self._normal[self._all, row, self._columns['velocity']]
+            states[:, count + self._angles] += joints.velocity_noise * noise
+        if self._moves_joint_readings():
+            error = joints.noise * self._normal[self._all, row, self._columns['joint']]
+            error += self._biases['joint']
+            if joints.resolution:
+                exact = states[:, self._angles] + error
+                error += joints.resolution * np.round(exact / joints.resolution) - exact
+            states[:, self._angles] += error
+            for name, levers in self._levers.items():
+                for number, lever in enumerate(levers):
+                    start = 7 * number
+                    measured[name][:, start : start + 3] += lever.displacement(error)
+        for name, values in measured.items():
+            self._held[name][ids] = values[ids]
+
+    def _sense_object(self, ids: Ids, true: Readings, is_first: bool) -> None:
+        names = [name for name in _OBJECT_TOPICS if name in true]
+        if not names:
+            return
+        tracked, row = self.disturbances.object, self._tick % _BLOCK
+        chance = self._uniform[self._all, row]
+        if not is_first:
+            self._lost = np.maximum(self._lost - 1, 0)
+            self._lost[(chance[:, 3] < tracked.lost) & (self._lost == 0)] = _LOST_TICKS
+        is_fresh = self._tick % np.maximum(self.variations['object_period'], 1) == 0
+        is_fresh &= (chance[:, 4] >= tracked.stale) & (self._lost == 0)
+        fresh = ids if is_first else ids[is_fresh[ids]]
+        noise = self._normal[self._all, row, self._columns['object']]
+        error = noise * np.repeat([tracked.noise, tracked.rotation_noise], 3)
+        error = error + self._biases['object']
+        for name in names:
+            values = self._delayed(name, 'object_latency')
+            if name != 'object_twist' and error.any():
+                values[:, :3] += error[:, :3]
+                values[:, 3:7] = _turned(values[:, 3:7], error[:, 3:])
+            self._held[name][fresh] = values[fresh]
+
+    # Copies
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that decides the future, for `pickle` and `copy.deepcopy`."""
+        return {name: getattr(self, name) for name in _STATE}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from what `state` returned."""
+        for name in _STATE:
+            setattr(self, name, state[name])
+        self._physics.restore(self._all)
+        self._physics.apply(self._all, self.variations)
+
+
+_STATE = (
+    'variations',
+    '_streams',
+    '_tick',
+    '_normal',
+    '_uniform',
+    '_biases',
+    '_sent',
+    '_applied',
+    '_lost',
+    '_true',
+    '_held',
+)
+
+
+def _turned(quaternion: Array, turn: Array) -> Array:
+    """Turn quaternions (N, 4) wxyz by rotation vectors (N, 3), rad, world axes."""
+    angle = np.linalg.norm(turn, axis=1, keepdims=True)
+    axis = turn / np.maximum(angle, 1e-12)
+    rotation = np.concatenate([np.cos(angle / 2.0), np.sin(angle / 2.0) * axis], axis=1)
+    return quaternion_multiply(rotation, quaternion)
+
+
+def _object_address(model: mujoco.MjModel) -> int | None:
+    """Where the object's pose begins in qpos; None without an object."""
+    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE.value)
+    return int(model.jnt_qposadr[free[0]]) if free.size else None
+
+
+def _pushed_body(task: Task) -> int:
+    """The object; the gripper or the palm where there is none."""
+    names = ('object0', 'object', 'robot0:gripper_link', 'robot0:palm')
+    numbers = (mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_BODY.value, n) for n in names)
+    return int(next((number for number in numbers if number > 0), task.model.nbody - 1))
+
+
+class _Lever:
+    """How far a site moves with the joints, to first order."""
+
+    def __init__(self, task: Task, site_name: str) -> None:
+        model = task.model
+        site = model.site(site_name).id
+        body = int(model.site_bodyid[site])
+        joints = [i for i, u in enumerate(task.spec.robot.joint_units) if u == 'rad']
+        dofs = joint_dofs(task)[joints]
+        chain = {dof for dof in dofs.tolist() if _moves(model, dof, body)}
+        self._errors = [i for i, dof in enumerate(dofs.tolist()) if dof in chain]
+        self._dofs = dofs[self._errors]
+        self._position = task.output('site_xpos')[:, site]
+        self._center = task.output('subtree_com')[:, int(model.body_rootid[body])]
+        self._cdof = task.output('cdof')
+
+    def displacement(self, error: Array) -> Array:
+        """Return the shift (N, 3), m, for errors (N, angles) of the joints, rad."""
+        weighted = self._cdof[:, self._dofs] * error[:, self._errors, None]
+        spatial = weighted.sum(axis=1)
+        shift: Array = spatial[:, 3:]
+        return shift + np.cross(spatial[:, :3], self._position - self._center)
+
+
+def _moves(model: mujoco.MjModel, dof: int, body: int) -> bool:
+    """Whether a degree of freedom moves a body."""
+    mover = int(model.dof_bodyid[dof])
+    while body:
+        if body == mover:
+            return True
+        body = int(model.body_parentid[body])
+    return False
+
+
+def _levers(task: Task) -> dict[str, list[_Lever]]:
+    return {
+        name: [_Lever(task, site) for site in sites]
+        for name, sites in _LED.items()
+        if name in task.sensors
+    }

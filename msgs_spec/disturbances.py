@@ -1,0 +1,382 @@
+"""Disturbances of a robot as data: delays, noise, lost messages, other physics, pushes.
+
+Everything is off by default. Sources of the ranges are in `docs/robustness.md`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal, cast
+
+from msgs_spec.text import did_you_mean, one_line
+
+Span = tuple[float, float]
+Kind = Literal['size', 'probability', 'factor', 'ticks', 'period', 'span']
+
+# The longest delay, in ticks.
+MOST_TICKS = 4
+# Bytes of a file of disturbances.
+_LONGEST_FILE = 100_000
+_LIMITS: dict[Kind, Span] = {
+    'size': (0.0, 100.0),
+    'probability': (0.0, 1.0),
+    'factor': (0.05, 20.0),
+    'ticks': (0, MOST_TICKS),
+    'period': (1, 100),
+    'span': (-1.0, 1.0),
+}
+_OFF: dict[Kind, Any] = {
+    'size': 0.0,
+    'probability': 0.0,
+    'factor': (1.0, 1.0),
+    'ticks': (0, 0),
+    'period': (1, 1),
+    'span': (0.0, 0.0),
+}
+
+
+def _off(kind: Kind) -> Any:
+    """A field that is off by default.
+
+    `size` and `probability` are one number. The other kinds are a range (lowest, highest) from
+    which each episode draws; one number n stands for (n, n).
+    """
+    return field(default=_OFF[kind], metadata={'kind': kind})
+
+
+def _checked(name: str, value: Any, kind: Kind) -> Any:
+    """Return a value in its form, or raise a `ValueError` that says what is allowed."""
+    lowest, highest = _LIMITS[kind]
+    is_range = isinstance(_OFF[kind], tuple)
+    numbers = list(value) if is_range and isinstance(value, (list, tuple)) else [value]
+    is_right = len(numbers) in ((1, 2) if is_range else (1,)) and all(
+        isinstance(each, (int, float))
+        and not isinstance(each, bool)
+        and lowest <= each <= highest
+        and (kind not in ('ticks', 'period') or each == int(each))
+        for each in numbers
+    )
+    if not is_right or numbers[0] > numbers[-1]:
+        whole = 'whole ' if kind in ('ticks', 'period') else ''
+        form = ', or [lowest, highest]' if is_range else ''
+        raise ValueError(
+            f'{name}={one_line(value, 40)}; allowed: a {whole}number {lowest:g} ... {highest:g}'
+            f'{form}'
+        )
+    if kind in ('ticks', 'period'):
+        return int(numbers[0]), int(numbers[-1])
+    return (float(numbers[0]), float(numbers[-1])) if is_range else float(numbers[0])
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Checks and normalises its fields."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            kind = each.metadata['kind']
+            value = _checked(each.name, getattr(self, each.name), kind)
+            object.__setattr__(self, each.name, value)
+
+
+@dataclass(frozen=True)
+class ActionDisturbance(_Group):
+    """What happens to commands on their way to the motors.
+
+    Attributes:
+        latency: Delay, ticks.
+        repeat: Probability per tick that the last command is applied again.
+        drop: Probability per tick that a command is lost: the gripper stays, the hand keeps its
+            targets.
+        noise: Standard deviation of white noise, as a share of half the command range.
+        bias: Standard deviation of an offset that lasts an episode, likewise.
+    """
+
+    latency: Span = _off('ticks')
+    repeat: float = _off('probability')
+    drop: float = _off('probability')
+    noise: float = _off('size')
+    bias: float = _off('size')
+
+
+@dataclass(frozen=True)
+class JointDisturbance(_Group):
+    """Errors of the joint sensors, and of the poses computed from them (gripper, fingertips).
+
+    Attributes:
+        latency: Delay, ticks.
+        noise: Standard deviation of white noise, rad.
+        bias: Standard deviation of an offset that lasts an episode, rad.
+        velocity_noise: Standard deviation of white noise, rad/s.
+        resolution: Step of the encoders, rad.
+    """
+
+    latency: Span = _off('ticks')
+    noise: float = _off('size')
+    bias: float = _off('size')
+    velocity_noise: float = _off('size')
+    resolution: float = _off('size')
+
+
+@dataclass(frozen=True)
+class ObjectDisturbance(_Group):
+    """Errors of the tracked object pose.
+
+    Attributes:
+        latency: Delay, ticks.
+        noise: Standard deviation of white noise per axis, m.
+        bias: Standard deviation of an offset that lasts an episode, per axis, m.
+        rotation_noise: Standard deviation of white noise per axis, rad.
+        rotation_bias: Standard deviation of an offset that lasts an episode, per axis, rad.
+        period: Ticks between two measurements; the last one is repeated meanwhile.
+        stale: Probability per tick that a measurement is missing.
+        lost: Probability per tick that tracking is lost for half a second.
+    """
+
+    latency: Span = _off('ticks')
+    noise: float = _off('size')
+    bias: float = _off('size')
+    rotation_noise: float = _off('size')
+    rotation_bias: float = _off('size')
+    period: Span = _off('period')
+    stale: float = _off('probability')
+    lost: float = _off('probability')
+
+
+@dataclass(frozen=True)
+class PhysicsDisturbance(_Group):
+    """Physics that differs from the model for an episode. Factors multiply the model's value.
+
+    Attributes:
+        friction: Factor of all sliding, torsional and rolling friction.
+        object_mass: Factor of the object's mass.
+        object_size: Factor of the object's size; its mass stays.
+        gain: Factor of the gain of the position actuators (hand, gripper fingers).
+        force_limit: Factor of the largest actuator force (hand).
+        damping: Factor of the damping of the driven joints (hand).
+        gravity_tilt: Largest angle between gravity and the vertical, rad.
+        table_height: Shift of the table and of what stands on it, m (Fetch).
+    """
+
+    friction: Span = _off('factor')
+    object_mass: Span = _off('factor')
+    object_size: Span = _off('factor')
+    gain: Span = _off('factor')
+    force_limit: Span = _off('factor')
+    damping: Span = _off('factor')
+    gravity_tilt: float = _off('size')
+    table_height: Span = _off('span')
+
+
+@dataclass(frozen=True)
+class PushDisturbance(_Group):
+    """Random pushes of one tick on the object, or on the end of the arm where there is none.
+
+    Attributes:
+        force: Standard deviation per axis, N.
+        rate: Mean number of pushes per simulated second.
+    """
+
+    force: float = _off('size')
+    rate: float = _off('size')
+
+
+@dataclass(frozen=True)
+class StartDisturbance(_Group):
+    """Start states beyond those of the task.
+
+    Attributes:
+        object_position: Largest shift of the object, horizontally, per axis, m.
+        joints: Standard deviation of an offset of each joint, rad (hand).
+    """
+
+    object_position: float = _off('size')
+    joints: float = _off('size')
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """All disturbances of a simulated robot; each group is off by default."""
+
+    action: ActionDisturbance = ActionDisturbance()
+    joints: JointDisturbance = JointDisturbance()
+    object: ObjectDisturbance = ObjectDisturbance()
+    physics: PhysicsDisturbance = PhysicsDisturbance()
+    pushes: PushDisturbance = PushDisturbance()
+    start: StartDisturbance = StartDisturbance()
+
+    @property
+    def is_off(self) -> bool:
+        """Whether nothing is disturbed."""
+        return self == Disturbances()
+
+    def scaled(self, factor: float) -> Disturbances:
+        """Return the disturbances `factor` times as strong.
+
+        Sizes, probabilities and delays are multiplied, delays are rounded; factors are raised to
+        the power of `factor`, so that 0.5 scaled by 2 is 0.25.
+        """
+        groups = {each.name: _scaled(getattr(self, each.name), factor) for each in fields(self)}
+        return dataclasses.replace(self, **groups)
+
+    def as_dict(self) -> dict[str, dict[str, Any]]:
+        """Return what is not off, ready for JSON or YAML; `from_dict` reads it."""
+        found: dict[str, dict[str, Any]] = {}
+        for group in fields(self):
+            for each in fields(getattr(self, group.name)):
+                value = getattr(getattr(self, group.name), each.name)
+                if value != _OFF[each.metadata['kind']]:
+                    plain = list(value) if isinstance(value, tuple) else value
+                    found.setdefault(group.name, {})[each.name] = plain
+        return found
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Disturbances:
+        """Return the disturbances that `as_dict` gave.
+
+        Raises:
+            ValueError: If a group or field is unknown, or a value is not allowed.
+        """
+        groups: dict[str, Any] = {each.name: type(each.default) for each in fields(cls)}
+        found: dict[str, Any] = {}
+        for name, given in _entries('disturbances', values, list(groups)):
+            kinds = [each.name for each in fields(groups[name])]
+            entries = dict(_entries(name, given, kinds))
+            try:
+                found[name] = groups[name](**entries)
+            except ValueError as error:
+                raise ValueError(f'{name}.{error}') from None
+        return cls(**found)
+
+
+def read_disturbances(given: str | Mapping[str, Any] | Disturbances | None) -> Disturbances:
+    """Return disturbances from any form in which a user may give them.
+
+    Args:
+        given: A preset (`mild`, `hardware`, `severe`), scaled as in `hardware*0.5`; the path of a
+            JSON or YAML file; JSON text that begins with `{`; a mapping; `off` or None for none.
+
+    Raises:
+        ValueError: If it is none of these, or a value is not allowed.
+    """
+    if given is None or given in ('', 'off'):
+        return Disturbances()
+    if isinstance(given, Disturbances):
+        return given
+    if not isinstance(given, str):
+        return Disturbances.from_dict(given)
+    name, star, scale = given.partition('*')
+    if name in PRESETS:
+        return PRESETS[name].scaled(_scale(scale) if star else 1.0)
+    if given.startswith('{'):
+        return Disturbances.from_dict(_parsed(given))
+    path = Path(given).expanduser()
+    if not path.is_file():
+        allowed = ', '.join(['off', *PRESETS])
+        raise ValueError(
+            f'disturbances {given[:80]!r} is neither a file nor a preset; allowed: {allowed}, '
+            f'scaled as in hardware*0.5{did_you_mean(name, list(PRESETS))}'
+        )
+    if path.stat().st_size > _LONGEST_FILE:
+        raise ValueError(f'{path}: larger than {_LONGEST_FILE:,} bytes')
+    try:
+        return Disturbances.from_dict(_parsed(path.read_text(errors='replace')))
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
+
+
+def _parsed(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        import yaml
+
+        try:
+            return yaml.safe_load(text)
+        except (yaml.YAMLError, RecursionError) as error:
+            raise ValueError(f'neither JSON nor YAML: {one_line(error)}') from None
+
+
+def _scale(text: str) -> float:
+    try:
+        scale = float(text)
+    except ValueError:
+        scale = math.nan
+    if not 0.0 <= scale <= 10.0:
+        raise ValueError(f'scale {text[:20]!r} of disturbances; allowed: 0 ... 10')
+    return scale
+
+
+def _entries(owner: str, values: Any, allowed: list[str]) -> list[tuple[str, Any]]:
+    if not isinstance(values, Mapping):
+        raise ValueError(
+            f'{owner}: {one_line(values, 40)!r} given; allowed: a mapping with {", ".join(allowed)}'
+        )
+    for name in values:
+        if name not in allowed:
+            raise ValueError(
+                f'{owner} has no {one_line(name, 40)!r}; allowed: {", ".join(allowed)}'
+                f'{did_you_mean(str(name), allowed)}'
+            )
+    return [(str(name), value) for name, value in values.items()]
+
+
+def _scaled(group: _Group, factor: float) -> Any:
+    changes: dict[str, Any] = {}
+    for each in fields(group):
+        kind, value = cast(Kind, each.metadata['kind']), getattr(group, each.name)
+        lowest, highest = _LIMITS[kind]
+        off = _OFF[kind]
+        numbers = value if isinstance(off, tuple) else (value,)
+        if kind == 'factor':
+            numbers = [number**factor for number in numbers]
+        elif kind == 'period':
+            numbers = [1 + round((number - 1) * factor) for number in numbers]
+        else:
+            numbers = [number * factor for number in numbers]
+            if kind == 'ticks':
+                numbers = [round(number) for number in numbers]
+        numbers = [min(max(number, lowest), highest) for number in numbers]
+        changes[each.name] = tuple(numbers) if isinstance(off, tuple) else numbers[0]
+    return dataclasses.replace(group, **changes)
+
+
+# `docs/robustness.md` gives the source of each range.
+_HARDWARE = Disturbances(
+    action=ActionDisturbance(latency=(0, 1), repeat=0.05, drop=0.02, noise=0.05, bias=0.015),
+    joints=JointDisturbance(
+        latency=(0, 1), noise=0.005, bias=0.01, velocity_noise=0.05, resolution=0.0015
+    ),
+    object=ObjectDisturbance(
+        latency=(0, 1),
+        noise=0.003,
+        bias=0.003,
+        rotation_noise=0.03,
+        rotation_bias=0.03,
+        period=(1, 2),
+        stale=0.1,
+        lost=0.002,
+    ),
+    physics=PhysicsDisturbance(
+        friction=(0.7, 1.3),
+        object_mass=(0.7, 1.3),
+        object_size=(0.97, 1.03),
+        gain=(0.8, 1.2),
+        force_limit=(0.8, 1.2),
+        damping=(0.7, 1.5),
+        gravity_tilt=0.03,
+        table_height=(-0.003, 0.003),
+    ),
+    pushes=PushDisturbance(force=0.3, rate=0.5),
+    start=StartDisturbance(object_position=0.003, joints=0.01),
+)
+PRESETS: Mapping[str, Disturbances] = {
+    'mild': _HARDWARE.scaled(0.5),
+    'hardware': _HARDWARE,
+    'severe': _HARDWARE.scaled(2.0),
+}
