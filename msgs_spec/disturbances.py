@@ -178,7 +178,7 @@ class PushDisturbance(_Group):
     """Random pushes of one tick on the object, or on the end of the arm where there is none.
 
     Attributes:
-        force: Standard deviation per axis, N.
+        force: Standard deviation per axis, as a share of the weight of what is pushed.
         rate: Mean number of pushes per simulated second.
     """
 

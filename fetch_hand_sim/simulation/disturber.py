@@ -98,6 +98,8 @@ class Disturber:
         self._held: dict[str, Array] = {}
         self._physics = VariedPhysics(task, disturbances.physics)
         self._pushed_body = _pushed_body(task)
+        gravity = float(np.linalg.norm(task.model.opt.gravity))
+        self._weight = gravity * float(task.model.body_subtreemass[self._pushed_body])
         self._object = _object_address(task.model)
         model, names = task.model, task.spec.robot.joints
         self._joint_qpos = np.array([int(model.joint(names[i]).qposadr[0]) for i in self._angles])
@@ -235,7 +237,7 @@ class Disturber:
         row = self._tick % _BLOCK
         per_tick = pushes.rate * self._task.tick_duration
         pushed = self._uniform[self._all, row, 2] < per_tick
-        force = pushes.force * self._normal[self._all, row, self._columns['push']]
+        force = pushes.force * self._weight * self._normal[self._all, row, self._columns['push']]
         forces[pushed, self._pushed_body, :3] += force[pushed]
         return bool(pushed.any())
 

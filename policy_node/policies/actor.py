@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
+from policy_node.policies.past_actions import past_after, past_before
 from policy_node.policies.policy import observation_and_goal
 
 
@@ -81,7 +82,7 @@ class Actor(nn.Module):
     def __init__(self, shape: NetworkShape) -> None:
         super().__init__()
         self.shape = shape
-        self.observation_normalizer = Normalizer(shape.observation_size)
+        self.observation_normalizer = Normalizer(shape.input_size)
         self.goal_normalizer = Normalizer(shape.goal_size)
         self.network = MLP(shape.feature_size, shape.action_size, shape)
 
@@ -93,12 +94,21 @@ class Actor(nn.Module):
         return actor.eval().requires_grad_(False)
 
     def features(self, observation: Tensor, goal: Tensor) -> Tensor:
-        """Normalised network input (..., feature_size)."""
+        """Return the normalised network input (..., feature_size).
+
+        Args:
+            observation: (..., input_size) observation and past actions.
+            goal: (..., goal_size).
+        """
         normalized = self.observation_normalizer(observation), self.goal_normalizer(goal)
         if self.shape.goal_features is None:
             return torch.cat(normalized, dim=-1)
-        inputs: Tensor = self.shape.goal_features.inputs((observation, goal), normalized)
-        return inputs
+        size = self.shape.observation_size
+        seen = normalized[0][..., :size], normalized[1]
+        inputs: Tensor = self.shape.goal_features.inputs((observation[..., :size], goal), seen)
+        if not self.shape.past_actions:
+            return inputs
+        return torch.cat([inputs, normalized[0][..., size:]], dim=-1)
 
     def forward(self, features: Tensor) -> Tensor:
         """Actions (..., action_size) in [-1, 1] for `features`."""
@@ -111,27 +121,33 @@ class Actor(nn.Module):
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], None]:
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Returns the action for one observation or a batch, as Stable-Baselines3's `predict` does.
 
         Args:
             observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
                 in the units of the task, where one of them may be one for the whole batch; other
                 keys are ignored.
-            state: Ignored; there is no recurrent state.
-            episode_start: Ignored, likewise.
+            state: What the last call returned; None at the start of an episode. Ignored by an
+                actor without past actions.
+            episode_start: Booleans (...,), True where an episode starts.
             deterministic: Ignored: the policy has no noise, as Stable-Baselines3's DDPG.
 
         Returns:
-            Actions (..., action_size) in [-1, 1], float32, and None.
+            Actions (..., action_size) in [-1, 1], float32, and the state for the next call; None
+            for an actor without past actions.
 
         Raises:
             ValueError: If a part is missing or has the wrong length, or their batches do not fit.
         """
         shape = self.shape
         parts = observation_and_goal(observation, shape.observation_size, shape.goal_size)
-        action = self(self.features(*map(self._input, parts)))
-        return action.cpu().numpy(), None
+        past = None
+        if shape.past_actions:
+            past = past_before(state, episode_start, parts[0].shape[:-1], shape.past_size)
+            parts = np.concatenate([parts[0], past], axis=-1), parts[1]
+        action = self(self.features(*map(self._input, parts))).cpu().numpy()
+        return action, None if past is None else past_after(past, action)
 
     def _input(self, values: NDArray[np.float32]) -> Tensor:
         # Read-only ones are copied, about which torch would warn.

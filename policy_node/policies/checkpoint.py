@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 FORMAT = 'fetch_hand_actor'
 FORMAT_VERSION = 1
+MOST_PAST_ACTIONS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,7 @@ class ActorInfo:
         goal_features: How observation and goal become inputs: `plain`, `relative`, `symmetric`.
         init_from: What its training started from: name, task, environment steps, and what that
             had started from; empty if from nothing.
+        past_actions: Number of past actions among the inputs.
     """
 
     task: str
@@ -74,6 +76,7 @@ class ActorInfo:
     success: dict[str, Any] = field(default_factory=dict)
     goal_features: str = 'plain'
     init_from: dict[str, Any] = field(default_factory=dict)
+    past_actions: int = 0
 
     @property
     def shape(self) -> NetworkShape:
@@ -85,6 +88,7 @@ class ActorInfo:
             hidden_sizes=self.hidden_sizes,
             layer_norm=self.layer_norm,
             goal_features=goal_features(self.goal_features, task_spec(self.task)),
+            past_actions=self.past_actions,
         )
 
 
@@ -202,7 +206,7 @@ def parse_metadata(metadata: dict[str, str], path: str | Path) -> ActorInfo:
     """
     _check_format(path, metadata)
     # Files from before there were goal features have plain ones, and started from nothing.
-    metadata = {'goal_features': '"plain"', 'init_from': '{}', **metadata}
+    metadata = {'goal_features': '"plain"', 'init_from': '{}', 'past_actions': '0', **metadata}
     fields = {field.name: field.type for field in dataclasses.fields(ActorInfo)}
     missing = [name for name in fields if name not in metadata]
     if missing:
@@ -237,6 +241,10 @@ def _check_sizes(path: str | Path, info: ActorInfo) -> None:
         goal_features(info.goal_features, spec)
     except ValueError as error:
         raise ValueError(f'{path} has {one_line(error)}') from None
+    if not 0 <= info.past_actions <= MOST_PAST_ACTIONS:
+        raise ValueError(
+            f'{path} has past_actions {info.past_actions}; allowed: 0 ... {MOST_PAST_ACTIONS}'
+        )
     expected = (observation_layout(spec), spec.goal.size, spec.robot.action_size)
     found = (info.observation_layout, info.goal_size, info.action_size)
     for name, given, wanted in zip(('observation', 'goal', 'action'), found, expected, strict=True):

@@ -22,6 +22,7 @@ class NetworkShape:
         hidden_sizes: Width of each hidden layer.
         layer_norm: Whether a LayerNorm precedes each activation.
         goal_features: How observation and goal become inputs; None for both as they are.
+        past_actions: Number of past actions among the inputs, after the observation.
     """
 
     observation_size: int
@@ -30,13 +31,25 @@ class NetworkShape:
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     layer_norm: bool = False
     goal_features: GoalFeatures | None = None
+    past_actions: int = 0
+
+    @property
+    def past_size(self) -> int:
+        """Length of the past actions."""
+        return self.past_actions * self.action_size
+
+    @property
+    def input_size(self) -> int:
+        """Length of the observation and the past actions."""
+        return self.observation_size + self.past_size
 
     @property
     def feature_size(self) -> int:
         """Length of the network input."""
         if self.goal_features is None:
-            return self.observation_size + self.goal_size
-        return self.goal_features.size(self.observation_size, self.goal_size)
+            return self.input_size + self.goal_size
+        size = self.goal_features.size(self.observation_size, self.goal_size)
+        return size + self.past_size
 
     @property
     def layer_names(self) -> list[str]:
@@ -53,7 +66,7 @@ class NetworkShape:
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
         """Name and shape of every tensor in the state of an `Actor`, without making one."""
         shapes: dict[str, tuple[int, ...]] = {}
-        for part, size in (('observation', self.observation_size), ('goal', self.goal_size)):
+        for part, size in (('observation', self.input_size), ('goal', self.goal_size)):
             for statistic in ('mean', 'std'):
                 shapes[f'{part}_normalizer.{statistic}'] = (size,)
         inputs = (self.feature_size, *self.hidden_sizes)

@@ -23,6 +23,7 @@ from threadpoolctl import ThreadpoolController
 from msgs_spec.arrays import Array
 from policy_node.policies import checkpoint
 from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
+from policy_node.policies.past_actions import past_after, past_before
 from policy_node.policies.policy import LoadedPolicy, Observation, observation_and_goal
 
 # As torch.nn.LayerNorm.
@@ -49,30 +50,37 @@ class NumpyActor:
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], None]:
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Returns the action for one observation or a batch.
 
         Args:
             observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
                 in the units of the task, where one of them may be one for the whole batch; other
                 keys are ignored.
-            state: Ignored; there is no recurrent state.
-            episode_start: Ignored, likewise.
+            state: What the last call returned; None at the start of an episode. Ignored by an
+                actor without past actions.
+            episode_start: Booleans (...,), True where an episode starts.
             deterministic: Ignored: the policy has no noise.
 
         Returns:
-            Actions (..., action_size) in [-1, 1], float32, and None.
+            Actions (..., action_size) in [-1, 1], float32, and the state for the next call; None
+            for an actor without past actions.
 
         Raises:
             ValueError: If a part is missing or has the wrong length, or their batches do not fit.
         """
-        del state, episode_start, deterministic
+        del deterministic
         shape = self.shape
         # Rounded to float32 first, as in training.
         seen, goal = observation_and_goal(observation, shape.observation_size, shape.goal_size)
+        past = None
+        if shape.past_actions:
+            past = past_before(state, episode_start, seen.shape[:-1], shape.past_size)
+            seen = np.concatenate([seen, past], axis=-1)
         features = self._features(seen.astype(np.float64), goal.astype(np.float64))
         with _ONE_AT_A_TIME, _blas().limit(limits=1):
-            return np.tanh(self._forward(features)).astype(np.float32), None
+            action = np.tanh(self._forward(features)).astype(np.float32)
+        return action, None if past is None else past_after(past, action)
 
     def _forward(self, layer: Array) -> Array:
         shape = self.shape
@@ -90,7 +98,10 @@ class NumpyActor:
         )
         if self.shape.goal_features is None:
             return np.concatenate(normalized, axis=-1)
-        return np.asarray(self.shape.goal_features.inputs((state, goal), normalized))
+        size = self.shape.observation_size
+        seen = normalized[0][..., :size], normalized[1]
+        inputs = self.shape.goal_features.inputs((state[..., :size], goal), seen)
+        return np.concatenate([inputs, normalized[0][..., size:]], axis=-1)
 
     def _normalize(self, name: str, values: Array) -> Array:
         mean, std = self._values[f'{name}.mean'], self._values[f'{name}.std']

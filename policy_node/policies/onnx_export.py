@@ -48,6 +48,8 @@ def export(source: Path, target: Path) -> float:
     """
     actor, info = checkpoint.load(source)
     shape = actor.shape
+    if shape.past_actions:
+        raise ValueError(f'{source}: an actor with past actions cannot be written as ONNX')
     sizes = (shape.observation_size, shape.goal_size)
     batch = torch.export.Dim('batch')
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -16,17 +16,24 @@ class Policy(Protocol):
     """What acts, in the form of Stable-Baselines3's `predict`."""
 
     def predict(
-        self, observation: Observation, *, deterministic: bool = True
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
         """Acts on one observation or on a batch.
 
         Args:
             observation: `observation` (..., observation size), `achieved_goal` and `desired_goal`
                 (..., goal size) in the units of the task.
+            state: The state that the last call returned; None at the start of an episode.
+            episode_start: Booleans (...,), True where an episode starts.
             deterministic: Without exploration noise.
 
         Returns:
-            Actions (..., action size) in [-1, 1], and a state that is not used.
+            Actions (..., action size) in [-1, 1], and the state for the next call; None for a
+            policy without memory.
         """
         ...
 
@@ -50,10 +57,14 @@ class LoadedPolicy:
     sha256: str = ''
 
     def predict(
-        self, observation: Observation, *, deterministic: bool = True
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Acts as `policy` does, so that it is a policy wherever one is asked for."""
-        return self.policy.predict(observation, deterministic=deterministic)
+        """Act as `policy` does."""
+        return self.policy.predict(observation, state, episode_start, deterministic)
 
 
 # Apart from other streams of random numbers that a seed stands for.

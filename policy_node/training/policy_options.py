@@ -95,7 +95,11 @@ class CheckedPolicy:
         self._size = task_spec(loaded.task).robot.action_size
 
     def predict(
-        self, observation: Observation, *, deterministic: bool = True
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
         """Asks the policy about a batch.
 
@@ -103,7 +107,9 @@ class CheckedPolicy:
             CommandError: If it fails, or answers with something else than an action for each.
         """
         try:
-            answer, state = self._loaded.policy.predict(observation, deterministic=deterministic)
+            answer, state = self._loaded.policy.predict(
+                observation, state, episode_start, deterministic
+            )
             shape = len(np.asarray(observation['observation'])), self._size
             actions = finite_numbers('actions', answer, shape, self._loaded.task)
             if not self._is_clipped and (np.abs(actions) > 1.0).any():

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from policy_node.policies.past_actions import past_after
 from policy_node.policies.policy import Policy
 from policy_node.training.collection.exploration import ActionNoise, ParameterNoise
 from policy_node.training.collection.frame_skip import Holder
@@ -42,6 +43,8 @@ class Collector:
         longest, every, spec = config.longest_hold, config.subgoal_every, simulation.spec
         std, epsilon = config.noise_std, config.random_epsilon
         size = spec.robot.action_size + (longest > 1)
+        self._past_size = config.past_actions * spec.robot.action_size
+        self._inputs = spec.observation_size + self._past_size
         self._columns = size + subgoal_columns(every, spec.goal.size)
         self._holder = Holder(longest) if longest > 1 else None
         self._parameters = ParameterNoise(generator, std) if config.parameter_noise else None
@@ -81,7 +84,7 @@ class Collector:
             retried = self._failed.give(simulation)
             observation = simulation.observe()
         episodes = Episodes(
-            observation=np.empty((count, ticks + 1, spec.observation_size), np.float32),
+            observation=np.empty((count, ticks + 1, self._inputs), np.float32),
             achieved_goal=np.empty((count, ticks + 1, spec.goal.size), np.float32),
             desired_goal=observation['desired_goal'].astype(np.float32),
             action=np.empty((count, ticks, self._columns), np.float32),
@@ -89,17 +92,20 @@ class Collector:
         whole = np.ones(count, dtype=np.bool_)
         success = np.zeros(count, dtype=np.bool_)
         acting = self._acting(policy)
+        past = np.zeros((count, self._past_size), np.float32)
         for tick in range(ticks):
-            episodes.observation[:, tick] = observation['observation']
+            episodes.observation[:, tick] = np.concatenate([observation['observation'], past], 1)
             episodes.achieved_goal[:, tick] = observation['achieved_goal']
-            action = self._explore(acting, observation, random, tick)
+            action = self._explore(acting, observation, past, random, tick)
             if self._holder is not None:
                 action = self._holder.take(action, ticks - tick)
             episodes.action[:, tick] = action
             result = simulation.step(action[:, : spec.robot.action_size])
+            if self._past_size:
+                past = past_after(past, action[:, : spec.robot.action_size])
             observation, success = result.observation, result.success
             whole &= ~result.diverged
-        episodes.observation[:, ticks] = observation['observation']
+        episodes.observation[:, ticks] = np.concatenate([observation['observation'], past], 1)
         episodes.achieved_goal[:, ticks] = observation['achieved_goal']
         if not random:
             self._adapt(policy, acting, episodes)
@@ -127,7 +133,12 @@ class Collector:
             self._parameters.adapt(policy, acting, states)
 
     def _explore(
-        self, policy: Policy, observation: Mapping[str, ArrayLike], random: bool, tick: int
+        self,
+        policy: Policy,
+        observation: Mapping[str, ArrayLike],
+        past: NDArray[np.float32],
+        random: bool,
+        tick: int,
     ) -> NDArray[np.float32]:
         guide = self._guide
         if guide is not None:
@@ -135,6 +146,7 @@ class Collector:
         if random:
             own = noisy = self._noise.random(tick)
         else:
-            own = policy.predict(observation, deterministic=True)[0]
+            state = past if self._past_size else None
+            own = policy.predict(observation, state, deterministic=True)[0]
             noisy = self._noise.around(own, tick)
         return noisy if guide is None else guide.mark(noisy, own)

@@ -140,10 +140,14 @@ class PerturbedActors:
         self._actors = actors
 
     def predict(
-        self, observation: Mapping[str, ArrayLike], *, deterministic: bool = True
+        self,
+        observation: Mapping[str, ArrayLike],
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
         """Actions (N, action size) for observations (N, ...), as `Policy.predict`."""
-        del deterministic
+        del state, episode_start, deterministic
         values = {name: np.asarray(rows) for name, rows in observation.items()}
         parts = np.array_split(np.arange(len(values['observation'])), len(self._actors))
         answers = [

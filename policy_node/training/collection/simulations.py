@@ -17,5 +17,6 @@ def make_simulation(config: TrainConfig, num_envs: int, num_threads: int) -> Sim
         'reward_type': config.reward_type,
         'success_rule': config.success_rule,
         'control_hz': config.control_hz,
+        'disturbances': config.disturbances,
     }
     return (GambleSimulation if config.gamble else Simulation)(config.task, **options)

@@ -25,6 +25,10 @@ class ConfigFields:
     """`ddpg`, or `ppo` (on policy: each cycle's episodes once, also under goals in hindsight)."""
     control_hz: float = DEFAULT_CONTROL_HZ
     """Action frequency, Hz. Steps, also those of this configuration, are ticks at this rate."""
+    disturbances: str = ''
+    """Disturbances of the simulated robot: a preset, `hardware*0.5`, a file or JSON."""
+    past_actions: int = 0
+    """Number of past actions that the networks see."""
     reward_type: str = 'sparse'
     """`sparse` (-1 until success, then 0) or `dense` (negative distance)."""
     success_rule: str = 'gymnasium'

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterator
 
+from msgs_spec.disturbances import read_disturbances
 from msgs_spec.tasks import (
     REWARD_TYPES,
     SUCCESS_RULES,
@@ -14,6 +15,7 @@ from msgs_spec.tasks import (
     substeps_per_tick,
     task_spec,
 )
+from policy_node.policies.checkpoint import MOST_PAST_ACTIONS
 from policy_node.policies.goal_features import GOAL_FEATURES, goal_features
 from policy_node.training.configuration.config_fields import ConfigFields
 from policy_node.training.goals.goal_choice import GOAL_CHOICES
@@ -22,7 +24,7 @@ from policy_node.training.goals.hindsight import FROM_THE_EPISODE, OUTCOME, pars
 from policy_node.training.replay.multi_step import CORRECTIONS
 
 # Recipes of runs that start from nothing.
-FROM_NOTHING = ('paper', 'best')
+FROM_NOTHING = ('paper', 'best', 'robust')
 RECIPES = (*FROM_NOTHING, 'finetune')
 # Tasks that ignore their gripper action.
 GAMBLE_TASKS = ('FetchReach', 'FetchPush')
@@ -67,6 +69,7 @@ CHOICES = {
 _INFINITY = float('inf')
 RANGES = (
     ('seed', 0, 2**31 - 1),
+    ('past_actions', 0, MOST_PAST_ACTIONS),
     ('hindsight_k', 1, 1000),
     ('reward_distance', 1e-3, 1000),
     ('reward_rotation', 1e-3, 1000),
@@ -125,6 +128,12 @@ RANGES = (
 """Least and largest value of the fields that have them."""
 
 
+def _require_disturbances(config: ConfigFields) -> None:
+    read_disturbances(config.disturbances)
+    if config.past_actions and (config.longest_hold > 1 or config.parameter_noise):
+        raise ValueError('past_actions needs longest_hold=1 and parameter_noise=False')
+
+
 def require_allowed(config: ConfigFields) -> None:
     """Refuses values that are not allowed, and fields that exclude each other.
 
@@ -142,6 +151,7 @@ def require_allowed(config: ConfigFields) -> None:
             raise ValueError(f'{name} {value} is no finite number')
         if not lowest <= value <= highest:
             raise ValueError(f'{name} {value}; allowed: {_number(lowest)} ... {_number(highest)}')
+    _require_disturbances(config)
     substeps_per_tick(config.control_hz)
     goal_features(config.goal_features, spec)
     if config.goals:

@@ -1,10 +1,13 @@
-"""The recipes: `paper` (Plappert et al. 2018), `best` (the best measured here), `finetune`."""
+"""The recipes: `paper` (Plappert et al. 2018), `best`, `robust` and `finetune`."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Mapping
 from typing import Any
 
+from msgs_spec.disturbances import PRESETS
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_rules import DEFAULTS, RECIPES
@@ -40,7 +43,8 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     Args:
         task: Task name.
         recipe: `paper` (Plappert et al. 2018, appendix B), `best` (the best measured here from
-            nothing) or `finetune` (what goes on from an actor with an object in the hand).
+            nothing), `robust` (as `best`, on a disturbed robot) or `finetune` (what goes on from an
+            actor with an object in the hand).
         **overrides: Fields of `TrainConfig`.
 
     Raises:
@@ -49,8 +53,9 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     if recipe not in RECIPES:
         raise ValueError(f'recipe {recipe!r}; allowed: {", ".join(RECIPES)}')
     task_spec(task)
-    values = {'paper': _paper, 'best': _best, 'finetune': _finetune}[recipe](task)
-    if recipe == 'best':
+    recipes = {'paper': _paper, 'best': _best, 'robust': _robust, 'finetune': _finetune}
+    values = recipes[recipe](task)
+    if recipe in ('best', 'robust'):
         values |= _at_rate(task, values, overrides)
         values |= _imagined(task, overrides)
     return TrainConfig(**{'task': task, 'recipe': recipe, **values, **overrides})
@@ -165,6 +170,20 @@ def _best(task: str) -> dict[str, Any]:
     if task in _BEST:
         return dict(_BEST[task])
     return dict(_FETCH) if task.startswith('Fetch') else _object_in_hand(task)
+
+
+def _robust(task: str) -> dict[str, Any]:
+    """As `best`, on a robot with the preset `hardware` and up to two ticks of action latency.
+
+    The last three actions are inputs: with them a delay can be known.
+    """
+    hardware = PRESETS['hardware']
+    action = dataclasses.replace(hardware.action, latency=(0, 2))
+    disturbances = dataclasses.replace(hardware, action=action).as_dict()
+    values = _best(task) | {'disturbances': json.dumps(disturbances), 'past_actions': 3}
+    if task == 'FetchReach':
+        values |= {'total_steps': 200_000, 'evaluate_every': 20_000}
+    return values
 
 
 def _object_in_hand(task: str) -> dict[str, Any]:

@@ -130,8 +130,9 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
     success = np.zeros(count, np.bool_)
     ticks_reached, ticks_kept = np.zeros(count, np.int64), np.zeros(count, np.int64)
     episode_return = np.zeros(count)
+    state = None
     for _ in range(simulation.spec.episode_ticks):
-        action, _ = policy.predict(observation, deterministic=True)
+        action, state = policy.predict(observation, state, deterministic=True)
         result = simulation.step(action)
         observation = result.observation
         ticks_reached += success

@@ -15,6 +15,7 @@ from policy_node.training.goals.hindsight import SuccessFunction, goal_mixture, 
 from policy_node.training.goals.subgoals import subgoal_columns
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.networks.normalizer import RunningStatistics
+from policy_node.training.networks.shape_from_config import network_shape
 from policy_node.training.replay.episode_replay import EpisodeReplay, Episodes
 from policy_node.training.replay.transitions import Transitions
 
@@ -54,7 +55,7 @@ class Experience:
         self.generator = generator
         self.batch_size = workers.share(config.batch_size)
         self.statistics = {
-            'observation_statistics': RunningStatistics(spec.observation_size),
+            'observation_statistics': RunningStatistics(network_shape(config).input_size),
             'goal_statistics': RunningStatistics(spec.goal.size),
         }
         self._count_ticks = ticks_until_dropped(spec, config.ticks_after_drop)
@@ -65,7 +66,7 @@ class Experience:
         self.replay = EpisodeReplay(
             max(capacity, workers.share(config.num_envs)),
             spec.episode_ticks,
-            spec.observation_size,
+            network_shape(config).input_size,
             spec.goal.size,
             spec.robot.action_size
             + (config.longest_hold > 1)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -151,7 +152,11 @@ class GuidedPolicy:
         self._subgoal: Array32 = np.zeros((0, 0), np.float32)
 
     def predict(
-        self, observation: Mapping[str, ArrayLike], *, deterministic: bool = True
+        self,
+        observation: Mapping[str, ArrayLike],
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
         """Actions (N, action size) for observations (N, ...) of the next tick."""
         if self._tick % self._every == 0:
@@ -159,4 +164,5 @@ class GuidedPolicy:
             self._subgoal = proposer.goals(proposer.normalized(observation))
         self._tick = (self._tick + 1) % self._ticks
         pursued = {**observation, 'desired_goal': self._subgoal}
+        del state, episode_start
         return self._actor.predict(pursued, deterministic=deterministic)[0], None

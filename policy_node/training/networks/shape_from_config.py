@@ -19,4 +19,5 @@ def network_shape(config: TrainConfig) -> NetworkShape:
         hidden_sizes=config.hidden_sizes,
         layer_norm=config.layer_norm,
         goal_features=goal_features(config.goal_features, spec),
+        past_actions=config.past_actions,
     )

@@ -42,6 +42,7 @@ def described(shape: NetworkShape, goal_features: str) -> dict[str, object]:
         'hidden_sizes': shape.hidden_sizes,
         'layer_norm': shape.layer_norm,
         'goal_features': goal_features,
+        'past_actions': shape.past_actions,
         'inputs': shape.feature_size,
     }
 

@@ -120,6 +120,7 @@ class RunFolder:
             success=success or {},
             goal_features=config.goal_features,
             init_from=self.init_from,
+            past_actions=config.past_actions,
         )
         checkpoint.save(self.path / name, plain_actor(actor, config), info)
 
