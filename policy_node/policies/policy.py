@@ -63,7 +63,9 @@ class LoadedPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Act as `policy` does."""
+        """Act as `policy` does; a policy without memory may take only the observation."""
+        if state is None and episode_start is None:
+            return self.policy.predict(observation, deterministic=deterministic)
         return self.policy.predict(observation, state, episode_start, deterministic)
 
 

@@ -107,9 +107,7 @@ class CheckedPolicy:
             CommandError: If it fails, or answers with something else than an action for each.
         """
         try:
-            answer, state = self._loaded.policy.predict(
-                observation, state, episode_start, deterministic
-            )
+            answer, state = self._loaded.predict(observation, state, episode_start, deterministic)
             shape = len(np.asarray(observation['observation'])), self._size
             actions = finite_numbers('actions', answer, shape, self._loaded.task)
             if not self._is_clipped and (np.abs(actions) > 1.0).any():

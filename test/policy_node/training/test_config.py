@@ -187,7 +187,7 @@ def test_bad_values_are_refused(changes: dict[str, object], match: str) -> None:
 
 
 def test_an_unknown_recipe_or_stored_field_is_refused() -> None:
-    with pytest.raises(ValueError, match="recipe 'good'; allowed: paper, best, finetune"):
+    with pytest.raises(ValueError, match="recipe 'good'; allowed: paper, best, robust, finetune"):
         recipe_config('FetchPush', 'good')
     stored = dataclasses.asdict(recipe_config('FetchPush', 'best'))
     with pytest.raises(ValueError, match='unknown configuration fields: colour'):

@@ -192,7 +192,7 @@ def test_it_trains_in_a_thread_too(tmp_path):
         ({'task': 'FetchRech'}, "did you mean 'FetchReach'"),
         ({'task': ['FetchReach']}, "unknown task \\['FetchReach'\\]; allowed: FetchReach"),
         ({'on_cycle': 3}, 'on_cycle 3; allowed: None or a function'),
-        ({'recipe': 'bst'}, "recipe 'bst'; allowed: paper, best, finetune"),
+        ({'recipe': 'bst'}, "recipe 'bst'; allowed: paper, best, robust, finetune"),
         ({'total_stps': 3}, "total_stps; did you mean 'total_steps'"),
         ({'total_steps': '3'}, "total_steps '3' is not of type int"),
         ({'gamma': 2.0}, 'gamma 2.0; allowed'),
