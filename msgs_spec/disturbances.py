@@ -235,6 +235,22 @@ class Disturbances:
                     found.setdefault(group.name, {})[each.name] = plain
         return found
 
+    def to_json(self) -> str:
+        """Return `as_dict` as JSON text, which `read_disturbances` reads."""
+        return json.dumps(self.as_dict())
+
+    @classmethod
+    def from_json(cls, text: str) -> Disturbances:
+        """Return the disturbances that `to_json` gave.
+
+        Raises:
+            ValueError: If the text is no JSON, or a value is not allowed.
+        """
+        try:
+            return cls.from_dict(json.loads(text))
+        except RecursionError:
+            raise ValueError('disturbances: JSON is nested too deep') from None
+
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Disturbances:
         """Return the disturbances that `as_dict` gave.
@@ -259,12 +275,13 @@ def read_disturbances(given: str | Mapping[str, Any] | Disturbances | None) -> D
 
     Args:
         given: A preset (`mild`, `hardware`, `severe`), scaled as in `hardware*0.5`; the path of a
-            JSON or YAML file; JSON text that begins with `{`; a mapping; `off` or None for none.
+            JSON or YAML file; JSON text that begins with `{`; a mapping; `none` or None for no
+            disturbances.
 
     Raises:
         ValueError: If it is none of these, or a value is not allowed.
     """
-    if given is None or given in ('', 'off'):
+    if given is None or given in ('', 'none', 'off'):
         return Disturbances()
     if isinstance(given, Disturbances):
         return given
@@ -277,7 +294,7 @@ def read_disturbances(given: str | Mapping[str, Any] | Disturbances | None) -> D
         return Disturbances.from_dict(_parsed(given))
     path = Path(given).expanduser()
     if not path.is_file():
-        allowed = ', '.join(['off', *PRESETS])
+        allowed = ', '.join(['none', *PRESETS])
         raise ValueError(
             f'disturbances {given[:80]!r} is neither a file nor a preset; allowed: {allowed}, '
             f'scaled as in hardware*0.5{did_you_mean(name, list(PRESETS))}'

@@ -6,8 +6,9 @@ import math
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
+from msgs_spec.disturbances import read_disturbances
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
@@ -54,7 +55,7 @@ class ParameterSpec:
     upper: float = math.inf
     or_zero: bool = False
     read_only: bool = True
-    check: Callable[[float], object] | None = None
+    check: Callable[[Any], object] | None = None
     former: str = ''
     is_path: bool = False
 
@@ -104,6 +105,15 @@ SIM_NODE = (
         'sparse',
         'Sparse: 0 at the goal, -1 elsewhere. Dense: minus the distance to the goal.',
         choices=REWARD_TYPES,
+    ),
+    ParameterSpec(
+        'disturbances',
+        'string',
+        'none',
+        'Delays, noise and other physics of each episode: none, mild, hardware, severe, scaled as '
+        'in hardware*0.5, or a YAML file; a new value counts from the next episode on.',
+        check=read_disturbances,
+        read_only=False,
     ),
     ParameterSpec(
         'success_rule',
@@ -288,6 +298,7 @@ def _is_allowed(spec: ParameterSpec, value: object) -> bool:
             isinstance(value, str)
             and (not spec.choices or value in spec.choices)
             and (spec.longest is None or len(value) <= spec.longest)
+            and (spec.check is None or spec.check(value) is not None)
         )
     kinds = (int,) if spec.type == 'integer' else (int, float)
     if isinstance(value, bool) or not isinstance(value, kinds):

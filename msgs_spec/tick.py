@@ -24,7 +24,7 @@ from msgs_spec.tasks import (
     substeps_per_tick,
 )
 from msgs_spec.text import one_of
-from msgs_spec.topics import TopicSpec, topics
+from msgs_spec.topics import GROUND_TRUTH, TopicSpec, ground_truth_topics, topics
 
 Phase = Literal['waiting', 'reset', 'running', 'finished']
 # What each says of the tick it comes with. An episode that is given up ends without `finished`.
@@ -52,6 +52,8 @@ class EpisodeStatus:
         episode_return: Sum of rewards so far.
         is_success: Whether the goal is reached now.
         joint_prefix: What the names of joints begin with; told where it is not the usual one.
+        disturbances: What is disturbed, JSON; told where something is.
+        variation: What the episode drew from it, JSON.
     """
 
     task: str
@@ -65,6 +67,8 @@ class EpisodeStatus:
     episode_return: float
     is_success: bool
     joint_prefix: str = JOINT_PREFIX
+    disturbances: str = ''
+    variation: str = ''
 
     def is_of_same_robot(self, other: EpisodeStatus) -> bool:
         """Whether the messages of both mean the same: who follows one can follow the other."""
@@ -76,9 +80,8 @@ class EpisodeStatus:
     def to_values(self) -> dict[str, str]:
         """Returns the key/value pairs of the message."""
         values = {key: str(value) for key, value in dataclasses.asdict(self).items()}
-        if self.joint_prefix == JOINT_PREFIX:
-            del values['joint_prefix']
-        return values
+        usual = {'joint_prefix': JOINT_PREFIX, 'disturbances': '', 'variation': ''}
+        return {key: text for key, text in values.items() if usual.get(key) != text}
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> EpisodeStatus:
@@ -87,7 +90,7 @@ class EpisodeStatus:
         Raises:
             ValueError: If a pair is missing or cannot be read, or nothing can run at the rate.
         """
-        values = {'joint_prefix': JOINT_PREFIX, **values}
+        values = {'joint_prefix': JOINT_PREFIX, 'disturbances': '', 'variation': '', **values}
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
         if missing:
             raise ValueError(f'episode_status without {", ".join(missing)}')
@@ -110,6 +113,8 @@ class EpisodeStatus:
                 episode_return=float(values['episode_return']),
                 is_success=flags[values['is_success']],
                 joint_prefix=values['joint_prefix'],
+                disturbances=values['disturbances'],
+                variation=values['variation'],
             )
         except (KeyError, ValueError) as error:
             raise ValueError(f'{said} unreadable value: {error}') from None
@@ -144,6 +149,8 @@ class Tick:
         is_success: Whether the goal is reached now.
         applied_command: (action,), command units, after clipping.
         status: Of the episode.
+        true_readings: What the sensors would measure without disturbances; None where there are
+            none.
         has_diverged: Whether MuJoCo gave up in the step that led here, which ends the episode;
             state, goal and reward are of what it was set back to.
     """
@@ -156,6 +163,7 @@ class Tick:
     is_success: bool
     applied_command: Array | None
     status: EpisodeStatus
+    true_readings: Readings | None = None
     has_diverged: bool = False
 
 
@@ -183,6 +191,7 @@ class TickEncoder:
         published = [spec for spec in topics(task) if spec.direction == 'published']
         self._status = next(spec for spec in published if spec.name == 'episode_status')
         self._codecs = [TopicCodec(spec) for spec in published if spec is not self._status]
+        self._true_codecs = [TopicCodec(spec) for spec in ground_truth_topics(task)]
 
     def encode(self, tick: Tick, latched: bool = False) -> list[tuple[TopicSpec, bytes]]:
         """Returns the messages of a tick with their CDR bytes, in the order of `topics`.
@@ -205,6 +214,10 @@ class TickEncoder:
                 raise ValueError(f'no {codec.topic.name} in a tick of {tick.status.task}')
             values = vectors[codec.topic.name]
             if values is not None:
+                messages.append((codec.topic, codec.encode(tick.stamp_ns, values)))
+        if tick.true_readings is not None:
+            for codec in self._true_codecs:
+                values = tick.true_readings[codec.topic.name.removeprefix(f'{GROUND_TRUTH}/')]
                 messages.append((codec.topic, codec.encode(tick.stamp_ns, values)))
         if latched:
             messages.append(self.encode_status(tick.stamp_ns, tick.status))

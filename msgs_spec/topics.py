@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Literal
 
@@ -239,6 +239,29 @@ MONITORING = (DIAGNOSTICS, REAL_TIME_FACTOR, LATEST_TICK)
 def sensor_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Returns the topics of what sensors of a task say; observations are made of them."""
     return (_joint_topic(task), *_body_topics(task))
+
+
+# Namespace of what the sensors would measure without disturbances.
+GROUND_TRUTH = 'ground_truth'
+
+
+def ground_truth_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
+    """Return the topics of the true state, which a disturbed robot publishes besides."""
+    return tuple(
+        replace(
+            spec,
+            name=f'{GROUND_TRUTH}/{spec.name}',
+            description=f'`{spec.name}` without disturbances; only where there are some.',
+        )
+        for spec in sensor_topics(task)
+    )
+
+
+def relative_name(resolved: str) -> str:
+    """Return the name of a topic within the namespace of its robot."""
+    namespace, _, name = resolved.rpartition('/')
+    is_true_state = namespace.rpartition('/')[2] == GROUND_TRUTH
+    return f'{GROUND_TRUTH}/{name}' if is_true_state else name
 
 
 # Bounded: whoever publishes chooses names of joints, and so any number of tasks.

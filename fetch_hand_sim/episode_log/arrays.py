@@ -20,7 +20,7 @@ from msgs_spec.arrays import Array, Flags
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import TaskSpec
-from msgs_spec.topics import topic
+from msgs_spec.topics import relative_name, topic
 
 
 # Compared by identity: arrays compare number by number, and cannot say whether all are equal.
@@ -126,7 +126,7 @@ class _Decoder:
         self._record = EpisodeRecord.parse(metadata)
         self._task = self._record.task
         self._assembler = _assembler(self._task, self._record.control_hz)
-        self._resolved = {name.rpartition('/')[2]: name for name in file.offsets}
+        self._resolved = {relative_name(name): name for name in file.offsets}
 
     def decode(self, result: dict[str, str]) -> EpisodeArrays:
         states = {spec.name: self._rows(spec.name) for spec in self._assembler.topics}

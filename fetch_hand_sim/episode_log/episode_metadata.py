@@ -39,6 +39,8 @@ def episode_metadata(
     source_revision: str | None = None,
     checkpoint_sha256: str | None = None,
     perturb_limit: float = 0.0,
+    disturbances: str = '',
+    variation: str = '',
     started: str | None = None,
 ) -> dict[str, str]:
     """Returns the contents of the record `episode`.
@@ -59,6 +61,8 @@ def episode_metadata(
         checkpoint_sha256: Fingerprint of the actor that gives the commands, if known.
         perturb_limit: Largest force, N, by which the robot lets itself be pushed; recorded where it
             does at all, because such an episode is no plain one.
+        disturbances: What is disturbed, JSON; recorded where something is.
+        variation: What the episode drew from it, JSON; likewise.
         started: Wall-clock time of the start, ISO 8601. The one value that differs between equal
             runs; leave it out for files that are equal byte by byte.
     """
@@ -82,6 +86,8 @@ def episode_metadata(
         'source_revision': source_revision,
         'checkpoint_sha256': checkpoint_sha256,
         'perturb_limit': repr(float(perturb_limit)) if perturb_limit else None,
+        'disturbances': disturbances or None,
+        'variation': variation or None,
         'started': started,
         'python_version': platform.python_version(),
         **{f'{package}_version': _version(package) for package in _PACKAGES},

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
+from msgs_spec.disturbances import Disturbances
 from msgs_spec.parameters import LARGEST_PERTURBATION
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import (
@@ -50,6 +51,7 @@ class EpisodeRecord:
         interface_version: What its messages mean, see `INTERFACE_VERSION`.
         perturb_limit: Largest force of a push, N; 0 where none was taken.
         timing: What stayed where the rate is not 25 Hz.
+        disturbances: What was disturbed.
     """
 
     task: TaskSpec
@@ -62,6 +64,7 @@ class EpisodeRecord:
     interface_version: int
     perturb_limit: float = 0.0
     timing: Timing = 'seconds'
+    disturbances: Disturbances = field(default_factory=Disturbances)
 
     @classmethod
     def parse(cls, metadata: Strings) -> EpisodeRecord:
@@ -81,6 +84,7 @@ class EpisodeRecord:
             interface_version=_integer(metadata, 'interface_version', default='1'),
             perturb_limit=_perturb_limit(metadata),
             timing=one_of(metadata.get('timing', 'ticks'), TIMINGS, 'timing'),
+            disturbances=Disturbances.from_json(metadata.get('disturbances', '{}')),
         )
 
     @property

@@ -35,7 +35,7 @@ from fetch_hand_sim.episode_log.untrusted import RECOVERY_LIMITS, read_records
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.text import one_line
-from msgs_spec.topics import topics
+from msgs_spec.topics import relative_name, topics
 
 _RECEIVED = frozenset(
     spec.name for task in TASKS.values() for spec in topics(task) if spec.direction == 'subscribed'
@@ -104,7 +104,7 @@ class _Remains:
         types = {
             id: self.schemas[channel.schema_id].name
             for id, channel in self.channels.items()
-            if channel.topic.rpartition('/')[2] == name
+            if relative_name(channel.topic) == name
         }
         found = [m for m in self.messages if m.channel_id in types]
         try:
@@ -237,7 +237,7 @@ def _write(stream: BinaryIO, file: Path, remains: _Remains) -> str:
     received = ReceivedAllowance()
     for message in remains.messages:
         spec = specs[message.channel_id]
-        name = spec.topic.rpartition('/')[2]
+        name = relative_name(spec.topic)
         if name not in _RECEIVED or received.takes(name, len(message.data)):
             bag.write(spec, message.data, message.log_time)
     return end_bag(bag, stream, metadata, checked_strings(remains.result))

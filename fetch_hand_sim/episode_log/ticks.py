@@ -11,7 +11,7 @@ from msgs_spec.codecs import message_stamp
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.text import one_line
-from msgs_spec.topics import TopicSpec, topics
+from msgs_spec.topics import TopicSpec, ground_truth_topics, relative_name, topics
 
 _CLOCK = '/clock'
 
@@ -69,10 +69,11 @@ def logged_topics(episode: Episode) -> dict[str, TopicSpec]:
         EpisodeReadError: If the task has no such topic, or of another type.
     """
     task = episode_task(episode)
-    known = {spec.name.lstrip('/'): spec for spec in topics(task)}
+    specs = (*topics(task), *ground_truth_topics(task))
+    known = {spec.name.lstrip('/'): spec for spec in specs}
     found = {}
     for name, logged in episode.topics.items():
-        spec = known.get(name.rpartition('/')[2])
+        spec = known.get(relative_name(name))
         if spec is None or spec.type_name != logged.type_name:
             raise EpisodeReadError(
                 f'{episode.path}: {task.name} has no topic {name} of type {logged.type_name}'

@@ -122,7 +122,7 @@ class EpisodeChecker:
         return result
 
     def _simulation_of(self, record: EpisodeRecord) -> Simulation:
-        rules = (record.reward_type, record.success_rule, record.timing)
+        rules = (record.reward_type, record.success_rule, record.timing, record.disturbances)
         key = (record.task.name, record.control_hz, *rules)
         if self._simulation is None or key != self._key:
             self._simulation = Simulation(
@@ -132,6 +132,7 @@ class EpisodeChecker:
                 success_rule=record.success_rule,
                 control_hz=record.control_hz,
                 timing=record.timing,
+                disturbances=record.disturbances,
             )
             self._key = key
             model = self._simulation.model

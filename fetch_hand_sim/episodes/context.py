@@ -57,5 +57,7 @@ class RecordingContext:
             source_revision=self._source_revision,
             checkpoint_sha256=self.checkpoint_sha256,
             perturb_limit=self._perturb_limit,
+            disturbances=status.disturbances,
+            variation=status.variation,
             started=datetime.now(UTC).isoformat(timespec='milliseconds'),
         )

@@ -115,7 +115,8 @@ class EpisodeGenerator:
         for index, robot in enumerate(robots):
             self._take(robot, robot.episode.start(sensed, index))
         for _ in range(simulation.spec.episode_ticks):
-            actions = self._act(simulation.observe_from(sensed.readings))
+            observation = simulation.observe_from(sensed.readings)
+            actions = self._act({**observation, 'achieved_goal': sensed.achieved})
             commands = np.asarray(command_from_action(robot_spec, actions), dtype=np.float64)
             self._receive(robots, commands)
             applied = clip_command(robot_spec, commands)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ class Sensed:
 
     Attributes:
         readings: One reading of the sensors, (N, size) each.
+        true_readings: The same without disturbances; None where there are none.
         achieved: (N, goal size).
         desired: (N, goal size).
         reward: (N,).
@@ -28,6 +30,7 @@ class Sensed:
     """
 
     readings: Readings
+    true_readings: Readings | None
     achieved: Array
     desired: Array
     reward: Array
@@ -36,10 +39,13 @@ class Sensed:
 
 def sense(simulation: Simulation) -> Sensed:
     """Reads the sensors of all robots, once."""
-    readings = simulation.readings()
-    achieved, desired = achieved_goal(simulation.spec, readings), simulation.goals.copy()
+    readings, truth = simulation.readings(), None
+    if not simulation.disturbances.is_off:
+        truth = simulation.true_readings()
+    achieved = achieved_goal(simulation.spec, readings if truth is None else truth)
+    desired = simulation.goals.copy()
     reward, success = simulation.metric.evaluate(achieved, desired)
-    return Sensed(readings, achieved, desired, reward, success)
+    return Sensed(readings, truth, achieved, desired, reward, success)
 
 
 def has_ended(ticks: Any, episode_ticks: int, has_diverged: Any) -> Any:
@@ -84,6 +90,7 @@ class RobotEpisode:
         self._joint_prefix = joint_prefix
         self._period_ns = round(simulation.tick_duration * 1e9)
         self._return = 0.0
+        self._disturbances = self._variation = ''
         self.seed = seed
         self.first_stamp_ns = first_stamp_ns
         self.tick = 0
@@ -102,6 +109,10 @@ class RobotEpisode:
             sensed: By all robots.
             index: Which of them this one is.
         """
+        disturbances = self._simulation.disturbances
+        if not disturbances.is_off:
+            self._disturbances = disturbances.to_json()
+            self._variation = json.dumps(self._simulation.variation(index))
         return self._make_tick('reset', sensed, index, None)
 
     def step(self, sensed: Sensed, index: int, command: Array, has_diverged: bool) -> Tick:
@@ -120,7 +131,7 @@ class RobotEpisode:
         return self._make_tick('finished' if is_last else 'running', sensed, index, command)
 
     def _make_tick(self, phase: Phase, sensed: Sensed, index: int, command: Array | None) -> Tick:
-        is_success = bool(sensed.success[index])
+        is_success, truth = bool(sensed.success[index]), sensed.true_readings
         self.status = self._make_status(phase, is_success=is_success)
         return Tick(
             stamp_ns=self.first_stamp_ns + self.tick * self._period_ns,
@@ -131,6 +142,7 @@ class RobotEpisode:
             is_success=is_success,
             applied_command=command,
             status=self.status,
+            true_readings=truth and {name: values[index] for name, values in truth.items()},
             has_diverged=self.has_diverged,
         )
 
@@ -148,4 +160,6 @@ class RobotEpisode:
             episode_return=self._return,
             is_success=is_success,
             joint_prefix=self._joint_prefix,
+            disturbances=self._disturbances,
+            variation=self._variation,
         )

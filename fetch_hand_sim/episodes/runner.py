@@ -11,6 +11,7 @@ import numpy as np
 from fetch_hand_sim.episodes.robot_episode import RobotEpisode, sense
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array
+from msgs_spec.disturbances import Disturbances
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tick import EpisodeStatus, Tick
 
@@ -71,6 +72,7 @@ class EpisodeRunner:
         self._first_episode = self.episode = first_episode
         self._series_seed = first_seed
         self._new_first_seed: int | None = None
+        self._new_disturbances: Disturbances | None = None
         self.is_between_episodes = True
         self.current = self._make_episode(first_stamp_ns)
 
@@ -106,6 +108,10 @@ class EpisodeRunner:
         following = self.episode if self.is_between_episodes else self.episode + 1
         self._new_first_seed = seed - following
         self._series_seed = seed - self._first_episode
+
+    def set_next_disturbances(self, disturbances: Disturbances) -> None:
+        """Disturb the episodes that start from now on in this way."""
+        self._new_disturbances = disturbances
 
     def set_goal(self, goal: Array) -> None:
         """Replaces the goal (goal size,) of the running episode from the next tick on.
@@ -151,6 +157,8 @@ class EpisodeRunner:
         stamp_ns = self.stamp_ns + self._period_ns
         if self._new_first_seed is not None:
             self._first_seed, self._new_first_seed = self._new_first_seed, None
+        if self._new_disturbances is not None:
+            self.simulation.disturbances, self._new_disturbances = self._new_disturbances, None
         self.is_between_episodes = False
         self.simulation.reset(seed=self.seed)
         self.current = self._make_episode(stamp_ns)

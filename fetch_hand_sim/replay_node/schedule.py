@@ -13,7 +13,7 @@ from fetch_hand_sim.episode_log import Episode, EpisodeReadError, read_episode
 from fetch_hand_sim.episode_log.episode_record import parse_control_hz
 from fetch_hand_sim.episode_log.ticks import logged_topics
 from msgs_spec.schemas import deserialize
-from msgs_spec.topics import TopicSpec
+from msgs_spec.topics import TopicSpec, relative_name
 
 # What ROS takes for a resolved name; `rmw` sets the length.
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
@@ -102,7 +102,7 @@ class ReplaySchedule:
 
 
 def _wanted(specs: dict[str, TopicSpec], names: list[str], with_inputs: bool) -> set[str]:
-    short = {name.rpartition('/')[2]: name for name in specs}
+    short = {relative_name(name): name for name in specs}
     unknown = [name for name in names if name not in specs and name not in short]
     if unknown:
         raise ValueError(f'no topic {unknown[0]!r} in the episode; allowed: {", ".join(specs)}')

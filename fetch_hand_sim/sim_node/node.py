@@ -32,10 +32,11 @@ from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.diagnostics import REPORT_PERIOD, next_report
+from msgs_spec.disturbances import read_disturbances
 from msgs_spec.parameters import SIM_NODE
 from msgs_spec.robots import require_joint_prefix
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
-from msgs_spec.topics import LATEST_TICK, MONITORING, topics
+from msgs_spec.topics import LATEST_TICK, MONITORING, ground_truth_topics, topics
 from node_runtime.command_line import UsageError
 from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import NodeFailure, StopSignals
@@ -73,6 +74,7 @@ class SimNode(Node):
         self._recording_context: RecordingContext | None = None
         self._recorder = self._make_recorder()
         self._outputs = self._open_topics()
+        self._open_ground_truth()
         encoder = TickEncoder(self._robot.runner.spec)
         self._latest_tick = LatestTick(self._outputs[LATEST_TICK.name], encoder)
         self._watch = GraphWatch(self, self._robot.runner.spec, self._outputs)
@@ -105,6 +107,7 @@ class SimNode(Node):
                 reward_type=values['reward_type'],
                 success_rule=values['success_rule'],
                 control_hz=values['control_hz'],
+                disturbances=values['disturbances'],
             )
             require_joint_prefix(simulation.spec.robot, values['joint_prefix'])
         except ValueError as error:
@@ -140,6 +143,15 @@ class SimNode(Node):
             elif spec.name != '/clock' or self._settings['publish_clock']:
                 publishers[spec.name] = self.create_publisher(message_class, spec.name, profile)
         return publishers
+
+    def _open_ground_truth(self) -> None:
+        """Offer the true state too, once something disturbs the robot."""
+        if read_disturbances(self._settings['disturbances']).is_off:
+            return
+        for spec in ground_truth_topics(self._robot.runner.spec):
+            if spec.name not in self._outputs:
+                message_class, profile = ros_message_class(spec.type_name), rclpy_profile(spec.qos)
+                self._outputs[spec.name] = self.create_publisher(message_class, spec.name, profile)
 
     def _make_recorder(self) -> EpisodeRecorder | None:
         directory = self._settings['episode_dir']
@@ -362,6 +374,9 @@ class SimNode(Node):
                     self._publish(self._robot.waiting_status())
             elif change.name == 'command_timeout':
                 self._robot.buffer.timeout = float(change.value)
+            elif change.name == 'disturbances':
+                self._robot.runner.set_next_disturbances(read_disturbances(change.value))
+                self._open_ground_truth()
 
 
 def _episode_line(status: EpisodeStatus) -> str:

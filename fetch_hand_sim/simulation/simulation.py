@@ -157,9 +157,7 @@ class Simulation:
         self._is_started = np.zeros(num_envs, dtype=np.bool_)
         self._process = os.getpid()
         self._disturber: Disturber | None = None
-        chosen = read_disturbances(disturbances)
-        if not chosen.is_off:
-            self._disturber = Disturber(self._task, chosen)
+        self.disturbances = disturbances
         # The thirteen are held to their specification by tests.
         self._is_as_declared = self.spec.reference_id is not None
 
@@ -373,6 +371,15 @@ class Simulation:
     def disturbances(self) -> Disturbances:
         """What is disturbed."""
         return Disturbances() if self._disturber is None else self._disturber.disturbances
+
+    @disturbances.setter
+    def disturbances(self, disturbances: Disturbances | Mapping[str, Any] | str | None) -> None:
+        """Replace the disturbances; every simulation must be reset afterwards."""
+        chosen = read_disturbances(disturbances)
+        if self._disturber is not None:
+            self._disturber.start_nominal(self._all)
+        self._disturber = None if chosen.is_off else Disturber(self._task, chosen)
+        self._is_started[:] = False
 
     def variation(self, index: int) -> dict[str, float]:
         """Return what the running episode of a simulation drew from its disturbances."""

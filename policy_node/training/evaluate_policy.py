@@ -93,6 +93,7 @@ def _run(options: argparse.Namespace) -> int:
         **summarize(outcomes),
         'reward_type': options.reward_type,
         'touched_rule': options.success_rule,
+        **_disturbed(simulation),
     }
     try:
         try:
@@ -105,6 +106,12 @@ def _run(options: argparse.Namespace) -> int:
     except OSError as error:
         raise CommandError(f'{error.filename or "output"}: {error.strerror}') from None
     return code
+
+
+def _disturbed(simulation: Simulation) -> dict[str, Any]:
+    """Return the disturbances for the report; nothing where there are none."""
+    disturbances = simulation.disturbances
+    return {} if disturbances.is_off else {'disturbances': disturbances.as_dict()}
 
 
 def _is_replaced(file: Path) -> bool:

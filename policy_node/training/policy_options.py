@@ -51,6 +51,8 @@ def add_batch_options(parser: argparse.ArgumentParser, num_envs: int) -> None:
     simulations = f'simulations in the batch; default: {num_envs}'
     add('--num-envs', type=count, default=num_envs, help=simulations)
     add('--threads', type=int, default=0, help='simulation threads; default: all cores')
+    presets = 'none, mild, hardware, severe, scaled as in hardware*0.5, or a YAML file'
+    add('--disturbances', default='none', help=f'of the robot: {presets}; default: none')
 
 
 def add_reward_options(parser: argparse.ArgumentParser) -> None:
@@ -134,6 +136,7 @@ def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) ->
         reward_type=options.reward_type,
         success_rule=options.success_rule,
         control_hz=loaded.control_hz or DEFAULT_CONTROL_HZ,
+        disturbances=options.disturbances,
     )
 
 

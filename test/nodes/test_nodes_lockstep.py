@@ -52,9 +52,12 @@ def logged_run(start: Start, directory: Path, **parameters: object):
     return [payload(episode) for episode in episodes_in(directory)]
 
 
-def batch_run(spec: TaskSpec, episodes: int) -> list[dict[str, list[bytes]]]:
+def batch_run(
+    spec: TaskSpec, episodes: int, disturbances: str = 'none'
+) -> list[dict[str, list[bytes]]]:
     """The same without ROS: bytes by topic for each episode."""
-    runner = EpisodeRunner(Simulation(spec.name, num_threads=1), first_seed=SEED, episodes=episodes)
+    simulation = Simulation(spec.name, num_threads=1, disturbances=disturbances)
+    runner = EpisodeRunner(simulation, first_seed=SEED, episodes=episodes)
     encoder, buffer = TickEncoder(spec), CommandBuffer(spec.robot, 0.0)
     status = runner.waiting_status()
     sent: list[bytes] = []
@@ -104,6 +107,46 @@ def test_bytes_are_equal_between_runs_in_real_time_and_without_ros(
             break
     assert paced == first[0]
     end(policy)
+
+
+def test_a_disturbed_episode_is_the_same_over_ros_in_the_batch_and_in_its_check(
+    start_process: Start, tmp_path: Path
+) -> None:
+    policy = start_process(*POLICY_NODE)
+    logged = logged_run(
+        start_process, tmp_path, mode='lockstep', episodes=2, disturbances='hardware'
+    )
+    end(policy)
+    assert [without_times(each) for each in logged] == batch_run(REACH, 2, 'hardware')
+    assert logged[0]['/ground_truth/joint_states'] != logged[0]['/joint_states']
+    for path in tmp_path.iterdir():
+        assert EpisodeChecker().check(path).difference is None
+        assert 'action_latency' in read_summary(path).metadata['variation']
+
+
+def test_disturbances_change_between_episodes(start_process: Start, tmp_path: Path) -> None:
+    policy = start_process(*POLICY_NODE)
+    arguments = ros_args(mode='lockstep', wait_for_commands=True, episode_dir=tmp_path)
+    sim = start_process(*SIM_NODE, *arguments, '-p', 'log_compiled_model:=false')
+    with client(REACH) as robot:
+        robot.subscribe('reward')
+        robot.spin_until(lambda: robot.received['reward'], 'ticks')
+        for value, is_right in (('severe*2', True), ('sever', False)):
+            wanted = Parameter(
+                name='disturbances', value=ParameterValue(type=4, string_value=value)
+            )
+            answer = robot.call(SetParameters, 'sim_node/set_parameters', parameters=[wanted])
+            (result,) = answer.results
+            assert result.successful == is_right and ('mild' in result.reason) != is_right
+        count = len(robot.received['reward'])
+        robot.spin_until(lambda: len(robot.received['reward']) > count + 120, 'two episodes')
+    sim.send_signal(signal.SIGINT)
+    assert finish(sim)[0] == 0
+    end(policy)
+    first, *_, last = sorted(tmp_path.iterdir())
+    assert 'disturbances' not in read_summary(first).metadata
+    assert 'latency' in read_summary(last).metadata['disturbances']
+    assert EpisodeChecker().check(last).difference is None
 
 
 def test_an_episode_at_250_hz_takes_ten_times_the_ticks(

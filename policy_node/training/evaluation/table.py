@@ -22,6 +22,8 @@ _NARROWEST = 60
 def print_table(report: dict[str, Any]) -> None:
     """Prints rates with their 95 % intervals."""
     title = f'{report["task"]}: {report["policy"]}, {report["episodes"]} episodes'
+    if 'disturbances' in report:
+        title += ', disturbed'
     table = Table('measure', 'value', '95 % interval', title=Text(title))
     names = {
         'success_gymnasium': 'success at the last step, gymnasium rule',
