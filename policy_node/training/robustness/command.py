@@ -1,0 +1,170 @@
+"""`robustness`: success of a policy under ten disturbances at rising levels, and under the presets.
+
+The result is a JSON file, a CSV file and a figure. A command that was interrupted goes on with the
+points that the JSON file lacks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.parameters import LARGEST_SEED
+from msgs_spec.tasks import task_spec
+from node_runtime.command_line import (
+    EXIT_SUCCESS,
+    CommandError,
+    CommandParser,
+    UsageError,
+    progress,
+    run_command,
+    say,
+    whole_number,
+)
+from policy_node.policies.files import to_json, write_file
+from policy_node.policies.policy import LoadedPolicy
+from policy_node.training.evaluation.episodes import (
+    FIRST_SEED,
+    EpisodeOutcomes,
+    evaluate,
+    wilson_interval,
+)
+from policy_node.training.policy_options import (
+    CheckedPolicy,
+    add_policy_options,
+    load_chosen_policy,
+    make_chosen_simulation,
+    require_writable,
+)
+from policy_node.training.robustness.figure import draw
+from policy_node.training.robustness.sweeps import Point, points, sentence
+
+_NAME = 'robustness'
+# Settings that make the points of two results comparable.
+_SETTINGS = ('task', 'sha256', 'episodes', 'first_seed', 'control_hz')
+
+
+def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Parse the command line."""
+    parser = CommandParser(prog=_NAME, description=__doc__)
+    add_policy_options(parser)
+    add, count = parser.add_argument, whole_number(1)
+    add('--episodes', type=count, default=200, help='episodes of each point; default: 200')
+    add('--num-envs', type=count, default=100, help='simulations in the batch; default: 100')
+    add('--threads', type=int, default=0, help='simulation threads; default: all cores')
+    seed = whole_number(0, LARGEST_SEED)
+    add('--first-seed', type=seed, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
+    add(
+        '--output',
+        type=Path,
+        metavar='NAME',
+        help='writes NAME.json, NAME.csv and NAME.png; default: <task>.robustness',
+    )
+    parser.set_defaults(reward_type='sparse', success_rule='gymnasium', disturbances='none')
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    options = parse_arguments(arguments)
+    return run_command(_NAME, lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    loaded = load_chosen_policy(options)
+    try:
+        simulation = make_chosen_simulation(options, loaded)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    name = options.output or Path(f'{loaded.task}.robustness')
+    files = {kind: name.with_name(f'{name.name}.{kind}') for kind in ('json', 'csv', 'png')}
+    for file in files.values():
+        require_writable(file)
+    result = _start(options, loaded, simulation, files['json'])
+    _measure(result, simulation, CheckedPolicy(loaded), files['json'])
+    success = {key: point['success'] for key, point in result['points'].items()}
+    result['sentence'] = sentence(task_spec(loaded.task), result['control_hz'], success)
+    write_file(files['json'], to_json(result))
+    write_file(files['csv'], _to_csv(result))
+    try:
+        write_file(files['png'], draw(result))
+    except ImportError:
+        say(f'{files["png"]} needs matplotlib: pip install fetch_hand_sim[train]')
+    say(result['sentence'])
+    return EXIT_SUCCESS
+
+
+def _start(
+    options: argparse.Namespace, loaded: LoadedPolicy, simulation: Simulation, file: Path
+) -> dict[str, Any]:
+    """Return the result without its points, or with those that the file holds."""
+    result: dict[str, Any] = {
+        'policy': Path(options.policy or loaded.task).name,
+        'task': loaded.task,
+        'sha256': loaded.sha256,
+        'episodes': options.episodes,
+        'first_seed': options.first_seed,
+        'control_hz': simulation.control_hz,
+        'points': {},
+    }
+    if not file.exists():
+        return result
+    try:
+        earlier = json.loads(file.read_text())
+        is_same = all(earlier[name] == result[name] for name in _SETTINGS)
+        earlier_points = dict(earlier['points'])
+    except (ValueError, LookupError, TypeError, RecursionError):
+        raise UsageError(f'{file} is no result of this command; give another --output') from None
+    if not is_same:
+        raise UsageError(
+            f'{file} is of another policy or has other settings ({", ".join(_SETTINGS)}); '
+            'remove it or give another --output'
+        )
+    return {**result, 'points': earlier_points}
+
+
+def _measure(
+    result: dict[str, Any], simulation: Simulation, policy: CheckedPolicy, file: Path
+) -> None:
+    """Evaluate the points that are missing; write the file after each."""
+    missing = [each for each in points(simulation.spec) if each.key not in result['points']]
+    with progress('points', len(missing)) as advance:
+        for point in missing:
+            simulation.disturbances = point.disturbances
+            outcomes = evaluate(simulation, policy, result['episodes'], result['first_seed'])
+            result['points'][point.key] = _measured(point, outcomes)
+            try:
+                write_file(file, to_json(result))
+            except OSError as error:
+                raise CommandError(f'{file}: {error.strerror}') from None
+            advance(1)
+
+
+def _measured(point: Point, outcomes: EpisodeOutcomes) -> dict[str, Any]:
+    count = int(outcomes.success_gymnasium.sum())
+    return {
+        'disturbance': point.name,
+        'level': point.level,
+        'success': count / len(outcomes),
+        'success_interval_95': list(wilson_interval(count, len(outcomes))),
+        'dropped': float(outcomes.dropped.mean()),
+        'diverged': int(outcomes.diverged.sum()),
+        'disturbances': point.disturbances.as_dict(),
+    }
+
+
+def _to_csv(result: dict[str, Any]) -> bytes:
+    """Return a CSV file with a row per point."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator='\n')
+    writer.writerow(['disturbance', 'level', 'success', 'low_95', 'high_95', 'dropped', 'diverged'])
+    for each in result['points'].values():
+        rest = (each['success'], *each['success_interval_95'], each['dropped'], each['diverged'])
+        writer.writerow([each['disturbance'], each['level'], *rest])
+    return file.getvalue().encode()

@@ -1,0 +1,60 @@
+"""The figure of a robustness result: one panel for each disturbance."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+from msgs_spec.disturbances import PRESETS
+from msgs_spec.tasks import task_spec
+from policy_node.training.robustness.sweeps import KEPT, sweeps_of
+
+_COLUMNS = 4
+
+
+def draw(result: Mapping[str, Any]) -> bytes:
+    """Return a PNG with success and its 95 % interval over the level of each disturbance.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    from matplotlib.figure import Figure
+
+    spec, found = task_spec(result['task']), result['points']
+    sweeps = sweeps_of(spec)
+    rows = -(-(len(sweeps) + 1) // _COLUMNS)
+    figure = Figure(figsize=(3.2 * _COLUMNS, 2.5 * rows), layout='constrained')
+    panels = list(figure.subplots(rows, _COLUMNS, sharey=True, squeeze=False).ravel())
+    undisturbed = found['none 0']
+    for axes, sweep in zip(panels, sweeps, strict=False):
+        measured = [undisturbed, *(found[f'{sweep.name} {level:g}'] for level in sweep.levels)]
+        labels = ['none', *(f'{level:g}' for level in sweep.levels)]
+        _panel(axes, labels, measured, undisturbed['success'])
+        axes.set_title(f'{sweep.name}, {sweep.unit}', fontsize='small')
+    presets = [undisturbed, *(found[f'{name} 1'] for name in PRESETS)]
+    last = panels[len(sweeps)]
+    _panel(last, ['none', *PRESETS], presets, undisturbed['success'])
+    last.set_title('presets', fontsize='small')
+    for axes in panels[len(sweeps) + 1 :]:
+        axes.set_visible(False)
+    figure.suptitle(
+        f'{result["policy"]} on {spec.name}: success at the last step, {result["episodes"]} '
+        f'episodes a point; dashed: {KEPT:.0%} of the undisturbed success; dotted: dropped',
+        fontsize='medium',
+    )
+    file = io.BytesIO()
+    figure.savefig(file, dpi=110)
+    return file.getvalue()
+
+
+def _panel(axes: Any, labels: list[str], measured: list[Any], undisturbed: float) -> None:
+    places = range(len(labels))
+    bounds = [each['success_interval_95'] for each in measured]
+    axes.fill_between(places, [b[0] for b in bounds], [b[1] for b in bounds], alpha=0.2)
+    axes.plot(places, [each['success'] for each in measured], 'o-', markersize=3)
+    if any(each['dropped'] for each in measured):
+        axes.plot(places, [each['dropped'] for each in measured], ':', color='C3')
+    axes.axhline(KEPT * undisturbed, linestyle='--', linewidth=0.8, color='gray')
+    axes.set_xticks(places, labels, fontsize='small')
+    axes.set_ylim(-0.03, 1.03)

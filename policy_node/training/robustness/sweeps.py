@@ -1,0 +1,148 @@
+"""The disturbances of a robustness curve, their levels, and what a policy keeps up to each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from msgs_spec.disturbances import PRESETS, Disturbances
+from msgs_spec.tasks import TaskSpec
+
+# Share of the undisturbed success that counts as kept.
+KEPT = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One disturbance at rising levels.
+
+    Attributes:
+        name: Name in files and figures.
+        unit: Unit of the levels.
+        levels: Levels, mildest first.
+        at: Makes the disturbances of a level, as `Disturbances.from_dict` reads them.
+        needs_object: Whether only tasks with an object have it.
+    """
+
+    name: str
+    unit: str
+    levels: tuple[float, ...]
+    at: Callable[[float], dict[str, Any]]
+    needs_object: bool = False
+
+
+def _ticks(group: str, *more: str) -> Callable[[float], dict[str, Any]]:
+    return lambda level: {name: {'latency': int(level)} for name in (group, *more)}
+
+
+def _one(group: str, name: str) -> Callable[[float], dict[str, Any]]:
+    return lambda level: {group: {name: level}}
+
+
+def _factors(*names: str) -> Callable[[float], dict[str, Any]]:
+    """Every episode draws a factor between 1/level and level."""
+    return lambda level: {'physics': {name: [1.0 / level, level] for name in names}}
+
+
+def _object_noise(level: float) -> dict[str, Any]:
+    return {'object': {'noise': level, 'rotation_noise': min(5.0 * level, 0.5)}}
+
+
+def _pushes(level: float) -> dict[str, Any]:
+    return {'pushes': {'force': level, 'rate': 1.0}}
+
+
+_TICKS = (1.0, 2.0, 3.0, 4.0)
+_SPREADS = (1.1, 1.25, 1.5, 2.0, 3.0)
+SWEEPS = (
+    Sweep('action latency', 'ticks', _TICKS, _ticks('action')),
+    Sweep('sensor latency', 'ticks', _TICKS, _ticks('joints', 'object')),
+    Sweep('repeated commands', 'probability', (0.1, 0.2, 0.3, 0.5, 0.7), _one('action', 'repeat')),
+    Sweep('action noise', 'of half the range', (0.05, 0.1, 0.2, 0.3, 0.5), _one('action', 'noise')),
+    Sweep('joint noise', 'rad', (0.005, 0.01, 0.02, 0.05, 0.1), _one('joints', 'noise')),
+    Sweep('joint offset', 'rad', (0.005, 0.01, 0.02, 0.05, 0.1), _one('joints', 'bias')),
+    Sweep(
+        'object noise',
+        'm, 5 x rad',
+        (0.002, 0.005, 0.01, 0.02, 0.05),
+        _object_noise,
+        needs_object=True,
+    ),
+    Sweep('friction', 'factor', _SPREADS, _factors('friction')),
+    Sweep('actuators', 'factor', _SPREADS, _factors('gain', 'damping')),
+    Sweep('pushes', 'of the weight, 1 Hz', (0.25, 0.5, 1.0, 2.0, 4.0), _pushes),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """What is evaluated: a disturbance at a level, a preset (level 1), or `none`."""
+
+    name: str
+    level: float
+    disturbances: Disturbances
+
+    @property
+    def key(self) -> str:
+        """Name in the result."""
+        return f'{self.name} {self.level:g}'
+
+
+def points(spec: TaskSpec) -> Iterator[Point]:
+    """Yield the points of a task's curve, the undisturbed one first."""
+    yield Point('none', 0.0, Disturbances())
+    for sweep in sweeps_of(spec):
+        for level in sweep.levels:
+            yield Point(sweep.name, level, Disturbances.from_dict(sweep.at(level)))
+    for name, preset in PRESETS.items():
+        yield Point(name, 1.0, preset)
+
+
+def sweeps_of(spec: TaskSpec) -> Sequence[Sweep]:
+    """Return the disturbances that a task has."""
+    return [sweep for sweep in SWEEPS if spec.has_object or not sweep.needs_object]
+
+
+def kept_up_to(sweep: Sweep, success: Mapping[str, float], undisturbed: float) -> float | None:
+    """Return the highest level up to which `KEPT` of the success is kept at every level.
+
+    Args:
+        sweep: The disturbance.
+        success: Success by `Point.key`.
+        undisturbed: Success without disturbances.
+
+    Returns:
+        The level; None if the success is lost at the first one.
+    """
+    kept = None
+    for level in sweep.levels:
+        if success[f'{sweep.name} {level:g}'] < KEPT * undisturbed:
+            break
+        kept = level
+    return kept
+
+
+def sentence(spec: TaskSpec, control_hz: float, success: Mapping[str, float]) -> str:
+    """Return what a policy keeps, in one sentence."""
+    if not success['none 0']:
+        return f'{spec.name}: no success without disturbances, so there is none to keep.'
+    kept, lost = [], []
+    for sweep in sweeps_of(spec):
+        level = kept_up_to(sweep, success, success['none 0'])
+        if level is None:
+            lost.append(f'{_amount(sweep, sweep.levels[0], control_hz)} {sweep.name}')
+        else:
+            end = ' (the highest level)' if level == sweep.levels[-1] else ''
+            kept.append(f'{_amount(sweep, level, control_hz)} {sweep.name}{end}')
+    share = f'{spec.name} keeps {KEPT:.0%} of its undisturbed success ({success["none 0"]:.2f})'
+    text = f'{share} up to {", ".join(kept)}' if kept else f'{share} under no disturbance'
+    return f'{text}; not with {", ".join(lost)}.' if lost else f'{text}.'
+
+
+def _amount(sweep: Sweep, level: float, control_hz: float) -> str:
+    if sweep.unit == 'ticks':
+        return f'{1000.0 * level / control_hz:.0f} ms'
+    if sweep.unit == 'factor':
+        return f'x{level:g}'
+    return f'{level:g} rad' if sweep.unit == 'rad' else f'{level:g}'
