@@ -1,6 +1,6 @@
 """The robots: thirteen tasks on MuJoCo, from one batched simulation, and the ROS node around it."""
 
-from node_runtime.import_guard import guard_loading
+from node_runtime.signals import guard_loading
 
 # Before anything that takes long to import.
 guard_loading()

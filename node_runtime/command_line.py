@@ -1,6 +1,6 @@
-"""What all command lines share: errors of one line, exit codes, Ctrl-C, closed pipes, progress.
+"""Command lines: one-line errors, exit codes, optional dependencies, progress bars.
 
-Here, because commands of both packages use it and neither package knows the other.
+`run_command` is the one place where errors become exit codes.
 """
 
 from __future__ import annotations
@@ -10,12 +10,10 @@ import errno
 import io
 import os
 import re
-import select
 import shlex
 import signal
 import sys
-import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
@@ -23,17 +21,23 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from msgs_spec.text import did_you_mean, one_line, printable
-from node_runtime.import_guard import EXIT_INTERRUPTED as EXIT_INTERRUPTED
-from node_runtime.import_guard import is_nobodys
+from node_runtime.signals import (
+    EXIT_INTERRUPTED,
+    discard_output,
+    discard_unread_output,
+    has_default_interrupt,
+    is_unread,
+    on_stop_signals,
+)
 
-# Done; done, and something is wrong; not begun, because of what was given.
+# Done, failed, and not started because of wrong arguments.
 EXIT_SUCCESS, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
-# What a stream says that takes nothing more.
-_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
-# As shells say it: 128 + SIGPIPE.
+# 128 + SIGPIPE, as in shells.
 EXIT_CLOSED_PIPE = 141
+# Errors of an output stream that takes no more data.
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
-# Modules by which an extra of this package is recognised, since ROS brings its own by apt.
+# Modules that show whether an extra of this package is installed; ROS installs its own by apt.
 EXTRAS = {
     'ros': ('rclpy',),
     'actors': ('torch',),
@@ -47,27 +51,27 @@ EXTRAS = {
 
 
 class CommandError(Exception):
-    """Something is wrong; the message is one line."""
+    """A command failed; the message is one line."""
 
     exit_code = EXIT_FAILURE
 
 
 class UsageError(CommandError):
-    """The user asked for what is not possible; the message is one line that says what is."""
+    """The arguments of a command are wrong; the message names the allowed ones in one line."""
 
     exit_code = EXIT_USAGE
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose errors are one line, as those of `run_command` are."""
+    """An argument parser with one-line errors and suggestions for misspelt names."""
 
     def error(self, message: str) -> NoReturn:
-        """Says what is wrong and exits; of an unknown name, which one was probably meant."""
+        """Print the error with a suggestion and exit with 2."""
         complain(self.prog, f'{message}{self._hint(message)}')
         sys.exit(EXIT_USAGE)
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        """Prints help and the like; that nobody reads them, argparse would swallow or trace."""
+        """Print help; argparse itself ignores or traces a closed output."""
 
         def write() -> int:
             print(message, end='', file=file or sys.stderr)
@@ -93,7 +97,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 def whole_number(lower: int, upper: int | None = None) -> Callable[[str], int]:
-    """Returns what reads a number from `lower` to `upper`, for `add_argument(type=...)`."""
+    """Return a parser of whole numbers from `lower` to `upper`, for `add_argument(type=...)`."""
     allowed = f'{lower} or more' if upper is None else f'{lower} ... {upper}'
 
     def read(text: str) -> int:
@@ -109,7 +113,7 @@ def whole_number(lower: int, upper: int | None = None) -> Callable[[str], int]:
 
 
 class FormerOption(argparse.Action):
-    """An option under its former name: it still works, and says what it is called now."""
+    """An option under its former name, accepted with a line that tells the new name."""
 
     def __call__(
         self,
@@ -118,117 +122,128 @@ class FormerOption(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        """Says so and sets the option."""
+        """Print the new name and set the option."""
         complain(parser.prog, f'{option_string} is now called --{self.dest}')
         setattr(namespace, self.dest, values)
 
 
 def complain(name: str, text: object) -> None:
-    """Prints one line on stderr.
+    """Print one line on stderr, after the name of the command.
 
-    Args:
-        name: The command that complains.
-        text: What is wrong; line breaks become spaces, control characters are escaped.
+    Line breaks become spaces and control characters are escaped.
     """
     print(f'{name}: {printable(" ".join(str(text).split()))}', file=sys.stderr, flush=True)
 
 
 def complain_from_handler(name: str, text: object) -> None:
-    """As `complain`, of a signal handler, which may have come in the middle of another line."""
-    # Python refuses to write to a stream from within a write to it.
+    """Call `complain` from a signal handler, which may have interrupted another write."""
+    # Python forbids a write to a stream within another write to it.
     with suppress(RuntimeError):
         complain(name, text)
 
 
 def say(text: object) -> None:
-    """Prints on stdout what may hold a name of somebody else's, escaped as `complain` does."""
+    """Print a line on stdout; control characters are escaped, as in `complain`."""
     print(printable(str(text)), flush=True)
 
 
 def given_command(name: str, arguments: Sequence[str] | None) -> str:
-    """Returns the command line that was given, in one line, for the record.
-
-    Args:
-        name: The command.
-        arguments: Of its `main`; None is those of the process.
-    """
+    """Return the command line as one line for the record; None means `sys.argv`."""
     words = [name, *(sys.argv[1:] if arguments is None else arguments)]
     return printable(shlex.join(words))
 
 
 def run_command(name: str, run: Callable[[], int]) -> int:
-    """Runs the body of a command and returns the exit code of the process.
+    """Run the body of a command and return the exit code of the process.
 
     Args:
         name: Name of the command, for error lines.
         run: Returns the exit code; may raise `CommandError`.
 
     Returns:
-        What `run` returns, or the exit code of what it raised: 1 or 2 for a `CommandError`, 130 for
-        Ctrl-C (it is acknowledged at once with a line), 141 if nobody reads the output any more.
-        SIGTERM and SIGHUP are as Ctrl-C, with 143 and 129.
+        The result of `run`; 1 or 2 for a `CommandError`; 130, 143 or 129 for SIGINT, SIGTERM or
+        SIGHUP, after the line `stopping`; 141 for a closed output.
     """
     make_output_usable()
-    with _stopping_is_said(name) as stopping:
-        code = _exit_code(name, run, stopping)
-        if stopping and code == EXIT_INTERRUPTED:
-            return 128 + stopping[0]
-    return code
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        complain_from_handler(name, 'stopping')
+        signal.default_int_handler(number, frame)
+
+    with on_stop_signals(_unclaimed_signals(), stop) as received:
+        code = _exit_code(name, run, received)
+        # A command may run another one, which knows nothing of the signal.
+        return 128 + received[0] if received and code == EXIT_INTERRUPTED else code
 
 
-def _exit_code(name: str, run: Callable[[], int], stopping: Sequence[int]) -> int:
-    """Runs the body of a command; `stopping` holds the signal once one came."""
+def _exit_code(name: str, run: Callable[[], int], received: Sequence[int]) -> int:
+    """Run the body of a command; `received` holds the stop signal once it has come."""
     try:
         code = run()
         sys.stdout.flush()
+        return code
     except CommandError as error:
         complain(name, error)
         return error.exit_code
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ImportError, RuntimeError) as error:
+        if not _is_interrupt(error, received):
+            raise
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        _discard_output(sys.stdout.fileno())
+        discard_output(sys.stdout.fileno())
         return EXIT_CLOSED_PIPE
     except OSError as error:
         if error.filename is not None or error.errno not in _FULL:
             raise
-        _discard_output(sys.stdout.fileno())
+        discard_output(sys.stdout.fileno())
         complain(name, f'cannot write: {error.strerror}')
         return EXIT_FAILURE
-    except ImportError:
-        # What becomes of KeyboardInterrupt in the initialisation of many a library.
-        if not stopping:
-            raise
-        return EXIT_INTERRUPTED
-    except RuntimeError as error:
-        # And in `__set_name__` of what a class holds, before Python 3.12.
-        if not isinstance(error.__cause__, KeyboardInterrupt):
-            raise
-        return EXIT_INTERRUPTED
-    return code
+
+
+def _is_interrupt(error: BaseException, received: Sequence[int]) -> bool:
+    """Return whether an error is KeyboardInterrupt or was raised in place of it.
+
+    Many libraries turn it into ImportError while they are imported. Python 3.11 turns it into
+    RuntimeError within `__set_name__`.
+    """
+    if isinstance(error, ImportError):
+        return bool(received)
+    return any(isinstance(each, KeyboardInterrupt) for each in (error, error.__cause__))
+
+
+def _unclaimed_signals() -> list[signal.Signals]:
+    """Return the signals that a command handles: none within a program that has its own handlers.
+
+    A shell starts background processes with SIGINT ignored; they still handle SIGTERM.
+    """
+    ignores_interrupt = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    if not (has_default_interrupt() or ignores_interrupt):
+        return []
+    others = (signal.SIGTERM, signal.SIGHUP)
+    found = [each for each in others if signal.getsignal(each) == signal.SIG_DFL]
+    return found if ignores_interrupt else [signal.SIGINT, *found]
 
 
 def make_output_usable() -> None:
-    """Lets this process print where its stdout or stderr is closed, or cannot take every letter.
+    """Replace a closed stdout or stderr and escape characters that their encoding lacks.
 
-    Of a program of somebody else that runs a command, nothing is changed.
+    Programs that handle SIGINT themselves keep their streams.
     """
-    if not is_nobodys():
+    if not has_default_interrupt():
         return
     for name in ('stdout', 'stderr'):
         stream = getattr(sys, name)
         if stream is None:
-            # What cron and daemons may start; it stays open to the end.
+            # Daemons may start a process without it; the replacement stays open to the end.
             setattr(sys, name, open(os.devnull, 'w'))
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors='backslashreplace')
 
 
 def start_command(name: str, module: str, *extras: str) -> int:
-    """Runs the `main` of a module that needs extras, once it is known that they are there.
+    """Import a module that needs extras and run its `main` as a command.
 
-    Loading what they bring takes seconds: without this, Ctrl-C in them and what is missing would
-    end in tracebacks.
+    The import takes seconds, so Ctrl-C and missing packages are handled before it.
     """
 
     def run() -> int:
@@ -241,14 +256,14 @@ def start_command(name: str, module: str, *extras: str) -> int:
 
 
 def require_extra(extra: str, *needed: str) -> None:
-    """Checks that what an extra of this package brings is installed.
+    """Check that the packages of an extra are installed.
 
     Args:
-        extra: Its name.
-        needed: Those of its modules that are; none given are all of them.
+        extra: Name in `EXTRAS`.
+        needed: Modules of the extra that must exist; default all.
 
     Raises:
-        UsageError: If not; the message says what to install.
+        UsageError: If a package is missing; the message tells what to install.
     """
     missing = [module for module in needed or EXTRAS[extra] if find_spec(module) is None]
     if missing:
@@ -261,7 +276,7 @@ def require_extra(extra: str, *needed: str) -> None:
 
 
 def _require_rclpy() -> None:
-    """Refuses an rclpy that is found and cannot be used, as that of a ROS for another Python."""
+    """Reject an rclpy that was built for another Python."""
     try:
         import_module('rclpy')
     except (ImportError, OSError) as error:
@@ -274,14 +289,10 @@ def _require_rclpy() -> None:
 
 @contextmanager
 def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Shows how far a command is and how long it will take; nothing unless somebody watches.
-
-    Args:
-        description: What is counted.
-        total: How many there are.
+    """Show a progress bar with the remaining time where stderr is a terminal.
 
     Yields:
-        A function to call with the number of those that were done since the last call.
+        A function to call with the number of items done since the last call.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -301,115 +312,6 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
         try:
             yield lambda count: bars.advance(bar, count)
         finally:
-            # What was counted is not lost with the terminal that it was shown on.
-            if _is_unread(2):
+            # The work is valid even if the terminal with the bar has closed.
+            if is_unread(2):
                 discard_unread_output()
-
-
-@contextmanager
-def _stopping_is_said(name: str) -> Iterator[list[int]]:
-    """Ctrl-C says `stopping` before it raises KeyboardInterrupt; a second one ends the process.
-
-    SIGTERM and SIGHUP do the same, unless somebody else takes or ignores them: what is half written
-    is taken away.
-
-    Yields:
-        A list that will hold the signal.
-    """
-
-    def say_and_raise(number: int, frame: FrameType | None) -> None:
-        complain_from_handler(name, 'stopping')
-        signal.default_int_handler(number, frame)
-
-    with on_stop_signals(_nobodys_signals(), say_and_raise) as received:
-        yield received
-
-
-@contextmanager
-def on_stop_signals(
-    numbers: Iterable[signal.Signals],
-    stop: Callable[[int, FrameType | None], None],
-    raises_again: bool = False,
-) -> Iterator[list[int]]:
-    """Calls `stop` when one of these signals comes for the first time; again, it ends the process.
-
-    But not a second SIGHUP: a closed terminal sends one, and the shell in it another; so after the
-    first they are ignored. One that is ignored from the start, as `nohup` has it, stays so.
-
-    Args:
-        numbers: The signals.
-        stop: Is called with the number and the frame.
-        raises_again: Whether a second SIGINT raises KeyboardInterrupt instead, because the process
-            is somebody else's program, a notebook perhaps.
-
-    Yields:
-        A list that will hold the numbers of those that came.
-    """
-    received: list[int] = []
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        again: Any = signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL
-        if raises_again and number == signal.SIGINT:
-            again = signal.default_int_handler
-        signal.signal(number, again)
-        discard_unread_output()
-        stop(number, frame)
-
-    before = {number: signal.signal(number, handle) for number in heard(numbers)}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            # A SIGHUP that is ignored by now has come once, here or in a part of what ran: the next
-            # one must not kill what ends.
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                signal.signal(number, handler)
-
-
-def heard(numbers: Iterable[signal.Signals]) -> list[signal.Signals]:
-    """Those of these signals that may be taken: all but a SIGHUP that `nohup` has ignored.
-
-    None in a thread: Python hands signals to the main one.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        return []
-    ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-    return [number for number in numbers if number != signal.SIGHUP or not ignored]
-
-
-def _nobodys_signals() -> list[signal.Signals]:
-    """The signals that a command takes: none inside of another one or of somebody else's program.
-
-    What a shell starts in the background ignores Ctrl-C, and SIGTERM ends it all the same.
-    """
-    ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    if not (is_nobodys() or ignored):
-        return []
-    others = (signal.SIGTERM, signal.SIGHUP)
-    found = [each for each in others if signal.getsignal(each) == signal.SIG_DFL]
-    return found if ignored else [signal.SIGINT, *found]
-
-
-def discard_unread_output() -> None:
-    """Lets what this process prints go nowhere, where its terminal or pipe has been closed.
-
-    For commands that have more to do than to print: writing there would be an error.
-    """
-    for number in (1, 2):
-        if _is_unread(number):
-            _discard_output(number)
-
-
-def _is_unread(number: int) -> bool:
-    """Whether nobody reads what is written to a file descriptor any more."""
-    poll = select.poll()
-    poll.register(number, 0)
-    return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
-
-
-def _discard_output(number: int) -> None:
-    """Lets Python flush a stream at its end without an error, although it is closed."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, number)
-    os.close(nowhere)

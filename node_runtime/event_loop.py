@@ -1,4 +1,4 @@
-"""Serves the callbacks of a node, a few at a time, beside what else it has to do."""
+"""An executor for nodes that do other work between callbacks."""
 
 from __future__ import annotations
 
@@ -8,21 +8,17 @@ if TYPE_CHECKING:
     from rclpy.executors import Executor
     from rclpy.node import Node
 
-# Seconds between looks at what no callback announces: signals, the graph.
+# Seconds between checks of signals and of the graph, for which rclpy has no callback.
 BEAT = 0.1
-# Callbacks that an executor is asked for which does not say whether there are any.
+# Callbacks to ask for where the executor does not tell whether any are waiting.
 _SERVED_BLINDLY = 10
 
 
 class EventLoop:
-    """Serves the callbacks of one node, from the thread that owns it.
+    """Run the callbacks of one node in the thread that owns the node.
 
-    rclpy's EventsExecutor costs half of the wait-set one per message. It is used through
-    `spin_once` alone, because its `spin` serves nothing in some builds. Releases before 7.1.4 lack
-    it.
-
-    Args:
-        node: Whose callbacks.
+    rclpy's EventsExecutor costs half of the wait-set executor per message; rclpy before 7.1.4 lacks
+    it. It is used through `spin_once` alone, because its `spin` serves nothing in some builds.
     """
 
     def __init__(self, node: Node) -> None:
@@ -31,23 +27,22 @@ class EventLoop:
         self._executor.add_node(node)
 
     def wait(self, seconds: float) -> None:
-        """Serves one callback, or none within that time."""
+        """Run one callback; return without one after `seconds`."""
         self._executor.spin_once(timeout_sec=seconds)
 
     def serve_pending(self, limit: int) -> None:
-        """Serves what has been waiting, not what arrives meanwhile.
+        """Run the callbacks that are waiting now, without those that arrive meanwhile.
 
         Args:
-            limit: Callbacks served at most. What comes in faster than it is served would otherwise
-                take longer every time. A number and not a time, so that a busy machine changes
-                nothing.
+            limit: Maximum number of callbacks. A number and not a time, so that the result does not
+                depend on the load of the machine.
         """
         if not self._is_queue:
-            # It says neither what waits nor whether it has served anything, and asking takes time.
+            # It tells neither what waits nor whether it ran a callback.
             for _ in range(min(limit, _SERVED_BLINDLY)):
                 self._executor.spin_once(timeout_sec=0.0)
             return
-        # First in, first out: the mark comes last of what is there.
+        # First in, first out: this task runs after all that wait now.
         reached: list[bool] = []
         self._executor.create_task(lambda: reached.append(True))
         for _ in range(limit):
@@ -56,12 +51,12 @@ class EventLoop:
                 return
 
     def close(self) -> None:
-        """Gives the node back."""
+        """Remove the node from the executor."""
         self._executor.remove_node(self._node)
 
 
 def _make_executor() -> tuple[Executor, bool]:
-    """Returns an executor and whether it serves a queue in order."""
+    """Return an executor and whether it serves a queue in order."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:

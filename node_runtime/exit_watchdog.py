@@ -1,16 +1,16 @@
-"""The end of a process that a library does not let go.
+"""A time limit on the shutdown of a process.
 
-Fast DDS 2.14 can spin for minutes where a participant is deleted while another one comes or goes
-(eProsima/Fast-DDS issue 6513: it waits for a callback without ever giving up the lock that the
-callback needs), and rclpy holds the interpreter meanwhile, so that neither a thread nor a signal
-handler of Python gets a turn. A timer of the C library does.
+Fast DDS 2.14 can spin for minutes while a participant is deleted (eProsima/Fast-DDS issue 6513),
+and rclpy holds the interpreter meanwhile. No Python thread or signal handler runs then, but a timer
+of the C library does. `faulthandler.dump_traceback_later` would work too, but its exit code is
+always 1.
 """
 
 from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 _CLOCK_MONOTONIC = 1
@@ -40,33 +40,27 @@ class _TimerSpec(ctypes.Structure):
 
 @contextmanager
 def ends_within(seconds: float, exit_code: int) -> Iterator[None]:
-    """Ends the process with `exit_code` where what is done inside takes longer than `seconds`.
+    """End the process with `exit_code` if the body takes longer than `seconds`.
 
-    Nothing is flushed but standard output and error, and these before. It works where the C library
-    is glibc; elsewhere nothing happens.
+    Stdout and stderr are flushed before the body, all else is lost. Works with glibc only.
     """
     for stream in filter(None, (sys.stdout, sys.stderr)):
-        # Whoever read it may be gone.
         with suppress(OSError, ValueError):
             stream.flush()
-    disarm = _arm(seconds, exit_code)
-    try:
-        yield
-    finally:
-        disarm()
-
-
-def _arm(seconds: float, exit_code: int) -> Callable[[], None]:
     library = ctypes.CDLL(None)
-    if not sys.platform.startswith('linux') or not hasattr(library, 'gnu_get_libc_version'):
-        return lambda: None
+    timer = ctypes.c_void_p()
     # `_exit` takes its argument where a notification function finds the value.
     leave = ctypes.cast(library._exit, ctypes.c_void_p)
     event = _SignalEvent(value=exit_code, notify=_SIGEV_THREAD, function=leave)
-    timer = ctypes.c_void_p()
-    if library.timer_create(_CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) != 0:
-        return lambda: None
-    first_s = int(seconds)
-    first = _TimerSpec(first_s=first_s, first_ns=int((seconds - first_s) * 1e9))
-    library.timer_settime(timer, 0, ctypes.byref(first), None)
-    return lambda: library.timer_delete(timer)
+    is_armed = (
+        hasattr(library, 'gnu_get_libc_version')
+        and library.timer_create(_CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0
+    )
+    if is_armed:
+        first = _TimerSpec(first_s=int(seconds), first_ns=int(seconds % 1 * 1e9))
+        library.timer_settime(timer, 0, ctypes.byref(first), None)
+    try:
+        yield
+    finally:
+        if is_armed:
+            library.timer_delete(timer)

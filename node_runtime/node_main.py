@@ -22,46 +22,46 @@ from node_runtime.command_line import (
     CommandError,
     UsageError,
     complain,
-    heard,
     make_output_usable,
     require_extra,
     run_command,
 )
 from node_runtime.exit_watchdog import ends_within
+from node_runtime.signals import available_signals
 from node_runtime.transport import keep_discovery_local, leave_out_shared_memory
 
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-# Enough for any node on a busy machine: 0.3 s are usual.
+# Time limit for destroying a node; 0.3 s are usual.
 _DESTROY_SECONDS = 10.0
-# Seconds within which several signals are one.
+# Signals within this many seconds count as one.
 _AT_ONCE = 1.0
+# Characters of an error line.
+_LONGEST_LINE = 1000
 
 
 class NodeFailure(CommandError):
-    """The node cannot go on; the message is one line that says why."""
+    """The node cannot continue; the message is one line with the reason."""
 
 
 class StopSignals:
-    """Turns SIGINT, SIGTERM and SIGHUP into a flag, so that a tick in progress is finished first.
+    """Record SIGINT, SIGTERM and SIGHUP, so that a node finishes its tick before it stops.
 
-    SIGHUP, which a closed terminal sends, only where it is not ignored, as `nohup` has it.
-
-    rclpy's own handlers would invalidate the context in the middle of a tick, and the last messages
-    with it. A thread other than the main one hears of no signal.
+    rclpy's own handlers would invalidate the context in the middle of a tick and lose the last
+    messages. In other threads than the main one nothing is recorded.
 
     Attributes:
-        received: Name of the signal that came, None if none did.
-        second_ends: Whether another one, a second or more after it, ends the process at once: of
-            nodes that call code of somebody else's, which may never come back.
+        received: Name of the last signal, or None.
+        second_ends: Whether another signal, a second or more later, ends the process at once. For
+            nodes that run third-party code, which may never return.
     """
 
     def __init__(self) -> None:
         self.received: str | None = None
         self.second_ends = False
         self._received_at = -math.inf
-        for number in heard([signal.SIGINT, signal.SIGTERM, signal.SIGHUP]):
+        for number in available_signals([signal.SIGINT, signal.SIGTERM, signal.SIGHUP]):
             signal.signal(number, self._handle)
 
     def __bool__(self) -> bool:
@@ -78,22 +78,22 @@ class StopSignals:
         self._received_at = time.monotonic()
 
     def watch(self) -> Callable[[], bool]:
-        """Returns what says whether another signal has come, a second or more from now.
+        """Return a function that tells whether another signal came, a second or more from now.
 
-        Whoever ends a process may send several at once.
+        Shells and supervisors may send several signals at once.
         """
         earliest = time.monotonic() + _AT_ONCE
         return lambda: self._received_at >= earliest
 
 
 class RunnableNode(Protocol):
-    """A node that runs until it is done or told to stop."""
+    """A node that runs until its work is done or a signal stops it."""
 
     def run(self, stop: StopSignals) -> None:
-        """Runs."""
+        """Run."""
 
     def destroy_node(self) -> None:
-        """Closes its topics and services."""
+        """Close topics and services."""
 
 
 def node_main(
@@ -104,13 +104,14 @@ def node_main(
     shared_memory: bool = False,
     second_signal_ends: bool = False,
 ) -> int:
-    """Runs a node of `NODES` as a process, or prints its help; returns the exit code of `run_node`.
+    """Run a node of `NODES` as a process, or print its help; return the exit code of `run_node`.
 
     Args:
         name: Name of the executable and of the node.
-        summary: What it is, in a line.
-        load: Imports the class of the node, which may take long.
-        args: Command line; None for that of the process.
+        summary: One line for the help.
+        load: Imports and returns the node's class, which may take seconds. A ValueError of its
+            constructor is a usage error.
+        args: Command line; None means `sys.argv`.
         shared_memory: As in `run_node`.
         second_signal_ends: As `StopSignals.second_ends`.
     """
@@ -134,7 +135,10 @@ def _run(load: Callable[[], Callable[[], RunnableNode]], stop: StopSignals) -> N
     make_node = load()
     if stop:
         return
-    node = make_node()
+    try:
+        node = make_node()
+    except ValueError as error:
+        raise UsageError(one_line(error, _LONGEST_LINE)) from error
     try:
         node.run(stop)
     finally:
@@ -142,11 +146,11 @@ def _run(load: Callable[[], Callable[[], RunnableNode]], stop: StopSignals) -> N
 
 
 def destroy(node: RunnableNode | Node, exit_code: int | None = None) -> None:
-    """Destroys a node whose work is done; if that takes too long the process ends all the same.
+    """Destroy a node whose work is done; end the process if that takes longer than 10 s.
 
     Args:
-        node: Of a process that has nothing else to do.
-        exit_code: What the process then ends with; None for 0, or the code of the error on its way.
+        node: Node of a process that has no other work left.
+        exit_code: Code of the process in that case; None means that of the current exception, or 0.
     """
     error = sys.exception()
     if exit_code is None:
@@ -161,21 +165,21 @@ def run_node(
     args: list[str] | None = None,
     shared_memory: bool = False,
 ) -> int:
-    """Initialises rclpy, runs a node and returns the process's exit code.
+    """Initialise rclpy, run a node and return the exit code of the process.
 
     Args:
         name: Name of the executable, for error lines.
-        run: Runs until it is done or the signals say stop.
-        args: Command line; None for that of the process.
-        shared_memory: Whether readers that die may hold the node up, which `transport.py` explains:
-            for nodes that send pictures and keep nobody waiting.
+        run: Runs until its work is done or a signal is recorded.
+        args: Command line; None means `sys.argv`.
+        shared_memory: Whether to allow shared memory (see `transport`). For nodes that send
+            pictures and that no robot waits for.
 
     Returns:
-        0 for a normal end, also by signal; 2 for bad usage; 1 for a failure. Errors of both kinds
-        are one line on stderr.
+        0 after the work is done or a signal; 2 for wrong usage; 1 for a failure. Both kinds of
+        error print one line on stderr.
     """
     make_output_usable()
-    # What follows takes long enough for people to change their mind.
+    # Before the imports below, which take seconds.
     stop = StopSignals()
     keep_discovery_local()
     find_place_for_logs()
@@ -191,14 +195,14 @@ def run_node(
     from rclpy.signals import SignalHandlerOptions
 
     try:
-        _refuse_arguments(sys.argv[1:] if args is None else args)
+        _reject_arguments(sys.argv[1:] if args is None else args)
         _initialise(rclpy.init, args, SignalHandlerOptions.NO)
         run(stop)
     except CommandError as error:
         complain(name, error)
         return error.exit_code
     except InvalidParameterTypeException as error:
-        # Of a parameter that is ROS's own, such as use_sim_time.
+        # From a parameter of ROS itself, such as use_sim_time.
         complain(name, error)
         return UsageError.exit_code
     except ROSInterruptException:
@@ -209,7 +213,10 @@ def run_node(
 
 
 def find_place_for_logs(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Without a home that may be written to, as in many a container, ROS starts no node."""
+    """Move ROS's logs to the temporary folder where the home directory is not writable.
+
+    ROS starts no node otherwise, for example in many containers.
+    """
     if any(map(environment.get, ('ROS_LOG_DIR', 'ROS_HOME'))):
         return
     home = environment.get('HOME', '')
@@ -217,7 +224,7 @@ def find_place_for_logs(environment: MutableMapping[str, str] = os.environ) -> N
     while home and not os.path.exists(folder):
         folder = os.path.dirname(folder)
     if not home or not os.access(folder, os.W_OK):
-        # Where not even that can be written, ROS says so.
+        # Without a writable temporary folder, ROS prints the error itself.
         with suppress(FileNotFoundError):
             environment['ROS_LOG_DIR'] = tempfile.gettempdir()
 
@@ -227,7 +234,7 @@ def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any
         init(args=args, signal_handler_options=handlers)
     except Exception as error:
         # rclpy raises several unrelated types for malformed `--ros-args`.
-        line = one_line(error, longest=1000)
+        line = one_line(error, _LONGEST_LINE)
         if type(error).__name__ == 'UnknownROSArgsError':
             line = (
                 f'unknown after --ros-args: {line.strip("[]")}; a parameter is -p <name>:=<value>, '
@@ -236,11 +243,8 @@ def _initialise(init: Callable[..., None], args: list[str] | None, handlers: Any
         raise UsageError(line) from None
 
 
-def _refuse_arguments(args: Sequence[str]) -> None:
-    """Rejects what stands outside of `--ros-args ... --`, which rclpy would ignore.
-
-    Also a parameter without a value, of which it would say `error not set`.
-    """
+def _reject_arguments(args: Sequence[str]) -> None:
+    """Raise UsageError for arguments that rclpy would ignore or answer with `error not set`."""
     inside = False
     for before, arg in pairwise(['', *args]):
         if arg == '--ros-args':

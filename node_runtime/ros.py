@@ -1,4 +1,4 @@
-"""Message classes, quality of service and the graph, as the nodes take them from rclpy."""
+"""Message classes, quality of service and the graph of rclpy."""
 
 from __future__ import annotations
 
@@ -16,27 +16,32 @@ if TYPE_CHECKING:
     from rclpy.publisher import Publisher
     from rclpy.qos import QoSProfile
 
-# Seconds for what was said last to be heard.
-_LAST_WORDS_SECONDS = 1.0
-# Seconds within which discovery has found all nodes that are there.
+# Seconds to wait at shutdown until subscribers have the last messages.
+_LAST_MESSAGES_SECONDS = 1.0
+# Seconds within which discovery finds all running nodes.
 DISCOVERY_TIME = 2.0
-# Seconds after which the graph has forgotten a process that was killed: until then it may stand
-# beside its successor. DDS implementations take 20 s or less.
+# Seconds for which the graph may still show a killed process beside its successor. DDS
+# implementations need 20 s or less.
 MEMORY_OF_THE_GRAPH = 25.0
+# Seconds without changes after which the subscriptions of a node count as known: publishers and
+# subscriptions are discovered separately, in any order.
+_SETTLING_TIME = 0.2
+# Seconds without changes after which an unconnected subscription counts as incompatible. A busy
+# machine has taken three to connect.
+_PATIENCE = 6.0
 
 
 def seldom(seconds: float) -> dict[str, Any]:
-    """Arguments of a logger for a line that it says at most once in so many seconds.
+    """Return arguments that make a logger print a line at most once in `seconds`.
 
-    By rclpy's default, the system's clock, one that is set back would silence the line until that
-    time comes again.
+    rclpy throttles by the system clock, which would silence the line after the clock is set back.
     """
     return {'throttle_duration_sec': seconds, 'throttle_time_source_type': _steady_clock()}
 
 
 @cache
 def _steady_clock() -> Clock:
-    """Always the same: a logger takes no other for a line that it has said before."""
+    """Return one clock for all lines: a logger rejects another one for the same line."""
     from rclpy.clock import Clock
     from rclpy.clock_type import ClockType
 
@@ -44,18 +49,18 @@ def _steady_clock() -> Clock:
 
 
 def ros_message_class(type_name: str) -> Any:
-    """Returns rclpy's class of a message type such as `sensor_msgs/msg/JointState`."""
+    """Return rclpy's class of a message type such as `sensor_msgs/msg/JointState`."""
     package, kind, name = type_name.split('/')
     return getattr(import_module(f'{package}.{kind}'), name)
 
 
 def ros_service_class(type_name: str) -> Any:
-    """Returns rclpy's class of a service type such as `std_srvs/srv/Trigger`."""
+    """Return rclpy's class of a service type such as `std_srvs/srv/Trigger`."""
     return ros_message_class(type_name)
 
 
 def rclpy_profile(spec: QosSpec) -> QoSProfile:
-    """Returns the profile for rclpy's `create_publisher` and `create_subscription`."""
+    """Return the profile for rclpy's `create_publisher` and `create_subscription`."""
     from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 
     return QoSProfile(
@@ -67,20 +72,51 @@ def rclpy_profile(spec: QosSpec) -> QoSProfile:
 
 
 def full_name(namespace: str, name: str) -> str:
-    """Returns the full name of a node in a namespace, such as `/left/sim_node`."""
+    """Return the full name of a node in a namespace, such as `/left/sim_node`."""
     return f'{namespace.rstrip("/")}/{name}'
 
 
 def count_publishers(node: Node, topic: str) -> int:
-    """Returns how many publish a topic, under the name to which this node's is remapped."""
+    """Return the number of publishers of a topic, after the node's remappings."""
     return int(node.count_publishers(node.resolve_topic_name(topic)))
 
 
 def await_acknowledgements(publishers: Iterable[Publisher]) -> None:
-    """Gives what was said last a second to be heard; a killed subscriber never acknowledges."""
+    """Wait up to a second until subscribers have the last messages."""
     from rclpy.duration import Duration
 
-    deadline = time.monotonic() + _LAST_WORDS_SECONDS
+    deadline = time.monotonic() + _LAST_MESSAGES_SECONDS
     for publisher in publishers:
         left = max(0.0, deadline - time.monotonic())
         publisher.wait_for_all_acked(Duration(seconds=left))
+
+
+class SubscriberWatch:
+    """Track whether all subscribers of some publishers are connected and receive messages."""
+
+    def __init__(self, node: Node, publishers: Iterable[Publisher]) -> None:
+        self._node = node
+        self._publishers = tuple(publishers)
+        self._counts = [0 for _ in self._publishers]
+        self._changed_at = 0.0
+
+    def expect_more(self) -> None:
+        """Wait for subscriptions of a node that has just appeared."""
+        self._changed_at = time.monotonic()
+
+    def update(self) -> bool:
+        """Read the graph; return whether a topic has more subscribers than before."""
+        before = self._counts
+        self._counts = [self._node.count_subscribers(each.topic_name) for each in self._publishers]
+        if self._counts != before:
+            self.expect_more()
+        return any(have > had for have, had in zip(self._counts, before, strict=True))
+
+    def are_connected(self) -> bool:
+        """Return whether all compatible subscribers are connected and the graph is quiet."""
+        quiet_for = time.monotonic() - self._changed_at
+        if quiet_for > _PATIENCE:
+            return True
+        connected = (each.get_subscription_count() for each in self._publishers)
+        pairs = zip(connected, self._counts, strict=True)
+        return quiet_for >= _SETTLING_TIME and all(have >= want for have, want in pairs)

@@ -1,4 +1,4 @@
-"""Parameters as data (`parameters.py`), declared on a node and changed while it runs."""
+"""Declare the parameters of `msgs_spec.parameters` on a node and check changes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from msgs_spec.parameters import ParameterSpec, unknown_parameter, validate
-from node_runtime.command_line import UsageError
-from node_runtime.parameter_requests import serve_parameter_requests
 
 if TYPE_CHECKING:
     from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -17,17 +15,16 @@ if TYPE_CHECKING:
 
 
 def declare_parameters(node: Node, specs: Sequence[ParameterSpec]) -> dict[str, Any]:
-    """Declares parameters with description and range and returns their values.
+    """Declare parameters with description and range and return their values.
 
-    Requests for them are answered from then on: the node is made without rclpy's services for them.
-
-    Parameters that it was given and does not have, or that have a new name, are named in a warning.
+    Also offers the parameter services, so create the node with `start_parameter_services=False`.
+    Logs a warning for unknown parameters and for those under a former name.
 
     Raises:
-        UsageError: If a value given at the start is not allowed.
+        ValueError: If a given value is not allowed.
     """
-    serve_parameter_requests(node)
-    # rclpy has no public way to see what was given before it is declared.
+    _serve_parameter_requests(node)
+    # rclpy has no public access to given values before their declaration.
     given: dict[str, Parameter] = node._parameter_overrides
     for spec in specs:
         if spec.former in given:
@@ -49,11 +46,8 @@ def _renamed(parameter: Parameter, name: str) -> Parameter:
 
 def _declare(node: Node, spec: ParameterSpec, given: Parameter | None) -> Any:
     if given is not None:
-        # Before rclpy does, whose lines do not say what is allowed.
-        try:
-            validate(spec, given.value)
-        except ValueError as error:
-            raise UsageError(str(error)) from None
+        # rclpy's own errors do not name the allowed values.
+        validate(spec, given.value)
     value = node.declare_parameter(spec.name, spec.default, descriptor(spec)).value
     if spec.is_path:
         return os.path.expanduser(value)
@@ -61,10 +55,9 @@ def _declare(node: Node, spec: ParameterSpec, given: Parameter | None) -> Any:
 
 
 def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
-    """Returns the ROS descriptor.
+    """Return the ROS descriptor.
 
-    Doubles are typed dynamically, because ROS takes `1` on a command line for an integer and would
-    refuse it.
+    Doubles are typed dynamically, because ROS reads `1` as an integer and would reject it.
     """
     from rcl_interfaces.msg import (
         FloatingPointRange,
@@ -94,13 +87,13 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 def set_callback(
     specs: Iterable[ParameterSpec], *, makes_time: bool = False
 ) -> Callable[[list[Parameter]], SetParametersResult]:
-    """Returns the callback for `Node.add_on_set_parameters_callback` that checks new values.
+    """Return a callback for `Node.add_on_set_parameters_callback` that checks new values.
 
-    Parameters of other names pass: they belong to ROS.
+    Parameters of ROS itself pass.
 
     Args:
         specs: Parameters of the node.
-        makes_time: Whether it makes simulated time, so that it can follow none.
+        makes_time: Whether the node publishes `/clock` and therefore rejects `use_sim_time`.
     """
     from rcl_interfaces.msg import SetParametersResult
 
@@ -112,9 +105,51 @@ def set_callback(
                 if parameter.name in by_name:
                     validate(by_name[parameter.name], parameter.value)
                 elif makes_time and parameter.name == 'use_sim_time' and parameter.value:
-                    raise ValueError('use_sim_time: this node makes simulated time, follows none')
+                    raise ValueError('use_sim_time: true given; allowed: false in this node')
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     return check
+
+
+def _serve_parameter_requests(node: Node) -> None:
+    """Offer the parameter services; reject unknown types, which end a node of plain rclpy."""
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter_service import ParameterService
+
+    class ParameterRequests(ParameterService):
+        def _set_parameters_callback(self, request: Any, response: Any) -> Any:
+            answer = super()._set_parameters_callback
+            for parameter in request.parameters:
+                rejected = _rejection(parameter)
+                if rejected is None:
+                    one = SetParameters.Request(parameters=[parameter])
+                    answer(one, response)  # type: ignore[no-untyped-call]
+                else:
+                    response.results.append(rejected)
+            return response
+
+        def _set_parameters_atomically_callback(self, request: Any, response: Any) -> Any:
+            for rejected in filter(None, map(_rejection, request.parameters)):
+                response.result = rejected
+                return response
+            answer = super()._set_parameters_atomically_callback
+            return answer(request, response)  # type: ignore[no-untyped-call]
+
+    # Its services keep it alive.
+    ParameterRequests(node)  # type: ignore[no-untyped-call]
+
+
+def _rejection(message: Any) -> SetParametersResult | None:
+    """Return the answer to a parameter of an unknown type, or None."""
+    from rcl_interfaces.msg import SetParametersResult
+    from rclpy.parameter import Parameter
+
+    try:
+        Parameter.from_parameter_msg(message)
+    except ValueError:
+        types = ', '.join(f'{kind.value} ({kind.name})' for kind in Parameter.Type)
+        reason = f'{message.name}: type {message.value.type} given; allowed: {types}'
+        return SetParametersResult(successful=False, reason=reason)
+    return None

@@ -1,4 +1,4 @@
-"""Which revision of this project runs: what episodes and actors name as their source."""
+"""The source revision that episodes and actors record."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
 
 @cache
 def source_revision() -> str:
-    """Commit of this source tree, `-dirty` where its code differs; else the installed version."""
+    """Return the commit of this source tree, or the installed version outside of a repository."""
     root = Path(__file__).resolve().parents[1]
-    # Only its own: an installed copy may lie in somebody else's repository.
+    # Not a parent folder's: an installed copy may lie in a user's repository.
     if (root / '.git').exists():
         with suppress(OSError, subprocess.SubprocessError):
             return revision_of(root)
@@ -26,13 +26,11 @@ def source_revision() -> str:
 
 
 def revision_of(root: Path) -> str:
-    """Commit of a source tree, with `-dirty` where a file of its packages differs from it.
-
-    Pages and reports do not count: a study renews its own while its later runs wait.
+    """Return the commit of a source tree, with `-dirty` if files of its packages have changed.
 
     Raises:
-        OSError: If there is no git.
-        subprocess.SubprocessError: If it does not answer, or the tree is none of its.
+        OSError: If git is not installed.
+        subprocess.SubprocessError: If git fails, times out, or `root` is not a repository.
     """
 
     def git(*arguments: str) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from node_runtime.import_guard import guard_loading
+from node_runtime.signals import guard_loading
 
 if TYPE_CHECKING:
     from policy_node.policies.actor import Actor

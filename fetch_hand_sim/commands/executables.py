@@ -8,12 +8,12 @@ from __future__ import annotations
 import sys
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 
-from node_runtime import parent_process
+from node_runtime import signals
 from node_runtime.command_line import UsageError
 
 _DISTRIBUTION = 'fetch_hand_sim'
 _ACTORS = 'fetch_hand_sim.actors'
-_PARENT = parent_process.__name__
+_PARENT = signals.__name__
 
 
 class UnknownExecutableError(UsageError):

@@ -18,9 +18,9 @@ from fetch_hand_sim.replay_node import NODE_NAME
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
 from msgs_spec.parameters import REPLAY_NODE
 from node_runtime.command_line import UsageError
-from node_runtime.listeners import Listeners
 from node_runtime.node_main import StopSignals
 from node_runtime.ros import (
+    SubscriberWatch,
     await_acknowledgements,
     count_publishers,
     rclpy_profile,
@@ -127,7 +127,7 @@ class ReplayNode(Node):
         self._publish_latched()
         if not self._settings['wait_for_commands']:
             return
-        listeners = Listeners(self, self._publishers_by_topic.values())
+        listeners = SubscriberWatch(self, self._publishers_by_topic.values())
         recorded = f'{self._schedule.namespace}/commands'
         commands, own = self._name_here(recorded), int(recorded in self._publishers_by_topic)
         had_commander = False

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from fetch_hand_sim.sim_node.commanders import CommanderWatch, Endpoint
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topics
-from node_runtime.listeners import Listeners
-from node_runtime.ros import count_publishers, full_name
+from node_runtime.ros import SubscriberWatch, count_publishers, full_name
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -43,7 +42,7 @@ class GraphWatch:
         self.clock_publishers: list[str] = []
         self.robots: list[str] = []
         self.has_newcomer = False
-        self._listeners = Listeners(node, publishers.values())
+        self._listeners = SubscriberWatch(node, publishers.values())
         self._status = node.resolve_topic_name('episode_status')
 
     def update(self) -> None:

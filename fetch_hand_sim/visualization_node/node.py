@@ -33,9 +33,9 @@ from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import TopicSpec
 from msgs_spec.view_topics import SHOWN, scalar_topics
 from node_runtime.event_loop import BEAT, EventLoop
-from node_runtime.listeners import Listeners
 from node_runtime.node_main import NodeFailure, StopSignals
 from node_runtime.ros import (
+    SubscriberWatch,
     count_publishers,
     rclpy_profile,
     ros_message_class,
@@ -78,7 +78,7 @@ class VisualizationNode(Node):
         self._outputs: dict[str, Any] = {}
         for source in SHOWN:
             self._open(source)
-        self._listeners = Listeners(self, self._outputs.values())
+        self._listeners = SubscriberWatch(self, self._outputs.values())
         self._has_newcomer = False
         self._camera = Camera(
             settings['camera_width'],
@@ -145,7 +145,7 @@ class VisualizationNode(Node):
         for source in scalar_topics(spec):
             if source.name not in self._outputs:
                 self._open(source)
-        self._listeners = Listeners(self, self._outputs.values())
+        self._listeners = SubscriberWatch(self, self._outputs.values())
         urdf = self._transforms.description.to_xml(self._prefix, self._watch.joint_prefix)
         description = self._outputs['robot_description']
         description.publish(description.msg_type(data=urdf))

@@ -15,7 +15,6 @@ import numpy as np
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.parameters import LARGEST_SEED
 from node_runtime.command_line import (
-    EXIT_INTERRUPTED,
     EXIT_SUCCESS,
     CommandError,
     CommandParser,
@@ -24,6 +23,7 @@ from node_runtime.command_line import (
     run_command,
     whole_number,
 )
+from node_runtime.signals import EXIT_INTERRUPTED
 from policy_node.policies.files import to_json, write_file
 from policy_node.policies.policy import Policy
 from policy_node.training.evaluation.episodes import (

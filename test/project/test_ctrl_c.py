@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from node_runtime.import_guard import EXECUTABLES
+from node_runtime.signals import EXECUTABLES
 from support import script_environment
 from support.entry_points import console_scripts, started_as_modules
 
@@ -19,7 +19,7 @@ SCRIPT = 'import sys\nfrom {module} import {function}\nsys.exit({function}())\n'
 # What `python -X importtime` says after each import begins so.
 IMPORT = 'import time:'
 # The last import before Ctrl-C is answered.
-GUARD = 'node_runtime.import_guard'
+GUARD = 'node_runtime.signals'
 
 
 def interrupt(command: Sequence[str | Path], imports: int, after: str = GUARD) -> tuple[int, str]:

@@ -18,9 +18,9 @@ from node_runtime.command_line import (
     UsageError,
     complain,
     complain_from_handler,
-    on_stop_signals,
     require_extra,
 )
+from node_runtime.signals import on_stop_signals
 from node_runtime.source_revision import source_revision
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.machine.devices import choose_device

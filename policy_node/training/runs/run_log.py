@@ -14,7 +14,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from node_runtime.command_line import complain, discard_unread_output
+from node_runtime.command_line import complain
+from node_runtime.signals import discard_unread_output
 from policy_node.training.runs.run_folder import BOARD_FOLDER, PROGRESS_FILE
 
 COLUMNS = (

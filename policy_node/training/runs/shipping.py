@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.simulation import Simulation
-from node_runtime.command_line import discard_unread_output
+from node_runtime.signals import discard_unread_output
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo

@@ -22,9 +22,8 @@ from node_runtime.command_line import (
     CommandError,
     complain,
     complain_from_handler,
-    discard_unread_output,
 )
-from node_runtime.parent_process import end_with_parent
+from node_runtime.signals import discard_unread_output, end_with_parent
 from policy_node.training.runs.run import RunTakenError, lock_run, train_run
 from policy_node.training.studies.measures import measure_run
 from policy_node.training.studies.store import add_run, holds, read_runs

@@ -1,0 +1,164 @@
+"""Signals, closed pipes and interrupted imports: how every process of this project ends early.
+
+`fetch_hand_sim` and `policy_node` call `guard_loading` first, so this module imports little.
+"""
+
+import os
+import select
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+# The console scripts of setup.py; a test compares the two.
+EXECUTABLES = frozenset(
+    (
+        'fetch_hand_sim sim_node policy_node replay_node visualization_node view train_her '
+        'evaluate_policy generate_episodes benchmark export_actor list_episodes check_episode '
+        'render_episode recover_episodes export_episodes'
+    ).split()
+)
+_PACKAGES = ('fetch_hand_sim', 'policy_node')
+# 128 + SIGINT, as in shells.
+EXIT_INTERRUPTED = 130
+# The option of prctl(2), `PR_SET_PDEATHSIG`.
+_SET_PARENT_DEATH_SIGNAL = 1
+
+
+def guard_loading() -> None:
+    """Make Ctrl-C end this process with one line while one of our commands is being imported.
+
+    Imports take a second and more. `run_command` and `StopSignals` replace this handler as soon as
+    the command begins. Other programs that import our packages keep their handlers.
+    """
+    name = _command()
+    if name and has_default_interrupt():
+        signal.signal(signal.SIGINT, _ExitAtOnce(name))
+
+
+def has_default_interrupt() -> bool:
+    """Return whether SIGINT has Python's handler or that of `guard_loading`."""
+    handler = signal.getsignal(signal.SIGINT)
+    return handler is signal.default_int_handler or isinstance(handler, _ExitAtOnce)
+
+
+def _command() -> str:
+    """Return the name of our command that runs in this process, or ''."""
+    program = sys.argv[0] if sys.argv else ''
+    if program == '-m':
+        # `python -m` sets the file name only after it has imported the packages of the module.
+        words = (word for word in sys.orig_argv if word.partition('.')[0] in _PACKAGES)
+        return next(words, '').rpartition('.')[2]
+    folder, name = os.path.split(program)
+    # Our executables share a folder; a user's own script may be called `view`, too.
+    is_ours = name in EXECUTABLES and os.path.isfile(os.path.join(folder, _PACKAGES[0]))
+    return name if is_ours else ''
+
+
+class _ExitAtOnce:
+    """A handler that exits at once, because an import may swallow KeyboardInterrupt."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        # Not `print`: the signal may interrupt another one.
+        os.write(2, f'{self._name}: stopping\n'.encode())
+        os._exit(EXIT_INTERRUPTED)
+
+
+@contextmanager
+def on_stop_signals(
+    numbers: Iterable[signal.Signals],
+    stop: Callable[[int, FrameType | None], None],
+    raises_again: bool = False,
+) -> Iterator[list[int]]:
+    """Call `stop` at the first of these signals; the next one has its default effect.
+
+    A closed terminal sends SIGHUP twice, so SIGHUP is ignored after the first.
+
+    Args:
+        numbers: Signals to handle.
+        stop: Called with the signal number and the frame.
+        raises_again: Whether a second SIGINT raises KeyboardInterrupt instead of ending the
+            process, for programs of users such as notebooks.
+
+    Yields:
+        A list that collects the numbers of the received signals.
+    """
+    received: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        again: Any = signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL
+        if raises_again and number == signal.SIGINT:
+            again = signal.default_int_handler
+        signal.signal(number, again)
+        discard_unread_output()
+        stop(number, frame)
+
+    before = {number: signal.signal(number, handle) for number in available_signals(numbers)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            # After a first SIGHUP the second one must not interrupt the clean-up.
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, handler)
+
+
+def available_signals(numbers: Iterable[signal.Signals]) -> list[signal.Signals]:
+    """Return the signals that this thread may handle.
+
+    Python delivers signals to the main thread only, and `nohup` ignores SIGHUP.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return []
+    ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    return [number for number in numbers if number != signal.SIGHUP or not ignored]
+
+
+def discard_unread_output() -> None:
+    """Redirect stdout and stderr to /dev/null where their terminal or pipe is closed.
+
+    For commands that continue after their reader has ended.
+    """
+    for number in (1, 2):
+        if is_unread(number):
+            discard_output(number)
+
+
+def is_unread(number: int) -> bool:
+    """Return whether the reading end of a file descriptor is closed."""
+    poll = select.poll()
+    poll.register(number, 0)
+    return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
+
+
+def discard_output(number: int) -> None:
+    """Redirect a file descriptor to /dev/null, so that the last flush raises no error."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, number)
+    os.close(nowhere)
+
+
+def end_with_parent(parent: int) -> None:
+    """Make Linux send SIGTERM to this process when its parent ends.
+
+    For processes outside of their parent's group, which Ctrl-C does not reach.
+
+    Args:
+        parent: Process id of the parent.
+    """
+    if sys.platform != 'linux':
+        return
+    import ctypes
+
+    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
+    # The parent may have ended before the line above.
+    if os.getppid() != parent:
+        os.kill(os.getpid(), signal.SIGTERM)
