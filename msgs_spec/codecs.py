@@ -111,7 +111,8 @@ def checked_size(topic: TopicSpec, values: ArrayLike) -> Array:
     """Returns `values` as float64, or raises ValueError if they do not fit the topic."""
     vector = np.asarray(values, dtype=np.float64)
     if vector.shape != (topic.size,):
-        raise ValueError(f'{topic.name}: shape {vector.shape} given; allowed: ({topic.size},)')
+        given = f'shape {vector.shape}' if vector.ndim != 1 else f'{vector.size} values'
+        raise ValueError(f'{topic.name}: {given} given; allowed: {topic.size}')
     return vector
 
 
@@ -211,7 +212,12 @@ def _build_pose_array(topic: TopicSpec, values: Array) -> dict[str, Any]:
 
 
 def _read_pose_array(topic: TopicSpec, message: Any) -> Array:
-    size = topic.layout[0].size
+    size, names = topic.layout[0].size, [part.name for part in topic.layout]
+    if len(message.poses) != len(names):
+        raise ValueError(
+            f'{topic.name}: {len(message.poses)} poses given; allowed: {len(names)}, in the order '
+            f'{", ".join(names)}'
+        )
     poses = [_read_pose(pose.position, pose.orientation)[:size] for pose in message.poses]
     return np.concatenate([np.zeros(0), *poses])
 

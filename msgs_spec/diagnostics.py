@@ -118,6 +118,10 @@ class Durations:
         """Notes one."""
         self._values.append(seconds)
 
+    def median(self) -> float:
+        """Return the median, s; 0 before the first duration."""
+        return float(np.median(self._values)) if self._values else 0.0
+
     def milliseconds(self) -> dict[str, str]:
         """Returns median, 99th percentile and maximum as text; `-` while there are none."""
         names = ('p50', 'p99', 'max')

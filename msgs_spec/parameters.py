@@ -1,4 +1,4 @@
-"""Every parameter of the nodes as data, with what makes a value valid."""
+"""Parameters of the nodes as data, and the check of their values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from msgs_spec.disturbances import read_disturbances
-from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
+from msgs_spec.robots import LONGEST_JOINT_PREFIX, MODEL_PREFIX
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
     REWARD_TYPES,
@@ -20,7 +20,7 @@ from msgs_spec.tasks import (
 from msgs_spec.text import did_you_mean
 
 Value = str | int | float | bool
-# What parameters begin with that set the quality of service of ROS's own topics.
+# Prefixes of the parameters for the quality of service of ROS's own topics.
 _ROS_QOS = tuple(f'qos_overrides./{name}.' for name in ('clock', 'parameter_events', 'rosout'))
 
 
@@ -29,20 +29,15 @@ class ParameterSpec:
     """One parameter.
 
     Attributes:
-        name: Its name.
-        type: Its ROS type.
-        default: Value where none is given.
-        description: What it is for, with its unit.
-        choices: Allowed strings; empty for any.
-        longest: Characters of a string at most; None for any number.
-        lower: Smallest allowed number.
-        upper: Largest allowed number.
-        or_zero: Whether 0 is allowed too, below the smallest number, to switch something off.
-        read_only: Whether it is fixed once the node runs.
-        check: Raises ValueError for what type and limits cannot tell.
-        former: What it was called; still taken, with a warning.
-        is_path: Whether it names a file or folder, so that `~` stands for the home directory: no
-            shell replaces it within `<name>:=<value>`.
+        description: Purpose and unit, one or two sentences.
+        choices: Allowed strings; empty allows any.
+        longest: Maximum number of characters; None for no limit.
+        or_zero: Whether 0 is allowed below `lower`, to switch something off.
+        read_only: Whether the value is fixed once the node runs.
+        check: Raises ValueError for invalid values within type and limits.
+        former: Former name, accepted with a warning.
+        is_path: Whether `~` stands for the home directory. No shell replaces it within
+            `<name>:=<value>`.
     """
 
     name: str
@@ -64,19 +59,20 @@ class ParameterSpec:
         """Allowed values as text."""
         if self.choices:
             return ', '.join(repr(choice) for choice in self.choices)
-        if self.longest is not None:
-            return f'up to {self.longest} characters'
-        if self.type in ('string', 'bool'):
-            return 'any string' if self.type == 'string' else 'true, false'
+        if self.type == 'bool':
+            return 'true, false'
+        if self.type == 'string':
+            return 'text' if self.longest is None else f'text of up to {self.longest} characters'
         limits = f'{self.lower:.10g} ... {self.upper:.10g}'
-        return f'0 or {limits}' if self.or_zero else limits
+        kind = 'whole numbers ' if self.type == 'integer' else ''
+        return f'0 or {limits}' if self.or_zero else f'{kind}{limits}'
 
 
 LARGEST_SEED = 2**32 - 1
 
-# More than that throws the robots apart, N.
+# N. Larger forces throw the robots apart.
 LARGEST_PERTURBATION = 100.0
-# Pixels of a side that are drawn.
+# Pixels.
 LARGEST_PICTURE_SIDE = 4096
 
 SIM_NODE = (
@@ -85,8 +81,8 @@ SIM_NODE = (
         'seed',
         'integer',
         0,
-        'Seed of the first episode, and when set later of the next one; each further episode takes '
-        'the next seed.',
+        'Seed of the first episode. A later change sets the seed of the next episode; each further '
+        'episode takes the next seed.',
         lower=0,
         upper=LARGEST_SEED,
         read_only=False,
@@ -119,15 +115,15 @@ SIM_NODE = (
         'success_rule',
         'string',
         'gymnasium',
-        'Success as the released code of the benchmark has it, or as the paper defines it.',
+        'Success rule: that of Gymnasium-Robotics, or that of the paper.',
         choices=SUCCESS_RULES,
     ),
     ParameterSpec(
         'control_hz',
         'double',
         DEFAULT_CONTROL_HZ,
-        'Ticks per simulated second, 500/n for n = 1 ... 40; episodes are as long in seconds and '
-        'the Fetch gripper as fast at each.',
+        'Ticks per simulated second, 500/n for n = 1 ... 40. The seconds per episode and the speed '
+        'of the Fetch gripper do not depend on it.',
         lower=12.5,
         upper=500.0,
         check=substeps_per_tick,
@@ -136,7 +132,7 @@ SIM_NODE = (
         'mode',
         'string',
         'realtime',
-        'Realtime: ticks come with the clock. Lockstep: each tick waits for a command.',
+        'Realtime: ticks follow the wall clock. Lockstep: each tick waits for a command.',
         choices=('realtime', 'lockstep'),
     ),
     ParameterSpec(
@@ -144,7 +140,7 @@ SIM_NODE = (
         'double',
         1.0,
         'Simulated seconds per second in mode realtime; 0 is as fast as possible.',
-        # Slower cannot be told from a robot that hangs.
+        # A slower robot looks like one that hangs.
         lower=0.01,
         upper=1000.0,
         or_zero=True,
@@ -162,15 +158,16 @@ SIM_NODE = (
     ParameterSpec(
         'joint_prefix',
         'string',
-        JOINT_PREFIX,
-        'What the names of joints begin with in joint_states and joint_commands, such as left_.',
+        MODEL_PREFIX,
+        'Prefix of the joint names in joint_states and joint_commands, such as left_; model keeps '
+        'the names of the model, robot0:.',
         longest=LONGEST_JOINT_PREFIX,
     ),
     ParameterSpec(
         'wait_for_commands',
         'bool',
         False,
-        'Whether the first episode waits until somebody publishes commands.',
+        'Whether the first episode waits for a publisher of commands.',
     ),
     ParameterSpec(
         'publish_clock',
@@ -182,8 +179,8 @@ SIM_NODE = (
         'perturb_limit',
         'double',
         0.0,
-        'Largest force, N, that `perturb` may apply, and ten times the largest torque, N m; 0 '
-        'refuses all.',
+        'Largest force, N, and ten times the largest torque, N m, that `perturb` may apply; 0 '
+        'rejects all.',
         lower=0.0,
         upper=LARGEST_PERTURBATION,
     ),
@@ -191,14 +188,14 @@ SIM_NODE = (
         'episode_dir',
         'string',
         '',
-        'Directory for episode logs; empty logs nothing.',
+        'Directory for episode logs; empty for no logs.',
         is_path=True,
     ),
     ParameterSpec(
         'log_compiled_model',
         'bool',
         True,
-        'Whether each log carries the compiled model, 3 MB, beside its MJCF text.',
+        'Whether each log contains the compiled model, 3 MB, beside its MJCF text.',
     ),
 )
 
@@ -208,7 +205,7 @@ POLICY_NODE = (
         'string',
         '',
         'Shipped actor, file (.safetensors, .onnx, .zip), module:function, random or resting; '
-        'empty takes the shipped actor of the task. May be set while it acts.',
+        'empty selects the shipped actor of the task.',
         read_only=False,
         former='checkpoint',
     ),
@@ -222,7 +219,7 @@ POLICY_NODE = (
         'task',
         'string',
         '',
-        'Task to act in; empty waits for what episode_status says.',
+        'Task to act in; empty takes the task of episode_status.',
         choices=('', *TASKS),
     ),
 )
@@ -241,17 +238,18 @@ REPLAY_NODE = (
     ),
     ParameterSpec('loop', 'bool', False, 'Whether to start again at the end.', read_only=False),
     ParameterSpec('start_paused', 'bool', False, 'Whether to wait for ~/pause with false.'),
-    ParameterSpec(
-        'start_offset', 'double', 0.0, 'Recorded seconds to leave out.', lower=0.0, upper=1e6
-    ),
+    ParameterSpec('start_offset', 'double', 0.0, 'Recorded seconds to skip.', lower=0.0, upper=1e6),
     ParameterSpec(
         'topics', 'string', '', 'Topics to publish, separated by commas; empty for all published.'
     ),
     ParameterSpec(
-        'inputs', 'bool', False, 'Whether to publish also what the robot received: commands, goals.'
+        'inputs', 'bool', False, 'Whether to publish also the recorded commands and goals.'
     ),
     ParameterSpec(
-        'wait_for_commands', 'bool', False, 'Whether to start when somebody publishes commands.'
+        'wait_for_commands', 'bool', False, 'Whether to wait for a publisher of commands.'
+    ),
+    ParameterSpec(
+        'force', 'bool', False, 'Whether to publish on topics that have another publisher already.'
     ),
 )
 
@@ -262,7 +260,7 @@ VISUALIZATION_NODE = (
         'camera_hz',
         'double',
         10.0,
-        'Pictures per second while somebody subscribes; 0 for none.',
+        'Pictures per second while the camera has subscribers; 0 for none.',
         lower=0.0,
         upper=60.0,
     ),
@@ -277,15 +275,15 @@ NODES = {
 
 
 def validate(spec: ParameterSpec, value: object) -> None:
-    """Checks a value; integers pass for doubles.
+    """Check a value; integers are valid doubles.
 
     Raises:
-        ValueError: If it is not allowed; the message is one line and says what is.
+        ValueError: If the value is not allowed; one line names the allowed values.
     """
     if not _is_allowed(spec, value):
         hint = did_you_mean(str(value), spec.choices)
-        if spec.allowed == 'any string' and isinstance(value, (int, float)):
-            # ROS reads what is given as YAML, where 2026 is a number and off is false.
+        if spec.type == 'string' and not spec.choices and isinstance(value, (int, float)):
+            # ROS reads values as YAML, where 2026 is a number and off is false.
             hint = f'; a number or off is text in two pairs of quotes: "{spec.name}:=\'2026\'"'
         raise ValueError(f'{spec.name}: {value!r} given; allowed: {spec.allowed}{hint}')
 
@@ -305,33 +303,33 @@ def _is_allowed(spec: ParameterSpec, value: object) -> bool:
         return False
     if spec.check is not None:
         spec.check(value)
-    # NaN is not within any limits.
+    # Comparisons reject NaN.
     return spec.lower <= value <= spec.upper or (spec.or_zero and value == 0)
 
 
 def unknown_parameter(specs: Sequence[ParameterSpec], name: str) -> str | None:
-    """Returns a line about a parameter that a node was given and does not have.
+    """Return a warning about a parameter that a node does not have.
 
-    None if the parameter belongs to another node of this project or to ROS: files of parameters
-    are often written for several nodes.
+    Returns None for parameters of ROS and of the other nodes, because one file of parameters often
+    serves several nodes.
     """
     is_known = any(name in (spec.name, spec.former) for node in NODES.values() for spec in node)
     if is_known or name == 'use_sim_time' or name.startswith(_ROS_QOS):
         return None
     if name.startswith('qos_overrides.'):
         return f'{name} is ignored: the quality of service of all topics is fixed'
-    # Who mistypes a former name means the one of today.
+    # Misspelt former names lead to the present name.
     names = {known: spec.name for spec in specs for known in (spec.former, spec.name)}
     hint = did_you_mean(name, names)
-    return f'there is no parameter {name!r}{hint or "; it is ignored"}'
+    return f'unknown parameter {name!r}{hint or "; it is ignored"}'
 
 
 def usage(node: str, summary: str) -> str:
-    """Returns the help text of a node.
+    """Return the help text of a node.
 
     Args:
-        node: Its executable.
-        summary: What it is, in a line.
+        node: Name of the executable.
+        summary: Description in one line.
     """
     entries = [
         f'  {spec.name} ({spec.type}, default {spec.default!r}'

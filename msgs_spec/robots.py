@@ -7,8 +7,11 @@ from dataclasses import dataclass, replace
 # Metres a gripper action of 1 puts the mocap target ahead of the gripper at 25 Hz (Plappert et al.
 # 2018, section 1.1; Gymnasium-Robotics `fetch_env.py`).
 GRIPPER_STEP = 0.05
-# What the names of joints begin with in the MJCF, and on the network unless another is asked for.
+# Prefix of the joint names in the MJCF, and on the network by default.
 JOINT_PREFIX = 'robot0:'
+# Stands for `JOINT_PREFIX` in the parameter `joint_prefix`: YAML reads `robot0:` as a mapping, so
+# neither `-p joint_prefix:=robot0:` nor `ros2 param load` can carry it.
+MODEL_PREFIX = 'model'
 LONGEST_JOINT_PREFIX = 64
 
 
@@ -66,17 +69,20 @@ class RobotSpec:
         return replace(self, joints=joints, command=command)
 
 
-def require_joint_prefix(robot: RobotSpec, prefix: str) -> None:
-    """Refuses another prefix for a robot none of whose joints would be renamed by it.
+def read_joint_prefix(robot: RobotSpec, prefix: str) -> str:
+    """Return the prefix that a value of the parameter `joint_prefix` stands for.
 
     Raises:
-        ValueError: If no joint begins with `JOINT_PREFIX`.
+        ValueError: If the prefix would rename no joint of the robot.
     """
-    if prefix != JOINT_PREFIX and robot.with_joint_prefix(prefix).joints == robot.joints:
+    if prefix in (MODEL_PREFIX, JOINT_PREFIX):
+        return JOINT_PREFIX
+    if robot.with_joint_prefix(prefix).joints == robot.joints:
         raise ValueError(
-            f'joint_prefix {prefix!r} takes the place of {JOINT_PREFIX}, with which no joint of '
-            f'{robot.name} begins; allowed: {JOINT_PREFIX!r}'
+            f'joint_prefix {prefix!r} replaces {JOINT_PREFIX}, but no joint of {robot.name} begins '
+            f'with it; allowed: {MODEL_PREFIX!r}'
         )
+    return prefix
 
 
 _FETCH_NAMES = (

@@ -213,11 +213,11 @@ def _command_topics(task: TaskSpec) -> list[TopicSpec]:
     return specs
 
 
-# In wall time, of both nodes or of `sim_node`: no part of a tick and never logged.
+# In wall time: no part of a tick and never logged.
 DIAGNOSTICS = TopicSpec(
     '/diagnostics',
     'diagnostic_msgs/msg/DiagnosticArray',
-    'Health of `sim_node` and of `policy_node`, 1 Hz wall time; not logged.',
+    'Health of the nodes, 1 Hz wall time; not logged.',
 )
 REAL_TIME_FACTOR = TopicSpec(
     'real_time_factor',

@@ -98,7 +98,7 @@ class CommandParser(argparse.ArgumentParser):
 
 def whole_number(lower: int, upper: int | None = None) -> Callable[[str], int]:
     """Return a parser of whole numbers from `lower` to `upper`, for `add_argument(type=...)`."""
-    allowed = f'{lower} or more' if upper is None else f'{lower} ... {upper}'
+    allowed = f'whole numbers {f"from {lower}" if upper is None else f"{lower} ... {upper}"}'
 
     def read(text: str) -> int:
         try:

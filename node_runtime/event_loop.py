@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -10,8 +11,15 @@ if TYPE_CHECKING:
 
 # Seconds between checks of signals and of the graph, for which rclpy has no callback.
 BEAT = 0.1
-# Callbacks to ask for where the executor does not tell whether any are waiting.
+# Callbacks to run where the executor does not report whether any are waiting.
 _SERVED_BLINDLY = 10
+# Seconds without a call after which the process may have been suspended. Other participants of DDS
+# forget a silent one after 20 s.
+_SUSPENDED = 10.0
+# Seconds after a suspension in which the node announces its name, and between two announcements.
+_ANNOUNCING, _ANNOUNCEMENT_PERIOD = 15.0, 1.0
+# Counts the time in which the machine sleeps, too.
+_CLOCK = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 
 
 class EventLoop:
@@ -25,10 +33,13 @@ class EventLoop:
         self._node = node
         self._executor, self._is_queue = _make_executor()
         self._executor.add_node(node)
+        self._called_at = time.clock_gettime(_CLOCK)
+        self._announce_until = self._announce_at = self._called_at
 
     def wait(self, seconds: float) -> None:
         """Run one callback; return without one after `seconds`."""
         self._executor.spin_once(timeout_sec=seconds)
+        self._announce_after_suspension()
 
     def serve_pending(self, limit: int) -> None:
         """Run the callbacks that are waiting now, without those that arrive meanwhile.
@@ -38,7 +49,7 @@ class EventLoop:
                 depend on the load of the machine.
         """
         if not self._is_queue:
-            # It tells neither what waits nor whether it ran a callback.
+            # It reports neither what waits nor whether it ran a callback.
             for _ in range(min(limit, _SERVED_BLINDLY)):
                 self._executor.spin_once(timeout_sec=0.0)
             return
@@ -53,6 +64,26 @@ class EventLoop:
     def close(self) -> None:
         """Remove the node from the executor."""
         self._executor.remove_node(self._node)
+
+    def _announce_after_suspension(self) -> None:
+        """Send the name of the node again after a suspension (SIGSTOP, a laptop that slept).
+
+        Other participants have removed this one and find it again without the names of its nodes.
+        rmw sends the names whenever a node gets or loses a publisher.
+        """
+        now = time.clock_gettime(_CLOCK)
+        if now - self._called_at > _SUSPENDED:
+            self._announce_until = now + _ANNOUNCING
+        self._called_at = now
+        if now < self._announce_until and now >= self._announce_at:
+            self._announce_at = now + _ANNOUNCEMENT_PERIOD
+            _announce(self._node)
+
+
+def _announce(node: Node) -> None:
+    from rcl_interfaces.msg import Log
+
+    node.destroy_publisher(node.create_publisher(Log, '~/announcement', 1))
 
 
 def _make_executor() -> tuple[Executor, bool]:

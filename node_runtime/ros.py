@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rclpy.publisher import Publisher
     from rclpy.qos import QoSProfile
 
+_UNKNOWN = '_NODE_NAME_UNKNOWN_'
 # Seconds to wait at shutdown until subscribers have the last messages.
 _LAST_MESSAGES_SECONDS = 1.0
 # Seconds within which discovery finds all running nodes.
@@ -72,7 +73,12 @@ def rclpy_profile(spec: QosSpec) -> QoSProfile:
 
 
 def full_name(namespace: str, name: str) -> str:
-    """Return the full name of a node in a namespace, such as `/left/sim_node`."""
+    """Return the full name of a node in a namespace, such as `/left/sim_node`.
+
+    rmw knows a participant before the names of its nodes.
+    """
+    if name == _UNKNOWN:
+        return '(a node without a name yet)'
     return f'{namespace.rstrip("/")}/{name}'
 
 

@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool
@@ -18,41 +17,43 @@ from fetch_hand_sim.replay_node import NODE_NAME
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
 from msgs_spec.parameters import REPLAY_NODE
 from node_runtime.command_line import UsageError
+from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import StopSignals
 from node_runtime.ros import (
+    DISCOVERY_TIME,
     SubscriberWatch,
     await_acknowledgements,
     count_publishers,
+    full_name,
     rclpy_profile,
     ros_message_class,
 )
 from node_runtime.ros_parameters import declare_parameters, set_callback
 
-# Seconds between looks at the stop flag while nothing is due.
-_SPIN = 0.1
-# Seconds of a stall after which a replay goes on from where it was.
+# Seconds of a stall after which a replay continues where it was, without catching up.
 _LONGEST_STALL = 0.5
 _CLOCK = '/clock'
 
 
 class ReplayNode(Node):
-    """Publishes an episode, once or in a loop.
+    """Publish an episode, once or in a loop.
 
     Raises:
-        UsageError: If a parameter is not allowed or the episode cannot be read.
+        ValueError: If a parameter is not allowed or the episode cannot be read.
     """
 
     def __init__(self) -> None:
         super().__init__(NODE_NAME, start_parameter_services=False)
+        self._created_at = time.monotonic()
         self._settings = declare_parameters(self, REPLAY_NODE)
         self._schedule = self._read_schedule()
         self._start_ns = self._schedule.start_ns + round(self._settings['start_offset'] * 1e9)
         if self._start_ns > self._schedule.end_ns:
             length = (self._schedule.end_ns - self._schedule.start_ns) / 1e9
-            raise UsageError(
+            raise ValueError(
                 f'start_offset: {self._settings["start_offset"]} given; allowed: up to {length:.3f}'
             )
-        # The last tick lasts as long as the others before a loop starts again.
+        # In a loop, the last tick lasts as long as the others.
         self._end_ns = self._schedule.end_ns + self._schedule.period_ns
         self._publishers_by_topic = {name: self._open(name) for name in self._schedule.topics}
         self._next = 0
@@ -70,13 +71,13 @@ class ReplayNode(Node):
     def _read_schedule(self) -> ReplaySchedule:
         path = self._settings['path']
         if not path:
-            raise UsageError('path is missing; allowed: a bag directory or an MCAP file')
+            raise ValueError('path is missing; allowed: a bag directory or an MCAP file')
         names = [name.strip() for name in self._settings['topics'].split(',') if name.strip()]
         try:
             return ReplaySchedule(Path(path), names, self._settings['inputs'])
         except (EpisodeReadError, ValueError) as error:
             below = folders_below(Path(path))
-            raise UsageError(f'{error}{f"; there are some in {below}" if below else ""}') from None
+            raise ValueError(f'{error}{f"; there are some in {below}" if below else ""}') from None
 
     def _open(self, name: str) -> Publisher:
         spec = self._schedule.topics[name]
@@ -85,29 +86,54 @@ class ReplayNode(Node):
         )
 
     def _name_here(self, name: str) -> str:
-        """The name that a recorded topic has here: in the namespace of this node, if it has one."""
+        """Return the name under which this node publishes a recorded topic."""
         namespace, recorded = self.get_namespace().rstrip('/'), f'{self._schedule.namespace}/'
         if not namespace or name == _CLOCK or not name.startswith(recorded):
             return name
         return f'{namespace}/{name.removeprefix(recorded)}'
 
     def run(self, stop: StopSignals) -> None:
-        """Publishes until the end of the episode, or until the signals say stop."""
-        executor = SingleThreadedExecutor()
-        executor.add_node(self)
+        """Publish until the end of the episode or until a signal.
+
+        Raises:
+            UsageError: If a topic has another publisher, unless the parameter `force` is set.
+        """
+        loop = EventLoop(self)
         self.get_logger().info(self._description())
         try:
-            self._wait_for_commander(executor, stop)
+            self._require_free_topics(loop, stop)
+            self._wait_for_commander(loop, stop)
             self._begin()
             while not stop and not self._is_over():
-                self._serve(executor)
+                self._serve(loop)
                 self._publish_due()
         finally:
             await_acknowledgements(self._publishers_by_topic.values())
-            executor.remove_node(self)
+            loop.close()
+
+    def _require_free_topics(self, loop: EventLoop, stop: StopSignals) -> None:
+        """Reject topics that have another publisher: subscribers would mix both robots."""
+        if self._settings['force']:
+            return
+        while not stop and time.monotonic() < self._created_at + DISCOVERY_TIME:
+            loop.wait(BEAT)
+        for name in self._publishers_by_topic:
+            topic = self.resolve_topic_name(self._name_here(name))
+            found = [
+                full_name(info.node_namespace, info.node_name)
+                for info in self.get_publishers_info_by_topic(topic)
+            ]
+            # A second replay has the same name as this one.
+            found.remove(self.get_fully_qualified_name())
+            if found:
+                raise UsageError(
+                    f'{topic} is already published by {", ".join(sorted(found))}; stop that node, '
+                    'publish elsewhere (-r __ns:=/replay -r /clock:=/replay/clock) or set '
+                    'force:=true'
+                )
 
     def _description(self) -> str:
-        """What it is about to do, as a line for those who started it."""
+        """Return a line about the episode, the pace and the topics."""
         seconds = (self._schedule.end_ns - self._start_ns) / 1e9
         parts = [
             f'{self._settings["path"]}: {seconds:.2f} s, at {self._settings["rate"]:g} x real time',
@@ -119,10 +145,10 @@ class ReplayNode(Node):
             parts.append('paused until ~/pause is called with false')
         return '; '.join(parts)
 
-    def _wait_for_commander(self, executor: SingleThreadedExecutor, stop: StopSignals) -> None:
-        """Shows the latched topics, from which a policy learns what robot this is.
+    def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
+        """Publish the latched topics, then wait until a policy has connected to all topics.
 
-        It begins when the policy hears everything: the first observation would be lost otherwise.
+        The policy selects its task by them, and would otherwise miss the first observation.
         """
         self._publish_latched()
         if not self._settings['wait_for_commands']:
@@ -132,7 +158,7 @@ class ReplayNode(Node):
         commands, own = self._name_here(recorded), int(recorded in self._publishers_by_topic)
         had_commander = False
         while not stop and not (had_commander and listeners.are_connected()):
-            executor.spin_once(timeout_sec=_SPIN)
+            loop.wait(BEAT)
             has_commander = count_publishers(self, commands) > own
             if has_commander and not had_commander:
                 listeners.expect_more()
@@ -140,7 +166,7 @@ class ReplayNode(Node):
             listeners.update()
 
     def _begin(self) -> None:
-        """Goes to the start."""
+        """Go to the start."""
         self._next = self._schedule.index_at(self._start_ns)
         self._playhead.jump(self._start_ns, time.monotonic())
 
@@ -154,12 +180,12 @@ class ReplayNode(Node):
             self._begin()
         return False
 
-    def _serve(self, executor: SingleThreadedExecutor) -> None:
-        """Serves callbacks until the next message is due, a tenth of a second at most."""
+    def _serve(self, loop: EventLoop) -> None:
+        """Serve callbacks until the next message is due, but no longer than a beat."""
         messages = self._schedule.messages
         due = messages[self._next].time_ns if self._next < len(messages) else self._end_ns
         remaining = self._playhead.remaining(due, time.monotonic())
-        executor.spin_once(timeout_sec=max(0.0, min(remaining, _SPIN)))
+        loop.wait(max(0.0, min(remaining, BEAT)))
         if math.isinf(remaining) and self._last_clock is not None:
             self._publishers_by_topic[_CLOCK].publish(self._last_clock)
 
@@ -167,7 +193,7 @@ class ReplayNode(Node):
         now, messages = time.monotonic(), self._schedule.messages
         if self._next < len(messages):
             due = messages[self._next].time_ns
-            # Nobody could take all of it at once: time that was lost is not made up for.
+            # A burst of messages would overflow the queues of subscribers.
             if self._playhead.remaining(due, now) < -_LONGEST_STALL:
                 self._playhead.jump(due, now)
         position = self._playhead.position_ns(now)

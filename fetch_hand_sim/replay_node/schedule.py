@@ -1,4 +1,4 @@
-"""What to publish when, to say an episode once more; nothing here knows of ROS."""
+"""Messages of a recorded episode and the times to publish them, without ROS."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fetch_hand_sim.episode_log.ticks import logged_topics
 from msgs_spec.schemas import deserialize
 from msgs_spec.topics import TopicSpec, relative_name
 
-# What ROS takes for a resolved name; `rmw` sets the length.
+# Resolved names that ROS accepts; `rmw` limits the length.
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 _LONGEST_NAME = 247
 _SHOWN = 80
@@ -37,13 +37,13 @@ class ReplayMessage:
 
 
 class ReplaySchedule:
-    """The messages of an episode in order, as far as they are to be published.
+    """The messages to publish, in order.
 
     Args:
         path: Bag directory or MCAP file.
-        topics: Names of the topics to publish, resolved or not; empty for all that the robot
-            published.
-        with_inputs: Whether to publish also what the robot received: commands, goals.
+        topics: Names of the topics to publish, resolved or not; empty for all topics that the
+            robot published.
+        with_inputs: Whether to publish also the received commands and goals.
 
     Attributes:
         topics: Published topics by resolved name.
@@ -51,11 +51,11 @@ class ReplaySchedule:
         start_ns: Log time of the first message of the episode, published or not.
         end_ns: Log time of its last message.
         period_ns: Recorded nanoseconds per tick.
-        namespace: ROS namespace of the recorded robot, '' for the root.
+        namespace: ROS namespace of the recorded robot; '' for the root.
 
     Raises:
-        EpisodeReadError: If the file is damaged, or holds what is no message of its type, or topics
-            that have no names of ROS.
+        EpisodeReadError: If the file is damaged, a message does not match its type, or ROS rejects
+            the name of a topic.
         ValueError: If the episode has no topic of a given name.
     """
 
@@ -84,14 +84,13 @@ class ReplaySchedule:
         self.namespace = status.rpartition('/')[0]
 
     def index_at(self, time_ns: int) -> int:
-        """Index of the first message at or after a time."""
+        """Return the index of the first message at or after a time."""
         return bisect_left(self.messages, time_ns, key=lambda message: message.time_ns)
 
     def latched_at(self, time_ns: int) -> list[ReplayMessage]:
-        """What late subscribers of the latched topics get at a time.
+        """Return the last message before a time of each latched topic, or else its first message.
 
-        That is the last message of each before the time, or the first of all where there is none
-        yet: whoever listens learns at once which robot this is.
+        So subscribers know the robot from the start.
         """
         found: dict[str, ReplayMessage] = {}
         for message in self.messages:

@@ -1,69 +1,154 @@
-"""What the ROS graph shows a robot: who commands it, who else is like it, who hears it."""
+"""The ROS graph around a simulator node: publishers of its inputs, subscribers, other robots."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from fetch_hand_sim.sim_node.commanders import CommanderWatch, Endpoint
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topics
-from node_runtime.ros import SubscriberWatch, count_publishers, full_name
+from node_runtime.ros import MEMORY_OF_THE_GRAPH, SubscriberWatch, count_publishers, full_name
 
 if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.publisher import Publisher
 
 
-class GraphWatch:
-    """Takes in what the graph shows when asked to.
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """A publisher found on the graph; `node` and `topic` are fully qualified."""
+
+    node: str
+    topic: str
+    type_name: str
+    is_reliable: bool
+    gid: bytes
+
+
+class InputWatch:
+    """Publishers of the topics that a robot subscribes to, and what is wrong with them.
 
     Args:
-        node: The robot's.
-        spec: Its task.
+        commands: Fully qualified topics of commands, with their types.
+        others: The other subscribed topics, likewise.
+    """
+
+    def __init__(self, commands: Mapping[str, str], others: Mapping[str, str]) -> None:
+        self._commands = commands
+        self._types = {**commands, **others}
+        self._endpoints: list[Endpoint] = []
+        self._since: dict[bytes, float] = {}
+        self._now = 0.0
+
+    @property
+    def topics(self) -> Iterable[str]:
+        """All watched topics."""
+        return self._types
+
+    @property
+    def commanders(self) -> list[str]:
+        """Nodes whose commands arrive, sorted; two processes of one name count twice."""
+        copies: dict[str, int] = {}
+        for topic in self._commands:
+            for node in {endpoint.node for endpoint in self._endpoints}:
+                copies[node] = max(copies.get(node, 0), self._copies(node, topic))
+        return sorted(name for name, count in copies.items() for _ in range(count))
+
+    def update(self, found: Iterable[Endpoint], now: float) -> bool:
+        """Replace the known publishers; return whether a publisher of commands is new.
+
+        Args:
+            found: Publishers of the watched topics.
+            now: Seconds of a steady clock.
+        """
+        known = self._since
+        self._endpoints, self._now = list(found), now
+        self._since = {each.gid: known.get(each.gid, now) for each in self._endpoints}
+        return any(
+            each.gid not in known for each in self._endpoints if each.topic in self._commands
+        )
+
+    def problems(self) -> list[str]:
+        """Return one line for each problem."""
+        problems, names = [], self.commanders
+        if len(names) > 1:
+            problems.append(f'{len(names)} publish commands: {", ".join(names)}')
+        for endpoint in self._endpoints:
+            reason = self._mismatch(endpoint)
+            if reason:
+                problems.append(f'{endpoint.topic} of {endpoint.node} is not received: {reason}')
+        return problems
+
+    def _copies(self, node: str, topic: str) -> int:
+        """Return how many processes of this name publish a topic.
+
+        A killed process stays in the graph for a while; it and its successor count as one.
+        """
+        ages = [
+            self._now - self._since[each.gid]
+            for each in self._endpoints
+            if (each.node, each.topic) == (node, topic) and not self._mismatch(each)
+        ]
+        return len(ages) if ages and min(ages) > MEMORY_OF_THE_GRAPH else min(len(ages), 1)
+
+    def _mismatch(self, endpoint: Endpoint) -> str:
+        """Return why messages of a publisher never arrive, or ''."""
+        allowed = self._types[endpoint.topic]
+        if endpoint.type_name != allowed:
+            return f'its type is {endpoint.type_name}; allowed: {allowed}'
+        return '' if endpoint.is_reliable else 'it is best effort; allowed: reliable'
+
+
+class GraphWatch:
+    """What the graph contained at the last `update`.
+
+    Args:
+        node: The simulator node.
         publishers: Its publishers by topic.
 
     Attributes:
-        commanders: Who publishes commands.
-        clock_publishers: Other nodes that publish `/clock`, each name once.
-        robots: Nodes that publish the state of a robot under this one's topics, itself included.
-        has_newcomer: Whether a commander or listener came since this was last set to False.
+        inputs: Publishers of the subscribed topics.
+        clock_publishers: Other nodes that publish `/clock`.
+        robots: Nodes that publish the same `episode_status`, this one included.
+        has_newcomer: Whether a commander or subscriber is new since this was last set to False.
     """
 
     def __init__(self, node: Node, spec: TaskSpec, publishers: Mapping[str, Publisher]) -> None:
         self._node = node
-        self._command_topics = {
-            node.resolve_topic_name(each.name): each.type_name
-            for each in topics(spec)
-            if each.direction == 'subscribed' and each.name.endswith('commands')
+        received = [each for each in topics(spec) if each.direction == 'subscribed']
+        types = {node.resolve_topic_name(each.name): each.type_name for each in received}
+        commands = {
+            node.resolve_topic_name(each.name)
+            for each in received
+            if each.name.endswith('commands')
         }
-        self.commanders = CommanderWatch(self._command_topics)
+        self.inputs = InputWatch({name: types[name] for name in commands}, types)
         self.clock_publishers: list[str] = []
         self.robots: list[str] = []
         self.has_newcomer = False
-        self._listeners = SubscriberWatch(node, publishers.values())
+        self._subscribers = SubscriberWatch(node, publishers.values())
         self._status = node.resolve_topic_name('episode_status')
 
     def update(self) -> None:
-        """Takes in what the graph shows now."""
-        now = time.monotonic()
-        found = [each for topic in self._command_topics for each in self._found(topic)]
-        if self.commanders.update(found, now):
+        """Read the graph."""
+        found = [each for topic in self.inputs.topics for each in self._found(topic)]
+        if self.inputs.update(found, time.monotonic()):
             self.has_newcomer = True
-            self._listeners.expect_more()
+            self._subscribers.expect_more()
         me = self._node.get_fully_qualified_name()
         self.clock_publishers = sorted({each.node for each in self._found('/clock')} - {me})
         self.robots = sorted(each.node for each in self._found(self._status))
-        self.has_newcomer |= self._listeners.update()
+        self.has_newcomer |= self._subscribers.update()
 
-    def is_heard(self) -> bool:
-        """Whether everybody who subscribes is connected: only then a message reaches them."""
-        self.has_newcomer |= self._listeners.update()
-        return self._listeners.are_connected()
+    def are_subscribers_connected(self) -> bool:
+        """Return whether all subscribers are connected, so that a message reaches them."""
+        self.has_newcomer |= self._subscribers.update()
+        return self._subscribers.are_connected()
 
     def waiting_elsewhere(self) -> list[str]:
-        """Policies that wait for a robot in another namespace than this one's."""
+        """Return a line for each policy that waits for a robot in another namespace."""
         return [
             f'{full_name(info.node_namespace, info.node_name)} waits for a robot on {name}'
             for name, _ in self._node.get_topic_names_and_types()
@@ -72,8 +157,8 @@ class GraphWatch:
             for info in self._node.get_subscriptions_info_by_topic(name)
         ]
 
-    def will_introduce(self) -> bool:
-        """Whether somebody publishes `policy_status`."""
+    def has_policy_status(self) -> bool:
+        """Return whether a policy publishes `policy_status`."""
         return count_publishers(self._node, 'policy_status') > 0
 
     def _found(self, topic_name: str) -> list[Endpoint]:

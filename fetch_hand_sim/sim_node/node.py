@@ -34,7 +34,7 @@ from fetch_hand_sim.simulation import Simulation
 from msgs_spec.diagnostics import REPORT_PERIOD, next_report
 from msgs_spec.disturbances import read_disturbances
 from msgs_spec.parameters import SIM_NODE
-from msgs_spec.robots import require_joint_prefix
+from msgs_spec.robots import read_joint_prefix
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import LATEST_TICK, MONITORING, ground_truth_topics, topics
 from node_runtime.command_line import UsageError
@@ -109,14 +109,14 @@ class SimNode(Node):
                 control_hz=values['control_hz'],
                 disturbances=values['disturbances'],
             )
-            require_joint_prefix(simulation.spec.robot, values['joint_prefix'])
+            prefix = read_joint_prefix(simulation.spec.robot, values['joint_prefix'])
         except ValueError as error:
             raise UsageError(str(error)) from None
         runner = EpisodeRunner(
             simulation,
             first_seed=values['seed'],
             episodes=values['episodes'],
-            joint_prefix=values['joint_prefix'],
+            joint_prefix=prefix,
         )
         pacer = RealTimePacer(
             simulation.tick_duration, values['real_time_factor'], time.monotonic()
@@ -239,7 +239,7 @@ class SimNode(Node):
         A step begins the first episode without one, and then it goes on as any other.
         """
         watch = self._watch
-        while not (watch.commanders.names and watch.is_heard()):
+        while not (watch.inputs.commanders and watch.are_subscribers_connected()):
             if stop or self._robot.runner.has_started:
                 return
             loop.wait(BEAT)
@@ -249,7 +249,7 @@ class SimNode(Node):
             self._beat_when_due()
         # Latched, so it comes a little after its publisher is seen; the log names who commands.
         end = time.monotonic() + _INTRODUCTION_TIME
-        while not stop and watch.will_introduce() and not self._has_introduction:
+        while not stop and watch.has_policy_status() and not self._has_introduction:
             if time.monotonic() > end:
                 return
             loop.wait(BEAT)
@@ -294,7 +294,7 @@ class SimNode(Node):
         is_waiting = robot.schedule.waits_for_commands and robot.misses_commands
         if robot.stands_still:
             watch.update()
-            if watch.has_newcomer and watch.is_heard():
+            if watch.has_newcomer and watch.are_subscribers_connected():
                 watch.has_newcomer = False
                 self._publish(robot.last_messages)
                 self._latest_tick.repeat()
@@ -304,7 +304,7 @@ class SimNode(Node):
             self._reporter.say_what_is_waited_for()
 
     def _emit(self, tick: Tick, messages: Messages) -> None:
-        if self._watch.has_newcomer and self._watch.is_heard():
+        if self._watch.has_newcomer and self._watch.are_subscribers_connected():
             self._watch.has_newcomer = False
         self._publish(messages)
         self._latest_tick.take(tick, messages)
@@ -359,7 +359,11 @@ class SimNode(Node):
     def _forget_who_left(self) -> None:
         """Whoever commands after an actor has left gives actions of its own."""
         context = self._recording_context
-        if context is not None and context.checkpoint_sha256 and not self._watch.will_introduce():
+        if (
+            context is not None
+            and context.checkpoint_sha256
+            and not self._watch.has_policy_status()
+        ):
             context.checkpoint_sha256 = None
 
     def _apply_changes(self, changes: list[Any]) -> None:

@@ -84,10 +84,10 @@ class Reporter:
 
     def _surroundings(self) -> Surroundings:
         watch, log = self._watch, self._log_state()
-        names = watch.commanders.names
+        names = watch.inputs.commanders
         return Surroundings(
             commanders=names,
-            commander_problems=watch.commanders.problems(),
+            commander_problems=watch.inputs.problems(),
             robots=watch.robots,
             waiting_elsewhere=watch.waiting_elsewhere() if not names else [],
             clock_publishers=watch.clock_publishers,

@@ -1,4 +1,4 @@
-"""A camera that draws only while somebody looks, at a rate of its own."""
+"""A camera with a rate of its own."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from fetch_hand_sim.simulation.rendering import SceneRenderer
 from fetch_hand_sim.simulation.scene import Frame, Scene
 from msgs_spec.arrays import Picture
+from msgs_spec.diagnostics import Durations
 
 
 class Camera:
@@ -17,12 +18,19 @@ class Camera:
     Args:
         width: Pixels.
         height: Pixels.
-        hz: Pictures per second of the clock, at most; 0 for none.
+        hz: Largest number of pictures per second of the clock; 0 for none.
         clock: A steady clock, seconds.
+
+    Attributes:
+        pictures: Pictures so far.
+        picture_time: Seconds that each took.
     """
 
     def __init__(self, width: int, height: int, hz: float, clock: Callable[[], float]) -> None:
         self.width, self.height = width, height
+        self.pictures = 0
+        self.picture_time = Durations()
+        self._hz = hz
         self._period = 1.0 / hz if hz else np.inf
         self._clock = clock
         self._due = clock()
@@ -34,18 +42,32 @@ class Camera:
         return np.isfinite(self._period) and self._clock() >= self._due
 
     def render(self, scene: Scene, frame: Frame) -> Picture:
-        """Returns a picture (height, width, 3); the first one opens OpenGL.
+        """Return a picture (height, width, 3); the first call opens OpenGL.
 
         Raises:
-            RuntimeError: If there is no OpenGL.
+            RuntimeError: If OpenGL is missing.
         """
-        self._due = max(self._due + self._period, self._clock())
+        began = self._clock()
+        self._due = max(self._due + self._period, began)
         if self._renderer is None:
             self._renderer = SceneRenderer(scene, self.width, self.height)
-        return self._renderer.render(frame)
+        picture = self._renderer.render(frame)
+        self.pictures += 1
+        self.picture_time.add(self._clock() - began)
+        return picture
+
+    def problem(self) -> str:
+        """Return why pictures are fewer than requested, or ''."""
+        seconds = self.picture_time.median()
+        if seconds <= self._period:
+            return ''
+        return (
+            f'a picture takes {seconds:.2g} s, so that {1.0 / seconds:.2g} of the {self._hz:g} '
+            'pictures per second are possible; reduce camera_width and camera_height, or use a GPU'
+        )
 
     def close(self) -> None:
-        """Frees OpenGL; another scene may follow."""
+        """Free OpenGL; another scene may follow."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

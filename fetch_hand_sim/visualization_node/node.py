@@ -27,10 +27,11 @@ from fetch_hand_sim.visualization_node.transforms import (
     view_transform,
 )
 from msgs_spec.arrays import Picture
+from msgs_spec.diagnostics import REPORT_PERIOD, Increase, Report, encode_reports, next_report
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import TopicSpec
+from msgs_spec.topics import DIAGNOSTICS, TopicSpec
 from msgs_spec.view_topics import SHOWN, scalar_topics
 from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import NodeFailure, StopSignals
@@ -78,8 +79,15 @@ class VisualizationNode(Node):
         self._outputs: dict[str, Any] = {}
         for source in SHOWN:
             self._open(source)
+        self._diagnostics = self.create_publisher(
+            ros_message_class(DIAGNOSTICS.type_name),
+            DIAGNOSTICS.name,
+            rclpy_profile(DIAGNOSTICS.qos),
+        )
         self._listeners = SubscriberWatch(self, self._outputs.values())
         self._has_newcomer = False
+        self._report_due = time.monotonic() + REPORT_PERIOD
+        self._drawn = Increase()
         self._camera = Camera(
             settings['camera_width'],
             settings['camera_height'],
@@ -99,6 +107,7 @@ class VisualizationNode(Node):
                 loop.serve_pending(_SERVED_FIRST)
                 self._show_latest()
                 self._repeat_for_newcomers()
+                self._report_when_due()
         finally:
             self._camera.close()
             loop.close()
@@ -201,6 +210,23 @@ class VisualizationNode(Node):
             # Nothing is said in the name of a robot that is gone.
             if count_publishers(self, 'joint_states'):
                 self._on_tick(self._latest)
+
+    def _report_when_due(self) -> None:
+        """Report on the camera, once a second."""
+        now = time.monotonic()
+        if now < self._report_due:
+            return
+        self._report_due = next_report(self._report_due, now)
+        camera, task = self._camera, self._robot[0] if self._robot else 'no robot yet'
+        values = {
+            'pictures per second': f'{self._drawn.since(camera.pictures) / REPORT_PERIOD:g}',
+            **{f'picture time {k} (ms)': v for k, v in camera.picture_time.milliseconds().items()},
+        }
+        report = Report(self.get_fully_qualified_name(), task, values, f'shows {task}')
+        if problem := camera.problem():
+            report.warn(problem)
+            self.get_logger().warning(problem, **seldom(60.0))
+        self._diagnostics.publish(encode_reports(report))
 
     def _take_photo(self, scene: Scene, tick: SeenTick, wanted: list[str]) -> None:
         try:

@@ -51,8 +51,9 @@ def test_allowed_values_pass(name, value):
         ('sim.mode', 'lock_step', "'realtime', 'lockstep'; did you mean 'lockstep'\\?$"),
         ('sim.task', 3, 'task: 3 given; allowed: '),
         ('sim.task', None, 'task: None given; allowed: '),
-        ('sim.seed', -1, 'seed: -1 given; allowed: 0 ... 4294967295'),
-        ('sim.seed', 1.0, 'seed: 1.0 given; allowed: 0 ... 4294967295'),
+        ('sim.seed', -1, 'seed: -1 given; allowed: whole numbers 0 ... 4294967295'),
+        ('sim.seed', 1.0, 'seed: 1.0 given; allowed: whole numbers 0 ... 4294967295'),
+        ('sim.joint_prefix', 5, 'joint_prefix: 5 given; allowed: text of up to 64 .*two pairs of'),
         ('sim.seed', True, 'seed: True given; allowed: '),
         ('sim.reward_type', '', "reward_type: '' given; allowed: 'sparse', 'dense'"),
         ('sim.control_hz', 30.0, 'control_hz 30 is not a whole number .*29.4117647 and 31.25'),
@@ -66,8 +67,8 @@ def test_allowed_values_pass(name, value):
         ),
         ('sim.real_time_factor', '2', "real_time_factor: '2' given; allowed: 0 or 0.01 ... 1000"),
         ('sim.command_timeout', True, 'command_timeout: True given; allowed: 0 ... 3600'),
-        ('sim.joint_prefix', 'x' * 65, 'given; allowed: up to 64 characters$'),
-        ('sim.episode_dir', 1, '1 given; allowed: any string; .*: "episode_dir:=\'2026\'"$'),
+        ('sim.joint_prefix', 'x' * 65, 'given; allowed: text of up to 64 characters$'),
+        ('sim.episode_dir', 1, '1 given; allowed: text; .*: "episode_dir:=\'2026\'"$'),
         ('sim.wait_for_commands', 1, 'wait_for_commands: 1 given; allowed: true, false'),
         ('policy.task', 'Fetch', "task: 'Fetch' given; allowed: '', 'FetchReach', "),
     ],
@@ -108,6 +109,15 @@ def test_ros_declares_it_and_knows_its_type(spec, make_node):
     assert declared.read_only == spec.read_only
 
 
+@every_parameter
+def test_the_default_survives_ros2_param_dump_and_load(spec):
+    """`ros2 param load` parses the text of each dumped value as YAML, as `-p` does."""
+    parameter_module = pytest.importorskip('rclpy.parameter')
+    message = parameter_module.get_parameter_value(str(spec.default))
+    loaded = parameter_module.parameter_value_to_python(message)
+    assert (loaded, type(loaded)) == (spec.default, type(spec.default))
+
+
 def test_ros_takes_an_integer_for_a_number(make_node):
     spec = SPECS['sim.real_time_factor']
     node = make_node(real_time_factor=2)
@@ -136,7 +146,7 @@ def test_ros_shows_the_range_that_is_checked(spec, make_node):
 @pytest.mark.parametrize(
     ('name', 'value', 'line'),
     [
-        ('seed', -1, 'seed: -1 given; allowed: 0 ... 4294967295'),
+        ('seed', -1, 'seed: -1 given; allowed: whole numbers 0 ... 4294967295'),
         ('real_time_factor', 0.005, 'real_time_factor: 0.005 given; allowed: 0 or 0.01 ... 1000'),
         ('control_hz', 30.0, 'control_hz 30 is not a whole number'),
         ('control_hz', 12.0, 'control_hz 12 is not a whole number'),
@@ -162,15 +172,15 @@ def test_a_mistyped_parameter_is_named_with_the_nearest(make_node, capfd):
     values = declare_parameters(node, SIM_NODE)
     assert (values['task'], values['seed']) == ('FetchReach', 3)
     said = capfd.readouterr().err
-    assert "there is no parameter 'tsak'; did you mean 'task'?" in said
-    assert "there is no parameter 'nonsense'; it is ignored" in said
+    assert "unknown parameter 'tsak'; did you mean 'task'?" in said
+    assert "unknown parameter 'nonsense'; it is ignored" in said
     assert 'checkpoint' not in said  # policy_node's, in a file for both
     assert 'use_sim_time' not in said
 
 
 def test_a_mistyped_former_name_points_to_that_of_today():
     line = unknown_parameter(POLICY_NODE, 'chekpoint')
-    assert line == "there is no parameter 'chekpoint'; did you mean 'policy'?"
+    assert line == "unknown parameter 'chekpoint'; did you mean 'policy'?"
 
 
 def test_quality_of_service_that_is_fixed_is_not_ignored_without_a_word():

@@ -16,7 +16,7 @@ from msgs_spec.actions import (
     command_limits,
     resting_command,
 )
-from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, require_joint_prefix
+from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, read_joint_prefix
 from msgs_spec.tasks import TASKS, substeps_per_tick, task_spec
 
 MODELS = {
@@ -156,12 +156,11 @@ def test_other_rates_are_refused_with_the_nearest(hz, nearest):
         substeps_per_tick(hz)
 
 
-def test_a_joint_prefix_that_renames_nothing_is_refused():
+def test_a_joint_prefix_that_renames_no_joint_is_rejected():
     for robot in (FETCH, SHADOW_HAND):
-        require_joint_prefix(robot, 'rh_')
+        assert read_joint_prefix(robot, 'rh_') == 'rh_'
     arm = replace(FETCH, name='arm', joints=('shoulder', 'elbow'))
-    require_joint_prefix(arm, JOINT_PREFIX)
-    with pytest.raises(
-        ValueError, match=r"'rh_' takes the place of robot0:.* of arm begins; allow"
-    ):
-        require_joint_prefix(arm, 'rh_')
+    for value in ('model', JOINT_PREFIX):
+        assert read_joint_prefix(arm, value) == JOINT_PREFIX
+    with pytest.raises(ValueError, match=r"'rh_' .* arm .*; allowed: 'model'"):
+        read_joint_prefix(arm, 'rh_')

@@ -103,8 +103,8 @@ def test_ticks_do_not_leak_into_each_other():
     ('name', 'size', 'message'),
     [
         ('fingertip_poses', None, 'no fingertip_poses in a tick of HandManipulateBlockFull'),
-        ('object_joint', 7, r'object_joint: shape \(7,\) given; allowed: \(13,\)'),
-        ('joint_states', 51, r'joint_states: shape \(51,\) given; allowed: \(72,\)'),
+        ('object_joint', 7, r'object_joint: 7 values given; allowed: 13'),
+        ('joint_states', 51, r'joint_states: 51 values given; allowed: 72'),
     ],
 )
 def test_readings_that_do_not_fit_the_task_are_refused(name, size, message):
@@ -120,7 +120,7 @@ def test_readings_that_do_not_fit_the_task_are_refused(name, size, message):
 def test_goal_that_does_not_fit_the_task_is_refused():
     task = TASKS['HandManipulateBlockFull']
     tick = dataclasses.replace(random_tick(task), desired_goal=np.zeros(3))
-    with pytest.raises(ValueError, match=r'desired_goal: shape \(3,\) given; allowed: \(7,\)'):
+    with pytest.raises(ValueError, match=r'desired_goal: 3 values given; allowed: 7'):
         TickEncoder(task).encode(tick)
 
 

@@ -286,7 +286,7 @@ def test_numbers_out_of_range_are_one_line(text, capsys):
         parser.parse_args([f'--count={text}'])
     assert caught.value.code == 2
     error = capsys.readouterr().err
-    assert error == f'tool: argument --count: {text!r} given; allowed: 1 ... 6\n'
+    assert error == f'tool: argument --count: {text!r} given; allowed: whole numbers 1 ... 6\n'
     assert parser.parse_args(['--count', '6']).count == 6
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 
@@ -76,6 +77,52 @@ def test_older_rclpy_without_events_executor(node, monkeypatch):
     loop.serve_pending(100)
     assert received == [7.0, 0.0, 1.0, 2.0, 3.0, 4.0]
     loop.close()
+
+
+SUSPENDED = """
+import rclpy
+from std_msgs.msg import Float64
+from node_runtime import event_loop
+event_loop._SUSPENDED = 1.0
+rclpy.init()
+node = rclpy.create_node('suspended')
+publisher = node.create_publisher(Float64, 'numbers', 10)
+loop = event_loop.EventLoop(node)
+while True:
+    loop.wait(0.1)
+"""
+SHORT_LEASE = """<?xml version="1.0"?>
+<dds xmlns="http://www.eprosima.com"><profiles>
+<participant profile_name="short_lease" is_default_profile="true"><rtps><builtin>
+<discovery_config>
+<leaseDuration><sec>2</sec></leaseDuration>
+<leaseAnnouncement><sec>0</sec><nanosec>500000000</nanosec></leaseAnnouncement>
+</discovery_config>
+</builtin></rtps></participant>
+</profiles></dds>
+"""
+
+
+def test_a_node_keeps_its_name_after_a_suspension(node, start_process, tmp_path, monkeypatch):
+    """Other participants forget it after its lease, 20 s by default."""
+    profile = tmp_path / 'profile.xml'
+    profile.write_text(SHORT_LEASE)
+    monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(profile))
+    process = start_process(sys.executable, '-c', SUSPENDED)
+
+    def wait_for_names(expected):
+        deadline, names = time.monotonic() + 20.0, None
+        while names != expected:
+            assert time.monotonic() < deadline, names
+            time.sleep(0.1)
+            names = [each.node_name for each in node.get_publishers_info_by_topic('/numbers')]
+
+    wait_for_names(['suspended'])
+    process.send_signal(signal.SIGSTOP)
+    wait_for_names([])
+    process.send_signal(signal.SIGCONT)
+    wait_for_names(['suspended'])
+    process.kill()
 
 
 def test_an_error_in_a_callback_is_not_swallowed(node):

@@ -90,6 +90,16 @@ def test_two_robots_of_one_name_are_both_told_so(start_process: Start) -> None:
     assert [line in end(sim) for sim in sims] == [True, True]
 
 
+def test_a_goal_of_a_wrong_type_is_reported(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(task='HandReach'))
+    text = '/set_goal of /client is not received: its type is geometry_msgs/msg/PointStamped'
+    with client(REACH) as robot:
+        robot.subscribe('/diagnostics')
+        robot.publisher('set_goal')
+        robot.spin_until(lambda: any(text in each.message for each in robot.reports()), 'line')
+    assert end(sim).count(text) == 1
+
+
 def test_a_robot_in_another_namespace_names_the_policy_that_waits(start_process: Start) -> None:
     policy = start_process(*POLICY_NODE)
     sim = start_process(*SIM_NODE, *ros_args(mode='lockstep'), '-r', '__ns:=/arm1')

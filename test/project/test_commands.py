@@ -153,10 +153,22 @@ def test_what_is_not_there_is_bad_usage_in_one_line(name, arguments, run, tmp_pa
 @pytest.mark.parametrize(
     ('name', 'arguments', 'line'),
     [
-        ('evaluate_policy', ['--episodes', '0'], "--episodes: '0' given; allowed: 1 or more"),
-        ('evaluate_policy', ['--first-seed', 'inf'], "'inf' given; allowed: 0 ... 4294967295"),
-        ('benchmark', ['--jobs', '0'], "--jobs: '0' given; allowed: 1 or more"),
-        ('generate_episodes', ['--first-seed', '9223372036854775808'], 'allowed: 0 ... 4294967295'),
+        (
+            'evaluate_policy',
+            ['--episodes', '0'],
+            "--episodes: '0' given; allowed: whole numbers from 1",
+        ),
+        (
+            'evaluate_policy',
+            ['--first-seed', 'inf'],
+            "'inf' given; allowed: whole numbers 0 ... 4294967295",
+        ),
+        ('benchmark', ['--jobs', '0'], "--jobs: '0' given; allowed: whole numbers from 1"),
+        (
+            'generate_episodes',
+            ['--first-seed', '9223372036854775808'],
+            'allowed: whole numbers 0 ... 4294967295',
+        ),
         ('generate_episodes', [], 'the following arguments are required: --output'),
         ('list_episodes', ['--nosuch'], 'the following arguments are required: directory'),
         ('train_her', ['--set', 'seed=1', 'gamma=.9'], 'a --set of its own: --set gamma=.9'),

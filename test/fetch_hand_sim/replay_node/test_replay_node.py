@@ -307,6 +307,18 @@ def test_a_policy_goes_on_when_less_than_a_second_is_replayed_again(start_proces
         listener.spin_until(lambda: len(received) > 30, 'commands of a third round')
 
 
+def test_topics_of_a_running_robot_are_rejected_unless_forced(start_process, episode):
+    start_process(*SIM_NODE, *ros_args(publish_clock=False))
+    with client(REACH) as listener:
+        listener.spin_until(lambda: listener.node.count_publishers('joint_states'), 'a robot')
+        code, output = finish(start_process(*REPLAY_NODE, *ros_args(path=episode)))
+        assert code == 2 and ' is already published by /sim_node; ' in output
+        forced = start_process(*REPLAY_NODE, *ros_args(path=episode, force=True, rate=100.0))
+        assert_ends_well(forced)
+        elsewhere = start_process(*REPLAY_NODE, *ros_args(path=episode), '-r', '__ns:=/replay')
+        assert_ends_well(elsewhere)
+
+
 @pytest.mark.parametrize(
     ('parameters', 'line'),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from io import BytesIO
 
 import mujoco
@@ -43,6 +44,18 @@ def moved_frame(task):
     for _ in range(5):
         simulation.step(rng.uniform(-1, 1, (1, simulation.spec.robot.action_size)))
     return simulation_frame(simulation)
+
+
+def test_a_camera_that_is_too_slow_for_its_rate_reports_it():
+    now = itertools.count(100.0, 0.5)
+    frame, scene = moved_frame('FetchReach'), Scene('FetchReach')
+    fast, slow = (Camera(16, 16, hz, lambda: next(now)) for hz in (1.0, 10.0))
+    for camera in (fast, slow):
+        assert camera.problem() == ''
+        camera.render(scene, frame)
+        camera.close()
+    assert fast.problem() == ''
+    assert '2 of the 10 pictures per second are possible' in slow.problem()
 
 
 @pytest.mark.parametrize('task', ['FetchReach', 'FetchPush', 'HandReach', 'HandManipulateEggFull'])
