@@ -119,7 +119,7 @@ bench-her: env
 	$(BIN)/python bench/bench_her.py
 
 bench-paper: env
-	$(BIN)/python -m policy_node.training.studies --tasks $(TASK)
+	$(BIN)/python -m fetch_hand_sim benchmark --tasks $(TASK)
 
 bench-lockstep: env
 	$(BIN)/python bench/bench_lockstep.py

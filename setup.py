@@ -20,12 +20,12 @@ EXTRAS = {
     'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
     'actors': ACTORS,
     'train': [*ACTORS, 'matplotlib>=3.8', 'tensorboard>=2.16'],
-    # `export_episodes`.
+    # `fetch_hand_sim episodes export`.
     'data': ['minari>=0.5.3', 'pyarrow>=18'],
     'sb3': [*ACTORS, 'stable-baselines3>=2.4'],
     # To write ONNX actors; onnxruntime alone runs them.
     'onnx': ['onnx>=1.17', 'onnxruntime>=1.20', 'onnxscript>=0.3'],
-    # `render_episode` to .mp4.
+    # `fetch_hand_sim episodes film` to .mp4.
     'film': ['imageio-ffmpeg>=0.5'],
     # `benchmark --ray`.
     'cluster': [*ACTORS, 'matplotlib>=3.8', 'ray>=2.10'],
@@ -118,25 +118,15 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            # All of the following under one name; `ros2 run` finds each by its own.
-            'fetch_hand_sim = fetch_hand_sim.commands.main:main',
+            # Every command; the others are for `ros2 run`.
+            'fetch_hand_sim = fetch_hand_sim.__main__:main',
             'sim_node = fetch_hand_sim.sim_node:main',
             'policy_node = policy_node.node:main',
-            'export_actor = policy_node.training.commands:export_actor',
-            'benchmark = policy_node.training.commands:benchmark',
-            'train_her = policy_node.training.commands:train_her',
-            'evaluate_policy = policy_node.training.commands:evaluate_policy',
-            'view = fetch_hand_sim.view:main',
-            'visualization_node = fetch_hand_sim.visualization_node:main',
-            'render_episode = fetch_hand_sim.commands.render_episode:main',
             'replay_node = fetch_hand_sim.replay_node:main',
-            'list_episodes = fetch_hand_sim.commands.list_episodes:main',
-            'check_episode = fetch_hand_sim.commands.check_episode:main',
-            'recover_episodes = fetch_hand_sim.commands.recover_episodes:main',
-            'export_episodes = fetch_hand_sim.commands.export_episodes:main',
-            'generate_episodes = policy_node.training.commands:generate_episodes',
+            'visualization_node = fetch_hand_sim.visualization_node:main',
+            'view = fetch_hand_sim.view:main',
         ],
-        # Whoever ships actors says for which tasks; the demo asks without knowing the package.
+        # Functions that return the shipped actors by task; `fetch_hand_sim` imports no policy.
         'fetch_hand_sim.actors': ['shipped = policy_node.policies.shipped:shipped_actors'],
     },
 )

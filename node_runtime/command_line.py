@@ -149,7 +149,7 @@ def say(text: object) -> None:
 
 def given_command(name: str, arguments: Sequence[str] | None) -> str:
     """Return the command line as one line for the record; None means `sys.argv`."""
-    words = [name, *(sys.argv[1:] if arguments is None else arguments)]
+    words = [*name.split(), *(sys.argv[1:] if arguments is None else arguments)]
     return printable(shlex.join(words))
 
 

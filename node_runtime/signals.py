@@ -15,11 +15,7 @@ from typing import Any
 
 # The console scripts of setup.py; a test compares the two.
 EXECUTABLES = frozenset(
-    (
-        'fetch_hand_sim sim_node policy_node replay_node visualization_node view train_her '
-        'evaluate_policy generate_episodes benchmark export_actor list_episodes check_episode '
-        'render_episode recover_episodes export_episodes'
-    ).split()
+    ('fetch_hand_sim', 'sim_node', 'policy_node', 'replay_node', 'visualization_node', 'view')
 )
 _PACKAGES = ('fetch_hand_sim', 'policy_node')
 # 128 + SIGINT, as in shells.

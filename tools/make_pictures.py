@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from fetch_hand_sim.commands.executables import is_actor_shipped
+from fetch_hand_sim.commands.node_processes import is_actor_shipped
 from fetch_hand_sim.films.film import write_film, write_picture
 from fetch_hand_sim.films.recording import Recording, load_recordings
 from fetch_hand_sim.films.studio import Studio, tile, with_edge

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from fetch_hand_sim.commands.main import COMMANDS, Command
+from fetch_hand_sim.__main__ import COMMANDS, Command
 from msgs_spec.tasks import TASKS
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.config_fields import ConfigFields
@@ -38,12 +38,11 @@ def write_pages(directory: Path) -> None:
 def commands_page() -> str:
     """Returns every command with what its `--help` prints."""
     parts = [
-        '# Commands\n\n`fetch_hand_sim <command>`; a node or tool of another name for `ros2 run '
-        'fetch_hand_sim <executable>` is named beside. What each prints for `--help`:'
+        '# Commands\n\n`fetch_hand_sim <command>`. The nodes and `view` are also executables for '
+        '`ros2 run fetch_hand_sim`. What each command prints for `--help`:'
     ]
     for path, command in leaves(COMMANDS):
-        also = f' Executable: `{command.executable}`.' if command.executable else ''
-        parts.append(f'## {" ".join(path)}\n\n{_sentence(command.help)}{also}')
+        parts.append(f'## {" ".join(path)}\n\n{_sentence(command.help)}')
         parts.append(f'```\n{help_of(path)}\n```')
     return '\n\n'.join(parts) + '\n'
 
@@ -86,7 +85,7 @@ def train_config_page() -> str:
         '\n\n'.join(
             [
                 '# Fields of training',
-                'Everything that decides what `train_her` learns: '
+                'Everything that decides what `fetch_hand_sim train` learns: '
                 '`policy_node.training.configuration.config.TrainConfig`. Any field is an option, '
                 '`--learning-rate 1e-4`, or `--set learning_rate=1e-4`; each is in the JSON of the '
                 'actor. [Training](../training.md) '

@@ -11,7 +11,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,8 +19,12 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from fetch_hand_sim.commands.executables import is_actor_shipped
-from fetch_hand_sim.commands.node_processes import open_log, start_nodes, stop_node
+from fetch_hand_sim.commands.node_processes import (
+    is_actor_shipped,
+    open_log,
+    start_nodes,
+    stop_node,
+)
 from fetch_hand_sim.episode_log import (
     Episode,
     EpisodeOutcome,
@@ -54,7 +57,7 @@ from node_runtime.ros import (
 )
 from node_runtime.transport import keep_discovery_local
 
-_NAME = 'demo'
+_NAME = 'fetch_hand_sim demo'
 _START_TIMEOUT = 60.0
 # What shells add to the number of the signal that ended a command.
 _SIGNALLED = 128
@@ -296,7 +299,7 @@ def _show(progress: Progress, bar: TaskID, watcher: Watcher) -> None:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = CommandParser(prog='fetch_hand_sim demo', description=__doc__)
+    parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument('--task', default='FetchReach', help='default: %(default)s')
     count, seed = whole_number(1), whole_number(0, LARGEST_SEED)
     parser.add_argument('--episodes', type=count, default=5, help='how many; default: %(default)s')
@@ -340,7 +343,3 @@ def _run(options: argparse.Namespace) -> int:
         return Demo(options, Console()).run(stop)
     finally:
         rclpy.try_shutdown()
-
-
-if __name__ == '__main__':
-    sys.exit(main())

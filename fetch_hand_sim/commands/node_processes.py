@@ -1,4 +1,8 @@
-"""Nodes as child processes, for commands that run everything themselves."""
+"""Start and stop the nodes of this package as child processes.
+
+Executables are found through entry points, so that a simulator node starts a policy without
+importing it.
+"""
 
 from __future__ import annotations
 
@@ -6,47 +10,96 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import tempfile
 from collections.abc import Mapping
+from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from typing import IO
 
-from fetch_hand_sim.commands.executables import executable
-from node_runtime.command_line import EXIT_SUCCESS, CommandError
+from node_runtime import signals
+from node_runtime.command_line import EXIT_SUCCESS, CommandError, UsageError
 
+_DISTRIBUTION = 'fetch_hand_sim'
+_ACTORS = 'fetch_hand_sim.actors'
+_PARENT = signals.__name__
 _SHUTDOWN_TIMEOUT = 10.0
 
 
-def open_log(name: str) -> IO[str]:
-    """Opens a file for what nodes print, which goes when it is closed.
+class UnknownExecutableError(UsageError):
+    """No executable has the given name; the message lists the installed ones."""
+
+
+def find_executable(name: str) -> EntryPoint:
+    """Return the entry point of an executable such as `sim_node`.
 
     Raises:
-        CommandError: If there is no folder for temporary files.
+        UnknownExecutableError: If the package is not installed or has no such executable.
+    """
+    try:
+        points = distribution(_DISTRIBUTION).entry_points.select(group='console_scripts')
+    except PackageNotFoundError:
+        raise UnknownExecutableError(f'{_DISTRIBUTION} is not installed: pip install .') from None
+    if name not in points.names:
+        known = ', '.join(sorted(points.names))
+        raise UnknownExecutableError(f'no executable {name!r}; installed: {known}')
+    return points[name]
+
+
+def executable(name: str, parent: int | None = None) -> list[str]:
+    """Return the command that runs an executable with this interpreter.
+
+    Args:
+        name: The executable.
+        parent: Process id; the executable terminates when this process does.
+
+    Raises:
+        UnknownExecutableError: If no executable has this name.
+    """
+    point = find_executable(name)
+    function = f'__import__({point.module!r}, fromlist=["_"]).{point.attr}'
+    # Before slow imports.
+    first = '' if parent is None else f'import {_PARENT}; {_PARENT}.end_with_parent({parent}); '
+    # `-P` keeps modules of the working directory out, as an installed executable does.
+    return [sys.executable, '-P', '-c', f'{first}import sys; sys.exit({function}())']
+
+
+def is_actor_shipped(task: str) -> bool:
+    """Return whether an installed package ships an actor for a task.
+
+    Entry points of the group `fetch_hand_sim.actors` name functions that return actors by task.
+    """
+    return any(task in point.load()() for point in entry_points(group=_ACTORS))
+
+
+def open_log(name: str) -> IO[str]:
+    """Open a temporary file for the output of nodes; closing deletes it.
+
+    Raises:
+        CommandError: If the folder for temporary files cannot be written.
     """
     try:
         return tempfile.NamedTemporaryFile('w+', prefix=f'{name}_', suffix='.log')
     except OSError as error:
-        raise CommandError(f'no file for what the nodes print: {error.strerror}') from None
+        raise CommandError(f'cannot write the output of the nodes: {error.strerror}') from None
 
 
 def start_node(
     name: str, parameters: Mapping[str, object], output: IO[str], namespace: str = ''
 ) -> subprocess.Popen[str]:
-    """Starts a node in a process group of its own: Ctrl-C reaches only who started it.
-
-    It ends with this process, also where that is killed.
+    """Start a node that terminates with this process and does not receive its Ctrl-C.
 
     Args:
-        name: Of the executable.
-        parameters: Values by name: text, numbers or truth values.
-        output: Gets what the node prints.
-        namespace: Of the node.
+        name: The executable.
+        parameters: Text, numbers or truth values by parameter name.
+        output: File for stdout and stderr.
+        namespace: Namespace of the node.
 
     Raises:
-        UnknownExecutableError: If there is none of that name.
+        UnknownExecutableError: If no executable has this name.
     """
     words = []
     for parameter, value in parameters.items():
-        # Read as YAML: text without quotes may be a date, a number or a comment.
+        # ROS reads values as YAML: unquoted text may be a date, a number or a comment.
         words += ['-p', f'{parameter}:={json.dumps(value, ensure_ascii=False)}']
     if namespace:
         words += ['-r', f'__ns:=/{namespace.strip("/")}']
@@ -62,16 +115,7 @@ def start_node(
 def start_nodes(
     nodes: Mapping[str, Mapping[str, object]], output: IO[str], namespace: str = ''
 ) -> list[subprocess.Popen[str]]:
-    """Starts several nodes, all or none.
-
-    Args:
-        nodes: Parameters of each, by the name of its executable.
-        output: Gets what they print.
-        namespace: Of the nodes.
-
-    Raises:
-        UnknownExecutableError: If there is none of a name.
-    """
+    """Start several nodes, all or none: parameters by executable. See `start_node`."""
     started: list[subprocess.Popen[str]] = []
     try:
         for name, parameters in nodes.items():
@@ -84,10 +128,10 @@ def start_nodes(
 
 
 def stop_node(process: subprocess.Popen[str]) -> int:
-    """Asks a node to end; returns its exit code, 0 also for one that was still being loaded."""
+    """Terminate a node; return its exit code, or 0 if it had not finished loading."""
     if process.poll() is not None:
         return process.returncode
-    # Not SIGINT, which is a traceback as long as Python itself starts.
+    # SIGINT would print a traceback while Python starts.
     process.terminate()
     try:
         code = process.wait(_SHUTDOWN_TIMEOUT)

@@ -216,4 +216,6 @@ def _unfinished(file: Path) -> str:
         if durable.is_locked(file):
             return 'still being written'
     directory = shlex.quote(str(file.parent.parent))
-    return f'truncated by a kill or a full disk; `recover_episodes {directory}` ends it'
+    return (
+        f'truncated by a kill or a full disk; `fetch_hand_sim episodes recover {directory}` ends it'
+    )

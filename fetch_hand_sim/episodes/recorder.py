@@ -136,7 +136,7 @@ class EpisodeRecorder:
         Args:
             reason: What cuts the running episode short, if there is one.
             gives_up: Asked now and then while the disk takes its time: whether to leave what it
-                has not taken, which `recover_episodes` completes.
+                has not taken, which `fetch_hand_sim episodes recover` completes.
         """
         self._end(reason)
         self._backlog.close()

@@ -15,8 +15,12 @@ from typing import IO
 import rclpy
 from rclpy.node import Node
 
-from fetch_hand_sim.commands.executables import is_actor_shipped
-from fetch_hand_sim.commands.node_processes import open_log, start_nodes, stop_node
+from fetch_hand_sim.commands.node_processes import (
+    is_actor_shipped,
+    open_log,
+    start_nodes,
+    stop_node,
+)
 from fetch_hand_sim.view.guard import Attendance
 from fetch_hand_sim.view.live import LiveRobot
 from fetch_hand_sim.view.page.page import Page

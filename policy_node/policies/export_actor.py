@@ -1,4 +1,4 @@
-"""`export_actor`: writes an actor as an ONNX file, with normalisation and metadata."""
+"""Write an actor as an ONNX file, with normalisation and metadata."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from node_runtime.command_line import (
 )
 from policy_node.policies.shipped import actor_path
 
-_NAME = 'export_actor'
+_NAME = 'fetch_hand_sim export'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Actors as ONNX files: written by `export_actor`, run without torch.
+"""Actors as ONNX files: written by `fetch_hand_sim export`, run without torch.
 
 The graph takes `observation` (n, observation size) and `desired_goal` (n, goal size), float32, in
 the units of the task, normalisation included, and returns `action` (n, action size) in [-1, 1]. The

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from msgs_spec.text import did_you_mean
 
-# What a run of `train_her` leaves, and how the files of actors end.
+# What a run of `fetch_hand_sim train` leaves, and how the files of actors end.
 _BEST_OF_A_RUN = 'best.safetensors'
 _ENDINGS = ('.safetensors', '.onnx', '.zip')
 

@@ -1,4 +1,4 @@
-"""`evaluate_policy`: success of an actor over many fresh episodes, as table, JSON and CSV."""
+"""Measure the success rate of a policy over many new episodes; write table, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from policy_node.training.policy_options import (
     require_writable,
 )
 
-_NAME = 'evaluate_policy'
+_NAME = 'fetch_hand_sim evaluate'
 # What `--json` without a file means.
 _STDOUT = Path('-')
 

@@ -1,4 +1,4 @@
-"""`generate_episodes`: logs episodes of an actor in the batched simulation, without ROS.
+"""Log episodes of a policy in the batched simulation, without ROS.
 
 The files are byte-compatible with those of `sim_node`. The same command line gives the same
 messages.
@@ -42,7 +42,7 @@ from policy_node.training.policy_options import (
     make_chosen_simulation,
 )
 
-_NAME = 'generate_episodes'
+_NAME = 'fetch_hand_sim episodes generate'
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -26,7 +26,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_batch_options(parser, num_envs=100)
     add = parser.add_argument
-    add('run', type=Path, help='output folder of train_her')
+    add('run', type=Path, help='output folder of fetch_hand_sim train')
     add('--checkpoint', default='best.safetensors', help='file in the run; default: %(default)s')
     add('--actors', type=Path, default=ACTORS, help='where to; default: the package')
     return parser.parse_args(arguments)

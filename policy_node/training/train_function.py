@@ -1,4 +1,4 @@
-"""`train`: what `train_her` does, as a function."""
+"""The function `train`: `fetch_hand_sim train` for Python."""
 
 from __future__ import annotations
 

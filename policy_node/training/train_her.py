@@ -1,4 +1,4 @@
-"""`train_her`: trains an actor with DDPG and hindsight experience replay."""
+"""Train a policy with DDPG and hindsight experience replay."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from policy_node.training.replay.episode_replay import Episodes
 
 
-_NAME = 'train_her'
+_NAME = 'fetch_hand_sim train'
 # Fields that say which recipe there is to start from.
 _OWN_OPTIONS = ('task', 'recipe')
 # A process that a signal ended returns 128 + its number, as shells say it.
@@ -44,7 +44,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(
         prog=_NAME,
         description=__doc__,
-        epilog='Several workers: torchrun --nproc-per-node N -m policy_node.training.train_her ...',
+        epilog='Several workers: torchrun --nproc-per-node N -m fetch_hand_sim train ...',
     )
     add = parser.add_argument
     add('--task', choices=list(TASKS), metavar='TASK', help=', '.join(TASKS))

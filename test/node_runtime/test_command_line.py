@@ -160,7 +160,7 @@ def test_a_full_output_is_one_line():
     [
         ['fetch_hand_sim', '--print-completion', 'bash'],
         ['fetch_hand_sim', '--version'],
-        ['fetch_hand_sim.commands.list_episodes', '--help'],
+        ['fetch_hand_sim', 'episodes', 'list', '--help'],
         ['fetch_hand_sim.sim_node', '--help'],
     ],
 )

@@ -45,7 +45,7 @@ def test_the_demo_logs_episodes_and_stops_in_order(
     assert row[:4] == ['0', '0', '50', '-50']
     demo.send_signal(number)
     output, errors = demo.communicate(timeout=30)
-    assert (demo.returncode, errors) == (code, 'demo: stopping\n')
+    assert (demo.returncode, errors) == (code, 'fetch_hand_sim demo: stopping\n')
     assert 'FetchReach: ' in output and 'episodes succeeded' in output
     paths = sorted((tmp_path / directory).iterdir())
     assert read_summary(paths[0]).is_complete
@@ -88,8 +88,8 @@ def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path)
     code, output = finish(start_process(*command, '--episodes', '1', cwd=tmp_path), timeout=60.0)
     assert code == 1
     assert output == (
-        f'demo: {who} in / runs already and would take part: end that first, or choose another '
-        'ROS_DOMAIN_ID\n'
+        f'fetch_hand_sim demo: {who} in / runs already and would take part: end that first, or '
+        'choose another ROS_DOMAIN_ID\n'
     )
 
 

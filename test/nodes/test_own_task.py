@@ -61,9 +61,9 @@ def test_the_policys_side_reads_it_without_mujoco(site: Path) -> None:
 def test_the_pages_command_lines_are_understood(site: Path) -> None:
     page = (ROOT / 'docs' / 'own_task.md').read_text()
     lines = [words for line in shell_lines(page) for words in commands(line)]
-    (training,) = [words for words in lines if words[0] == 'train_her']
+    (training,) = [words for words in lines if words[:2] == ['fetch_hand_sim', 'train']]
     # What comes before `--help` is checked before it.
-    result = run(site, '-m', 'policy_node.training.train_her', *training[1:], '--help')
+    result = run(site, '-m', *training, '--help')
     assert result.returncode == 0, result.stderr
     (node,) = [words for words in lines if words[0] == 'sim_node']
     assert node[1:] == ros_args(task=TASK)
@@ -98,7 +98,7 @@ def test_it_is_shown(site: Path) -> None:
 
 ANOTHER_REWARD = """
 import gymnasium, numpy as np
-from fetch_hand_sim.commands.main import main
+from fetch_hand_sim.__main__ import main
 from fetch_hand_sim.view.page.robot_panel import introduction
 from msgs_spec.tasks import task_spec
 
@@ -200,7 +200,7 @@ def test_it_is_trained_run_by_the_nodes_logged_checked_and_replayed(
     )
     code, output = finish(start_process(*SIM_NODE, *arguments, env=os_environment), timeout=60.0)
     assert code == 0, output
-    checked = run(site, '-m', 'fetch_hand_sim.commands.check_episode', tmp_path / 'episodes')
+    checked = run(site, '-m', 'fetch_hand_sim', 'episodes', 'check', tmp_path / 'episodes')
     assert checked.returncode == 0, checked.stdout + checked.stderr
 
     (episode,) = episodes_in(tmp_path / 'episodes')

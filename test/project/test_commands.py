@@ -1,4 +1,4 @@
-"""All commands, as installed: one exit code for one kind of failure, no traceback for anybody."""
+"""Every command: names, help, exit codes, and errors of one line."""
 
 from __future__ import annotations
 
@@ -12,45 +12,56 @@ from importlib.metadata import distribution
 
 import pytest
 
-from fetch_hand_sim.commands.executables import executable, find_executable
+from fetch_hand_sim.__main__ import main
+from fetch_hand_sim.commands.node_processes import executable
 from node_runtime.command_line import EXTRAS
 from support import script_environment
-from support.entry_points import console_scripts, started_as_modules
+from support.entry_points import console_scripts, leaves, started_as_modules
 
-NODES = {'sim_node', 'policy_node', 'replay_node', 'visualization_node'}
-# What each executable needs beyond the base installation.
+# What each command needs beyond the base installation.
 NEEDS = {
-    'sim_node': ['rclpy'],
-    'policy_node': ['rclpy'],
-    'replay_node': ['rclpy'],
+    'sim': ['rclpy'],
+    'policy': ['rclpy'],
+    'replay': ['rclpy'],
+    'visualize': ['rclpy'],
     'view': ['rclpy'],
-    'visualization_node': ['rclpy'],
-    'render_episode': [],
-    'evaluate_policy': [],
-    'generate_episodes': [],
-    'train_her': ['torch', 'matplotlib', 'tensorboard'],
+    'demo': ['rclpy'],
+    'train': ['torch', 'matplotlib', 'tensorboard'],
+    'evaluate': [],
+    'robustness': ['torch', 'matplotlib', 'tensorboard'],
     'benchmark': ['torch', 'matplotlib', 'tensorboard'],
-    'export_actor': ['torch', 'onnx', 'onnxscript'],
-    'export_episodes': ['pyarrow', 'minari'],
-    'fetch_hand_sim': [],
-    'list_episodes': [],
-    'check_episode': [],
-    'recover_episodes': [],
+    'export': ['torch', 'onnx', 'onnxscript'],
+    'episodes list': [],
+    'episodes check': [],
+    'episodes film': [],
+    'episodes recover': [],
+    'episodes export': ['pyarrow', 'minari'],
+    'episodes generate': [],
 }
+NODES = {'sim': 'sim_node', 'policy': 'policy_node', 'replay': 'replay_node'} | {
+    'visualize': 'visualization_node'
+}
+
+
+def shown_name(command: str) -> str:
+    """The name that starts the error lines of a command."""
+    if command == 'view':
+        return command
+    return NODES.get(command, f'fetch_hand_sim {command}')
 
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    """Runs an executable through its entry point; returns exit code, stdout and stderr.
+    """Run a command in this process, because most of them load torch.
 
-    In this process, because most of them load torch.
+    Returns exit code, stdout and stderr.
     """
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    monkeypatch.setattr(sys, 'argv', [])
 
     def call(name: str, *arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, 'argv', [name, *map(str, arguments)])
         try:
-            code = find_executable(name).load()()
+            code = main([*name.split(), *map(str, arguments)])
         except SystemExit as exit_:
             code = exit_.code
         return code, *capsys.readouterr()
@@ -60,8 +71,12 @@ def run(monkeypatch, capsys):
         signal.signal(number, handler)
 
 
-def test_every_executable_says_what_it_needs():
-    assert set(console_scripts()) == set(NEEDS)
+def test_every_command_is_in_the_table_of_extras():
+    assert {' '.join(path) for path, _ in leaves()} == set(NEEDS)
+
+
+def test_executables_are_the_nodes_view_and_one_for_all_commands():
+    assert set(console_scripts()) == {'fetch_hand_sim', 'view', *NODES.values()}
 
 
 @pytest.mark.parametrize(
@@ -70,10 +85,10 @@ def test_every_executable_says_what_it_needs():
 def test_a_missing_extra_is_one_line_that_says_what_to_install(name, module, run, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     to = 'minari' if module == 'minari' else 'parquet'
-    required = ['x', '--to', to, '--output', 'x'] if name == 'export_episodes' else []
+    required = ['x', '--to', to, '--output', 'x'] if name == 'episodes export' else []
     code, output, error = run(name, *required)
     assert (code, output) == (2, '')
-    line = rf"{name}: {module} missing: .*pip install 'fetch_hand_sim\[\w+\]'\n"
+    line = rf"{shown_name(name)}: {module} missing: .*pip install 'fetch_hand_sim\[\w+\]'\n"
     assert re.fullmatch(line, error)
 
 
@@ -103,7 +118,7 @@ for module in {modules!r}:
 
 def test_modules_without_any_extra_end_without_traceback(tmp_path):
     modules = started_as_modules()
-    assert len(modules) > 15 and 'policy_node.training.train_her' in modules
+    assert len(modules) > 10 and 'policy_node.training.train_her' in modules
     extras = sorted({module for needed in EXTRAS.values() for module in needed})
     code = WITHOUT_EXTRAS.format(extras=extras, modules=modules)
     command = [sys.executable, '-c', code]
@@ -118,35 +133,46 @@ def test_modules_without_any_extra_end_without_traceback(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize('name', sorted(set(NEEDS) - NODES))
-def test_help_is_there(name, run):
+@pytest.mark.parametrize('name', sorted(set(NEEDS) - set(NODES)))
+def test_every_command_has_help(name, run):
     code, output, error = run(name, '--help')
     assert (code, error) == (0, '')
-    assert f'usage: {name}' in output
+    assert f'usage: {shown_name(name)} [-h]' in output
+
+
+def test_help_loads_no_large_library():
+    code = (
+        'import sys\nfrom fetch_hand_sim.__main__ import main\n'
+        'try: main(sys.argv[1:])\nexcept SystemExit: pass\n'
+        "sys.exit(bool({'torch', 'rclpy', 'pyarrow', 'matplotlib'} & set(sys.modules)))"
+    )
+    for words in ([], ['train'], ['evaluate'], ['episodes', 'list'], ['demo']):
+        command = [sys.executable, '-c', code, *words, '--help']
+        assert subprocess.run(command, stdout=subprocess.DEVNULL).returncode == 0, words
 
 
 @pytest.mark.parametrize(
     ('name', 'arguments'),
     [
-        ('evaluate_policy', ['--policy', 'nosuch']),
-        ('generate_episodes', ['--policy', 'nosuch', '--output', 'x']),
-        ('export_actor', ['nosuch', 'x.onnx']),
-        ('export_actor', ['FetchReach', 'nosuch.txt']),
-        ('train_her', ['--task', 'FetchReach', '--set', 'nosuch=1']),
-        ('list_episodes', ['nosuch']),
+        ('evaluate', ['--policy', 'nosuch']),
+        ('episodes generate', ['--policy', 'nosuch', '--output', 'x']),
+        ('export', ['nosuch', 'x.onnx']),
+        ('export', ['FetchReach', 'nosuch.txt']),
+        ('train', ['--task', 'FetchReach', '--set', 'nosuch=1']),
+        ('episodes list', ['nosuch']),
         ('view', ['nosuch']),
-        ('render_episode', ['nosuch', '--out', 'x.png']),
-        ('render_episode', ['x', '--out', 'x.nosuch']),
-        ('check_episode', ['nosuch']),
-        ('recover_episodes', ['nosuch']),
-        ('export_episodes', ['nosuch', '--to', 'parquet', '--output', 'x']),
+        ('episodes film', ['nosuch', '--out', 'x.png']),
+        ('episodes film', ['x', '--out', 'x.nosuch']),
+        ('episodes check', ['nosuch']),
+        ('episodes recover', ['nosuch']),
+        ('episodes export', ['nosuch', '--to', 'parquet', '--output', 'x']),
     ],
 )
 def test_what_is_not_there_is_bad_usage_in_one_line(name, arguments, run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, output, error = run(name, *arguments)
     assert (code, output) == (2, '')
-    assert re.fullmatch(rf'{name}: .*nosuch.*\n', error)
+    assert re.fullmatch(rf'{shown_name(name)}: .*nosuch.*\n', error)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -154,39 +180,51 @@ def test_what_is_not_there_is_bad_usage_in_one_line(name, arguments, run, tmp_pa
     ('name', 'arguments', 'line'),
     [
         (
-            'evaluate_policy',
+            'evaluate',
             ['--episodes', '0'],
             "--episodes: '0' given; allowed: whole numbers from 1",
         ),
         (
-            'evaluate_policy',
+            'evaluate',
             ['--first-seed', 'inf'],
             "'inf' given; allowed: whole numbers 0 ... 4294967295",
         ),
         ('benchmark', ['--jobs', '0'], "--jobs: '0' given; allowed: whole numbers from 1"),
         (
-            'generate_episodes',
+            'episodes generate',
             ['--first-seed', '9223372036854775808'],
             'allowed: whole numbers 0 ... 4294967295',
         ),
-        ('generate_episodes', [], 'the following arguments are required: --output'),
-        ('list_episodes', ['--nosuch'], 'the following arguments are required: directory'),
-        ('train_her', ['--set', 'seed=1', 'gamma=.9'], 'a --set of its own: --set gamma=.9'),
+        ('episodes generate', [], 'the following arguments are required: --output'),
+        ('episodes list', ['--nosuch'], 'the following arguments are required: directory'),
+        ('train', ['--set', 'seed=1', 'gamma=.9'], 'a --set of its own: --set gamma=.9'),
         ('benchmark', ['--seeds', '0,1'], "'0,1' given; allowed: whole numbers with spaces"),
-        ('train_her', ['--nosuch', '\x1b[31m'], 'unrecognized arguments: --nosuch \\x1b[31m'),
+        (
+            'train',
+            ['--nosuch', '\x1b[31m'],
+            'unrecognized arguments: --nosuch \\x1b[31m',
+        ),
     ],
 )
 def test_bad_usage_is_one_line(name, arguments, line, run):
     code, output, error = run(name, *arguments)
     assert (code, output) == (2, '')
-    assert error.startswith(f'{name}: ') and line in error and error.count('\n') == 1
+    assert error.startswith(f'{shown_name(name)}: ') and line in error and error.count('\n') == 1
 
 
 def test_ctrl_c_in_an_evaluation_keeps_what_is_finished():
     arguments = ['--policy', 'resting', '--task', 'FetchReach', '--episodes', '1000000']
     terminal, end = pty.openpty()
     process = subprocess.Popen(
-        [*executable('evaluate_policy'), *arguments, '--num-envs', '4', '--threads', '1'],
+        [
+            *executable('fetch_hand_sim'),
+            'evaluate',
+            *arguments,
+            '--num-envs',
+            '4',
+            '--threads',
+            '1',
+        ],
         stdout=subprocess.PIPE,
         stderr=end,
         text=True,
@@ -200,7 +238,7 @@ def test_ctrl_c_in_an_evaluation_keeps_what_is_finished():
     shown += os.read(terminal, 65536)
     os.close(terminal)
     assert process.returncode == 130
-    assert b'evaluate_policy: stopping' in shown and b'Traceback' not in shown
+    assert b'fetch_hand_sim evaluate: stopping' in shown and b'Traceback' not in shown
     assert re.search(r'FetchReach: resting, \d+ episodes', output)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -85,17 +86,18 @@ def test_a_module_that_has_hardly_begun(module):
 @pytest.mark.parametrize(
     ('name', 'words'),
     [
-        ('list_episodes', ['.']),
-        ('check_episode', ['.']),
+        ('fetch_hand_sim', ['episodes', 'list', '.']),
+        ('fetch_hand_sim', ['episodes', 'check', '.']),
         ('fetch_hand_sim', ['demo']),
-        ('train_her', ['--task', 'FetchReach', '--output', 'run']),
+        ('fetch_hand_sim', ['train', '--task', 'FetchReach', '--output', 'run']),
         ('view', ['--no-browser']),
     ],
 )
 @pytest.mark.parametrize('imports', [60, 200, 400])
 def test_a_command_at_any_moment(name, words, imports, programs, tmp_path):
     code, said = interrupt_in_time([programs / name, *words], imports)
-    assert (code, said) == (130, f'{name}: stopping\n')
+    assert code == 130
+    assert re.fullmatch(rf'{name}( [a-z]+)*: stopping\n', said)
 
 
 def test_a_program_of_somebody_else_keeps_its_own_answer(tmp_path):

@@ -22,8 +22,7 @@ import pytest
 import yaml
 from test_architecture import pages
 
-from fetch_hand_sim.commands.executables import find_executable
-from fetch_hand_sim.commands.main import main as fetch_hand_sim
+from fetch_hand_sim.__main__ import main as fetch_hand_sim
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.simulation import Simulation
@@ -135,8 +134,10 @@ def _run(name: str, rest: list[str]) -> None:
         _check_parameters(node, [part for word in rest[1:] for part in ('-p', word)])
     elif name == 'fetch_hand_sim':
         fetch_hand_sim(rest)
-    elif name != 'pip':
-        find_executable(name).load()()
+    elif name == 'view':
+        fetch_hand_sim([name, *rest])
+    else:
+        assert name == 'pip', name
 
 
 def _check_make(words: list[str]) -> None:
@@ -193,7 +194,10 @@ def _run_python(words: list[str]) -> None:
             assert all((ROOT / word).exists() for word in rest if not word.startswith('-'))
             return
         sys.argv = [module, *rest]
-        import_module(module).main()
+        if module == 'fetch_hand_sim':
+            fetch_hand_sim(rest)
+        else:
+            import_module(module).main()
     elif (ROOT / words[0]).is_file():
         script = compile((ROOT / words[0]).read_text(), words[0], 'exec')
         sys.argv = words
@@ -219,7 +223,8 @@ def test_command_lines_are_understood(page, understand):
     'line',
     [
         'make nosuchtarget',
-        'train_her --taks FetchPush',
+        'train_her --task FetchPush',
+        'fetch_hand_sim train --taks FetchPush',
         'ros2 run fetch_hand_sim sim_node --ros-args -p tsak:=FetchPush',
         'ros2 run fetch_hand_sim sim_node --ros-args -p task:=NoSuchTask',
         'ros2 topic hz /joint_state',

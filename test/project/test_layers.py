@@ -24,6 +24,8 @@ FORBIDDEN = {
     'msgs_spec': ('node_runtime', *ABOVE_RUNTIME),
     'node_runtime': ABOVE_RUNTIME,
     'fetch_hand_sim': ('policy_node', 'torch', 'safetensors'),
+    # Its table names the modules of all commands and imports none of them.
+    'fetch_hand_sim.__main__': ('torch', 'safetensors'),
     'policy_node': ('fetch_hand_sim', TRAINING, 'mujoco', 'gymnasium', 'gymnasium_robotics'),
     TRAINING: (),
 }

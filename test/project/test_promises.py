@@ -8,7 +8,7 @@ from importlib.metadata import distribution
 
 from gymnasium.envs.registration import registry
 
-from fetch_hand_sim.commands.main import COMMANDS, Command
+from fetch_hand_sim.__main__ import COMMANDS, Command
 from fetch_hand_sim.gym_envs.registration import reference_ids
 from msgs_spec.parameters import NODES
 from msgs_spec.services import SERVICES

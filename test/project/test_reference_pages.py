@@ -31,7 +31,9 @@ def test_the_recipes_are_those_that_train() -> None:
 
 def test_a_command_is_shown_with_what_it_prints() -> None:
     assert ('episodes', 'list') in dict(TOOL['leaves'](TOOL['COMMANDS']))
-    assert TOOL['help_of'](('episodes', 'list')).startswith('usage: list_episodes [-h]')
+    assert TOOL['help_of'](('episodes', 'list')).startswith(
+        'usage: fetch_hand_sim episodes list [-h]'
+    )
 
 
 def constructors() -> Iterator[tuple[str, str]]:

@@ -1,11 +1,11 @@
-"""Makes episode files with right checksums and wrong meaning and gives them to all that reads them.
+"""Give every reader of episodes files with valid checksums and invalid content.
 
     python test/support/crafted_files.py EPISODE COUNT SEED
 
-Every file is whole: lengths, CRCs, indexes and summary are right, what they say is not. It lies in
-a directory of episodes, as a bag or as what a killed robot left, and goes through the command lines
-`list_episodes`, `check_episode`, `recover_episodes` and `export_episodes`, the schedule of
-`replay_node` and `load_episodes`. Each has to end with exit code 0, 1 or 2, in lines without
+Lengths, CRCs, indexes and summary of every file are valid; the content is not. The file lies in a
+folder of episodes, as a bag or as the leftover of a killed simulator node. The readers are
+`fetch_hand_sim episodes list`, `check`, `recover` and `export`, the schedule of `replay_node` and
+`load_episodes`. Each has to end with exit code 0, 1 or 2, in lines without
 control characters, within CPU_SECONDS of processor time and MEMORY_BYTES of memory, and nothing may
 be written outside of the directory. Prints a JSON object with outcomes and costs; ends with 1 at
 the first file that breaks a rule, which is kept in the temporary directory.
@@ -32,10 +32,10 @@ import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
 from fetch_hand_sim.commands import (
-    check_episode,
-    export_episodes,
-    list_episodes,
-    recover_episodes,
+    episodes_check,
+    episodes_export,
+    episodes_list,
+    episodes_recover,
 )
 from fetch_hand_sim.episode_log import EpisodeReadError, load_episodes, read_episode
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
@@ -400,12 +400,12 @@ class Attack:
         self.episodes = root / 'a' / 'episodes'
         self.output = root / 'a' / 'output'
         self.tools = {
-            'list_episodes': lambda: self.command(list_episodes, self.episodes),
+            'episodes list': lambda: self.command(episodes_list, self.episodes),
             'load_episodes': lambda: load_episodes(self.episodes / 'x', on_skip=lambda _: None),
             'ReplaySchedule': lambda: ReplaySchedule(self.episodes / 'x'),
-            'check_episode': lambda: self.command(check_episode, self.episodes / 'x'),
-            'export_episodes': self.export,
-            'recover_episodes': lambda: self.command(recover_episodes, self.episodes),
+            'episodes check': lambda: self.command(episodes_check, self.episodes / 'x'),
+            'episodes export': self.export,
+            'episodes recover': lambda: self.command(episodes_recover, self.episodes),
         }
 
     def place(self, file: Path) -> None:
@@ -427,7 +427,7 @@ class Attack:
 
     def export(self) -> str:
         arguments = (self.episodes, '--to', 'parquet', '--output', self.output)
-        return self.command(export_episodes, *arguments)
+        return self.command(episodes_export, *arguments)
 
     def outcome(self, name: str) -> str:
         try:
@@ -463,12 +463,12 @@ def main() -> int:
         # Everything is imported and compiled before the limits begin.
         attack.place(next(source.glob('*.mcap')))
         assert {name: attack.outcome(name) for name in attack.tools} == {
-            'list_episodes': 'exit 0',
+            'episodes list': 'exit 0',
             'load_episodes': 'read',
             'ReplaySchedule': 'read',
-            'check_episode': 'exit 0',
-            'export_episodes': 'exit 0',
-            'recover_episodes': 'exit 0',
+            'episodes check': 'exit 0',
+            'episodes export': 'exit 0',
+            'episodes recover': 'exit 0',
         }
         expected = attack.outside()
         before, added = peak_memory(), 0

@@ -31,7 +31,7 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from fetch_hand_sim.commands import list_episodes
+from fetch_hand_sim.commands import episodes_list
 from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeReadError,
@@ -245,7 +245,7 @@ def _bag(content: dict[str, str], messages: list[bytes], random: np.random.Gener
 
 def _list(path: Path) -> object:
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as errors:
-        code = list_episodes.main([str(path.parent)])
+        code = episodes_list.main([str(path.parent)])
     if code:
         raise EpisodeReadError(errors.getvalue().strip())
     return read_summary(path)
@@ -267,7 +267,7 @@ READERS = {
     'read_episode': read_episode,
     'read_summary': read_summary,
     'load_episodes': load_episodes,
-    'list_episodes': _list,
+    'episodes list': _list,
     'ReplaySchedule': ReplaySchedule,
     'recover_episode': _recover,
 }

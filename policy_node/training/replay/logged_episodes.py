@@ -19,7 +19,7 @@ def read_experience(
     """Loads the episodes of a task that the trainer can learn from.
 
     Args:
-        directory: Where episodes were logged: by `sim_node`, `generate_episodes` or both.
+        directory: Episodes of `sim_node` or `fetch_hand_sim episodes generate`.
         task: The task; episodes of others are left out.
         control_hz: Action frequency, Hz; episodes at another are left out.
 

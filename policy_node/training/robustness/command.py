@@ -1,4 +1,4 @@
-"""`robustness`: success of a policy under ten disturbances at rising levels, and under the presets.
+"""Measure the success of a policy under ten disturbances at rising levels and under the presets.
 
 The result is a JSON file, a CSV file and a figure. A command that was interrupted goes on with the
 points that the JSON file lacks.
@@ -45,7 +45,7 @@ from policy_node.training.policy_options import (
 from policy_node.training.robustness.figure import draw
 from policy_node.training.robustness.sweeps import Point, points, sentence
 
-_NAME = 'robustness'
+_NAME = 'fetch_hand_sim robustness'
 # Settings that make the points of two results comparable.
 _SETTINGS = ('task', 'sha256', 'episodes', 'first_seed', 'control_hz')
 

@@ -76,7 +76,7 @@ class RunLog:
         logged = float(kept[-1]['env_steps']) if kept else 0.0
         if logged < resumed_steps and not quiet:
             complain(
-                'train_her',
+                'fetch_hand_sim train',
                 f'{self.path} has no rows from {logged:,.0f} to {resumed_steps:,} steps',
             )
         partial = self.path.with_name(f'.{self.path.name}.partial')

@@ -20,7 +20,7 @@ from policy_node.training.runs.run_folder import BEST_FILE, LATEST_FILE, RunFold
 from policy_node.training.runs.state_checks import is_finite
 from policy_node.training.runs.training_state import Counters
 
-NAME = 'train_her'
+NAME = 'fetch_hand_sim train'
 # Seconds between copies of the newest episodes beside the training state.
 REPLAY_SECONDS = 900.0
 

@@ -1,4 +1,4 @@
-"""`benchmark`: train whole studies as resumable jobs, on one machine or on Ray.
+"""`fetch_hand_sim benchmark`: train whole studies as resumable jobs, on one machine or on Ray.
 
 `--study paper`: the paper's comparison, DDPG with and without HER on sparse and dense rewards.
 Trains task x variant x seed, each in <output>/<task>/<variant>/seed<k>, draws success against steps
@@ -76,7 +76,7 @@ from policy_node.training.studies.workers import (
     run_jobs,
 )
 
-_NAME = 'benchmark'
+_NAME = 'fetch_hand_sim benchmark'
 ACTORS_TABLE = 'actors.md'
 # Studies without a page in docs/research.
 _OTHERS = ('paper', 'best')

@@ -131,7 +131,7 @@ def _try_to_report(when_finished: Callable[[], object]) -> None:
     try:
         when_finished()
     except (CommandError, OSError, ValueError) as error:
-        complain('benchmark', f'no report yet: {error}')
+        complain('fetch_hand_sim benchmark', f'no report yet: {error}')
 
 
 def _print(text: str) -> None:
@@ -166,7 +166,7 @@ def attempt(job: Job, report: Path, command: str) -> Outcome:
         _print(f'{job.name} is being trained by another process')
         return Outcome.TAKEN
     except (CommandError, OSError, ValueError) as error:
-        complain('benchmark', f'{job.name}: {error}')
+        complain('fetch_hand_sim benchmark', f'{job.name}: {error}')
         return Outcome.FAILED
     except Exception:
         # The other jobs go on.
@@ -224,7 +224,7 @@ class Processes:
         del frame
         if not self._stopped_by:
             text = 'stopping; jobs finish their cycle and save their state; once more stops at once'
-            complain_from_handler('benchmark', text)
+            complain_from_handler('fetch_hand_sim benchmark', text)
             self._stopped_by = number
         for _, process in self._running.values():
             process.terminate()
@@ -255,7 +255,7 @@ class Processes:
             # Every signal was passed on as SIGTERM.
             outcome = Outcome(128 + self._stopped_by)
         if outcome is Outcome.FAILED:
-            complain('benchmark', f'{job.name} failed; see {job.folder / LOG_FILE}')
+            complain('fetch_hand_sim benchmark', f'{job.name} failed; see {job.folder / LOG_FILE}')
         elif outcome is Outcome.TAKEN:
             _print(f'{job.name} is being trained by another process')
         return job, outcome
@@ -307,5 +307,5 @@ class Ray:
         try:
             return job, self._ray.get(done)
         except self._ray.exceptions.RayError as error:
-            complain('benchmark', f'{job.name}: {error}')
+            complain('fetch_hand_sim benchmark', f'{job.name}: {error}')
             return job, Outcome.FAILED

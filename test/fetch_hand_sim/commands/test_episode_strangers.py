@@ -16,10 +16,10 @@ import pytest
 from mcap.writer import Writer
 
 from fetch_hand_sim.commands import (
-    check_episode,
-    export_episodes,
-    list_episodes,
-    recover_episodes,
+    episodes_check,
+    episodes_export,
+    episodes_list,
+    episodes_recover,
 )
 from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
@@ -116,9 +116,9 @@ def test_a_bad_entry_hides_no_good_one(directory, make, capsys):
     make(directory)
     bad, good = find_leftovers(directory)
     assert bad.problem and not good.problem
-    assert list_episodes.main([str(directory)]) == 0
+    assert episodes_list.main([str(directory)]) == 0
     assert '1 episodes' in capsys.readouterr().out
-    assert recover_episodes.main([str(directory)]) == 1
+    assert episodes_recover.main([str(directory)]) == 1
     output = capsys.readouterr()
     assert 'recovered' in output.out
     assert_one_line_each(output.err, 1)
@@ -131,7 +131,7 @@ def test_a_bag_that_cannot_be_looked_into_hides_no_good_one(directory, capsys):
     # A name of the longest length: whatever is looked up in it is too long.
     (directory / 'loop').symlink_to(directory / 'loop')
     (directory / 'loop.mcap').symlink_to(directory / 'loop.mcap')
-    assert list_episodes.main([str(directory)]) == 1
+    assert episodes_list.main([str(directory)]) == 1
     output = capsys.readouterr()
     assert '1 episodes' in output.out
     assert_one_line_each(output.err, 1)
@@ -196,7 +196,7 @@ def test_quality_of_service_of_a_stranger_is_bounded(tmp_path, quality, capsys):
         writer.flush()
     before = sorted((path.name, path.stat().st_size) for path in leftover.iterdir())
     began = time.process_time()
-    assert recover_episodes.main([str(tmp_path)]) == 1
+    assert episodes_recover.main([str(tmp_path)]) == 1
     assert time.process_time() - began < 2.0
     error = capsys.readouterr().err
     assert_one_line_each(error, 1)
@@ -226,7 +226,7 @@ def test_a_file_without_statistics_hides_no_good_one(directory, capsys):
     (directory / 'bare.mcap').write_bytes(without(data, opcode=11))
     with pytest.raises(EpisodeReadError, match='no statistics'):
         read_summary(directory / 'bare.mcap')
-    assert list_episodes.main([str(directory)]) == 1
+    assert episodes_list.main([str(directory)]) == 1
     output = capsys.readouterr()
     assert '1 episodes' in output.out and 'no statistics' in output.err
     # Its messages are whole.
@@ -243,7 +243,7 @@ def test_an_episode_without_messages_cannot_be_replayed(tmp_path):
         writer.finish()
     with pytest.raises(EpisodeReadError, match='an episode without messages'):
         ReplaySchedule(path)
-    assert check_episode.main([str(path)]) == 2
+    assert episodes_check.main([str(path)]) == 2
 
 
 # Paths
@@ -263,13 +263,13 @@ def test_names_that_are_no_text_and_command_a_terminal(finished, tmp_path):
     (directory / 'text.mcap').write_text('no bag')
     parquet = ['--to', 'parquet', '--output', str(directory / 'out')]
     for command, arguments, code in (
-        ('list_episodes', [], 1),
-        ('recover_episodes', [], 0),
-        ('check_episode', [], 2),
-        ('export_episodes', parquet, 1),
+        ('list', [], 1),
+        ('recover', [], 0),
+        ('check', [], 2),
+        ('export', parquet, 1),
     ):
         run = subprocess.run(
-            [sys.executable, '-m', f'fetch_hand_sim.commands.{command}', directory, *arguments],
+            [sys.executable, '-m', 'fetch_hand_sim', 'episodes', command, directory, *arguments],
             capture_output=True,
             env=script_environment() | {'PYTHONIOENCODING': 'utf-8'},
         )
@@ -288,7 +288,7 @@ def test_what_macos_puts_beside_files_is_none_of_them(finished, tmp_path, capsys
     for file in (f'{NAME}/._{NAME}_0.mcap', f'{NAME}/._metadata.yaml', f'._{NAME}', '._alone.mcap'):
         (tmp_path / file).write_bytes(b'\0\5\x16\7')
     (tmp_path / 'alone' / '._x.mcap').write_bytes(b'\0\5\x16\7')
-    assert list_episodes.main([str(tmp_path)]) == check_episode.main([str(tmp_path)]) == 0
+    assert episodes_list.main([str(tmp_path)]) == episodes_check.main([str(tmp_path)]) == 0
     assert '2 episodes' in capsys.readouterr().out
     assert len(load_episodes(tmp_path)) == 2
 
@@ -307,7 +307,7 @@ def test_a_folder_that_may_not_be_read_is_said_to_be_that(finished, monkeypatch)
 
 
 def test_too_long_a_name_is_one_line(capsys):
-    for tool in (list_episodes, check_episode, recover_episodes):
+    for tool in (episodes_list, episodes_check, episodes_recover):
         assert tool.main(['x' * 5000]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
 
@@ -319,7 +319,7 @@ def test_too_long_a_name_is_one_line(capsys):
 def test_a_name_that_leads_elsewhere_creates_nothing(finished, tmp_path, name, capsys):
     output = tmp_path / 'a' / 'b' / 'datasets'
     arguments = [str(finished), '--to', 'minari', '--output', str(output), '--name', name]
-    assert export_episodes.main(arguments) in (1, 2)
+    assert episodes_export.main(arguments) in (1, 2)
     assert_one_line_each(capsys.readouterr().err, 1)
     assert list(tmp_path.iterdir()) == []
 
@@ -331,7 +331,7 @@ def test_a_dataset_keeps_the_name_it_is_given(finished, tmp_path, name, id, monk
     minari = pytest.importorskip('minari')
     monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path))
     arguments = [str(finished), '--to', 'minari', '--output', str(tmp_path), '--name', name]
-    assert export_episodes.main(arguments) == 0
+    assert episodes_export.main(arguments) == 0
     assert f'Minari dataset FetchReach/{id} in' in capsys.readouterr().out
     dataset = minari.load_dataset(f'FetchReach/{id}')
     assert dataset.spec.dataset_id == f'FetchReach/{id}' and dataset.total_steps == 50
@@ -346,7 +346,7 @@ def test_an_episode_without_a_step_is_left_out_of_a_dataset_by_name(tmp_path, ca
     recorder.write(writer, [replace(recorder.ticks()[0], command=None)])
     assert writer.finish({'success': 'false', 'return': '0.0'}) is not None
     arguments = [str(episodes.path), '--to', 'minari', '--output', str(tmp_path / 'data')]
-    assert export_episodes.main(arguments) == 1
+    assert episodes_export.main(arguments) == 1
     printed = capsys.readouterr()
     assert '1 episodes of FetchReach: Minari dataset FetchReach/logged-v0' in printed.out
     assert 'seed1: no step was taken, and Minari needs one' in printed.err
@@ -361,10 +361,10 @@ def test_an_export_has_the_episodes_that_a_list_has(finished, tmp_path, capsys):
     (directory / 'several').mkdir()
     for name in ('a.mcap', 'b.mcap'):
         shutil.copy(finished / f'{NAME}_0.mcap', directory / 'several' / name)
-    assert list_episodes.main([str(directory)]) == 1
+    assert episodes_list.main([str(directory)]) == 1
     listed = capsys.readouterr()
     output = ['--to', 'parquet', '--output', str(tmp_path / 'data')]
-    assert export_episodes.main([str(directory), *output]) == 1
+    assert episodes_export.main([str(directory), *output]) == 1
     exported = capsys.readouterr()
     assert '1 episodes' in listed.out and '1 episodes of FetchReach' in exported.out
     for text in (listed.err, exported.err):
@@ -380,7 +380,7 @@ def test_one_unfinished_episode_is_recovered_by_the_path_that_lists_give(
     leftover = directory / '.cut.active'
     if is_inside:
         monkeypatch.chdir(leftover)
-    assert recover_episodes.main(['.' if is_inside else str(leftover)]) == 0
+    assert episodes_recover.main(['.' if is_inside else str(leftover)]) == 0
     assert 'recovered' in capsys.readouterr().out
     assert not leftover.exists() and read_episode(directory / 'cut')
     assert [each.name for each in find_leftovers(directory)] == ['other']
@@ -389,7 +389,7 @@ def test_one_unfinished_episode_is_recovered_by_the_path_that_lists_give(
 def test_a_dry_run_says_by_its_code_what_cannot_be_recovered(directory, capsys):
     leave(directory, 'strange', b'').joinpath('notes.txt').write_text('hi')
     for options in (['--dry-run'], []):
-        assert recover_episodes.main([str(directory), *options]) == 1
+        assert episodes_recover.main([str(directory), *options]) == 1
         output = capsys.readouterr()
         assert 'no episode of a robot' in output.err and 'strange' in output.err
         assert_one_line_each(output.err, 1)

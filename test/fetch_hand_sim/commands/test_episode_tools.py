@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fetch_hand_sim.commands import check_episode, list_episodes, recover_episodes
+from fetch_hand_sim.commands import episodes_check, episodes_list, episodes_recover
 from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
     EpisodeLogError,
@@ -94,7 +94,7 @@ def rewrite(source, directory, change=lambda tick, name, data: data, result=None
     return writer.abort('test', {'steps': str(last - 1)})
 
 
-# generate_episodes and check_episode
+# fetch_hand_sim episodes generate and fetch_hand_sim episodes check
 
 
 def test_generated_episodes_are_those_of_one_robot(generated):
@@ -259,14 +259,14 @@ def test_the_fingerprint_of_a_log_of_1_0_is_known_too(tmp_path, monkeypatch):
 
 
 def test_check_episode_codes(reach, tmp_path, capsys):
-    assert check_episode.main([str(reach)]) == 0
+    assert episodes_check.main([str(reach)]) == 0
     assert capsys.readouterr().out.count('identical, 51 ticks') == 3
     changed = rewrite(min(reach.iterdir()), tmp_path, flip('reward', 5, -1))
-    assert check_episode.main([str(changed), str(reach)]) == 1
+    assert episodes_check.main([str(changed), str(reach)]) == 1
     assert 'differs at tick 5 (1.200 s), reward.data' in capsys.readouterr().out
-    assert check_episode.main([str(tmp_path / 'missing')]) == 2
+    assert episodes_check.main([str(tmp_path / 'missing')]) == 2
     (tmp_path / 'empty').mkdir()
-    assert check_episode.main([str(tmp_path / 'empty')]) == 2
+    assert episodes_check.main([str(tmp_path / 'empty')]) == 2
     assert all(len(line) < 300 for line in capsys.readouterr().err.splitlines())
 
 
@@ -366,11 +366,11 @@ def test_one_bad_file_does_not_hide_the_others(reach, tmp_path):
     assert len(skipped) == 1
 
 
-# list_episodes and recover_episodes
+# fetch_hand_sim episodes list and fetch_hand_sim episodes recover
 
 
 def test_list_shows_what_the_files_say(reach, capsys):
-    assert list_episodes.main([str(reach)]) == 0
+    assert episodes_list.main([str(reach)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 5
     for index, line in enumerate(lines[1:4]):
@@ -386,10 +386,10 @@ def test_list_calls_episodes_as_their_folders_and_names_those_below(reach, tmp_p
     name = f'FetchReach_{0:06d}_seed11'
     for copy in ('kept', 'kept too'):
         shutil.copytree(reach / name, tmp_path / 'day 1' / copy)
-    assert list_episodes.main([str(tmp_path / 'day 1')]) == 0
+    assert episodes_list.main([str(tmp_path / 'day 1')]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split('  ')[0] for line in lines[1:3]] == ['kept', 'kept too']
-    assert list_episodes.main([str(tmp_path)]) == 0
+    assert episodes_list.main([str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == f'there are some in {tmp_path / "day 1"}'
 
@@ -398,7 +398,7 @@ def test_a_narrow_terminal_wraps_names_and_numbers_instead_of_cutting_them(
     reach, monkeypatch, capsys
 ):
     monkeypatch.setenv('COLUMNS', '40')
-    assert list_episodes.main([str(reach)]) == 0
+    assert episodes_list.main([str(reach)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[1:-1]] == sorted(
         path.name for path in reach.iterdir()
@@ -410,7 +410,7 @@ def test_a_leftover_beside_its_finished_episode_is_called_a_copy(reach, tmp_path
     source = sorted(reach.iterdir())[0]
     shutil.copytree(source, tmp_path / source.name)
     cut_off(source, tmp_path, 60_000)
-    assert recover_episodes.main([str(tmp_path)]) == 1
+    assert episodes_recover.main([str(tmp_path)]) == 1
     error = capsys.readouterr().err
     assert f'if .{source.name}.active is an older copy of it, remove that' in error
 
@@ -444,7 +444,7 @@ def test_list_filters(reach, tmp_path, capsys):
             writer.finish({'success': 'true', 'steps': '1', 'return': '-1.0'})
 
     def names(*options):
-        assert list_episodes.main([str(directory), *options]) == 0
+        assert episodes_list.main([str(directory), *options]) == 0
         table = capsys.readouterr().out.splitlines()[1:-1]
         return [line.split()[0] for line in table]
 
@@ -473,7 +473,7 @@ def test_list_names_and_skips_what_it_cannot_read(reach, tmp_path, capsys):
     (directory / 'notes.txt').write_text('not an episode and no claim to be one')
     (directory / 'hollow').mkdir()
     (directory / 'hollow' / 'metadata.yaml').touch()
-    assert list_episodes.main([str(directory)]) == 1
+    assert episodes_list.main([str(directory)]) == 1
     output = capsys.readouterr()
     assert '2 episodes' in output.out
     named = [line for line in output.err.splitlines() if 'skipped' in line]
@@ -488,7 +488,7 @@ def test_list_shows_no_control_characters_of_a_file(tmp_path, capsys):
     spec = topic(task_spec('FetchReach'), '/clock')
     writer.write(spec, TopicCodec(spec).encode(0, []), 1)
     writer.finish({'success': '\x9b', 'return': 'nan', 'steps': '\n'})
-    assert list_episodes.main([str(tmp_path)]) == 0
+    assert episodes_list.main([str(tmp_path)]) == 0
     output = capsys.readouterr().out
     assert '[red]1[/red]' in output
     assert output.isascii() and all(c.isprintable() or c == '\n' for c in output)
@@ -501,14 +501,14 @@ def test_what_one_file_says_at_length_leaves_room_for_the_others(reach, tmp_path
     spec = topic(task_spec('FetchReach'), '/clock')
     writer.write(spec, TopicCodec(spec).encode(0, []), 1)
     writer.finish({'complete': 'false', 'reason': 'z' * 400})
-    assert list_episodes.main([str(directory)]) == 0
+    assert episodes_list.main([str(directory)]) == 0
     lines = capsys.readouterr().out.splitlines()
     names = {path.name for path in reach.iterdir()}
     assert names <= {line.split()[0] for line in lines}
 
 
 def test_usage_errors_exit_with_2(tmp_path, capsys):
-    for tool in (list_episodes, recover_episodes):
+    for tool in (episodes_list, episodes_recover):
         assert tool.main([str(tmp_path / 'missing')]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert 'missing' in line
@@ -534,10 +534,10 @@ def test_recover_makes_bags_of_leftovers_and_says_which_it_cannot(reach, tmp_pat
     cut_off(sources[1], tmp_path, 2000)
     damaged = cut_off(sources[2], tmp_path, size) / f'{sources[2].name}_0.mcap'
     damaged.write_bytes(bytes(100) + damaged.read_bytes()[100:])
-    assert recover_episodes.main([str(tmp_path), '--dry-run']) == 0
-    assert list_episodes.main([str(tmp_path)]) == 0
-    assert capsys.readouterr().out.count('recover_episodes makes a bag of it') == 3
-    assert recover_episodes.main([str(tmp_path)]) == 1
+    assert episodes_recover.main([str(tmp_path), '--dry-run']) == 0
+    assert episodes_list.main([str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count('fetch_hand_sim episodes recover makes a bag of it') == 3
+    assert episodes_recover.main([str(tmp_path)]) == 1
     output = capsys.readouterr()
     assert 'marked as interrupted' in output.out
     (line,) = [line for line in output.out.splitlines() if 'cleared away' in line]
@@ -552,7 +552,7 @@ def test_recover_makes_bags_of_leftovers_and_says_which_it_cannot(reach, tmp_pat
     (arrays,) = load_episodes(tmp_path / sources[0].name)
     assert len(arrays) == int(arrays.result['steps']) == result.ticks - 1
     assert float(arrays.result['return']) == arrays.rewards.sum()
-    assert recover_episodes.main([str(reach)]) == 0
+    assert episodes_recover.main([str(reach)]) == 0
 
 
 # Learning
@@ -595,7 +595,7 @@ def test_the_command_line_generates(tmp_path, capsys):
     arguments = ['--policy', 'random', '--task', 'FetchReach', '--output', str(tmp_path)]
     assert generate_episodes.main([*arguments, '--episodes', '2', '--threads', '1']) == 0
     assert '2 episodes of FetchReach' in capsys.readouterr().out
-    assert list_episodes.main([str(tmp_path), '--complete']) == 0
+    assert episodes_list.main([str(tmp_path), '--complete']) == 0
     assert generate_episodes.main(['--policy', 'random', '--output', str(tmp_path)]) == 2
     assert 'random needs a task' in capsys.readouterr().err
     assert generate_episodes.main([*arguments, '--episodes', '3', '--threads', '1']) == 0

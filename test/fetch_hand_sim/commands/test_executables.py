@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from fetch_hand_sim.commands.executables import (
+from fetch_hand_sim.commands.node_processes import (
     UnknownExecutableError,
     executable,
     find_executable,
@@ -18,7 +18,7 @@ from fetch_hand_sim.commands.executables import (
 
 
 def test_an_executable_runs_with_its_arguments_and_exit_code(tmp_path):
-    command = [*executable('list_episodes'), tmp_path]
+    command = [*executable('fetch_hand_sim'), 'episodes', 'list', tmp_path]
     result = subprocess.run(command, capture_output=True, text=True)
     assert (result.returncode, result.stderr) == (0, '')
     assert result.stdout.startswith('0 episodes')
@@ -29,7 +29,7 @@ def test_an_executable_runs_with_its_arguments_and_exit_code(tmp_path):
 def test_python_files_of_the_working_directory_are_not_run(tmp_path):
     for name in ('random', 'numpy', 'yaml'):
         (tmp_path / f'{name}.py').write_text('raise RuntimeError("not asked for")')
-    command = [*executable('list_episodes'), tmp_path]
+    command = [*executable('fetch_hand_sim'), 'episodes', 'list', tmp_path]
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert (result.returncode, result.stderr) == (0, '')
 
@@ -59,7 +59,7 @@ def test_an_rclpy_of_another_python_is_one_line(tmp_path):
 @pytest.mark.skipif(sys.platform != 'linux', reason='Linux tells of a parent that has ended')
 def test_an_executable_whose_parent_is_gone_does_not_start(tmp_path):
     for parent, code in ((os.getpid(), 0), (os.getppid(), -signal.SIGTERM)):
-        command = [*executable('list_episodes', parent), tmp_path]
+        command = [*executable('fetch_hand_sim', parent), 'episodes', 'list', tmp_path]
         assert subprocess.run(command, capture_output=True).returncode == code
 
 

@@ -1,51 +1,22 @@
-"""The one command: finds what it is asked for, passes the rest on, says what it does not know."""
+"""`fetch_hand_sim`: help, unknown commands, short ROS parameters, completion."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from importlib.metadata import distribution, version
+from importlib.metadata import version
 
 import pytest
 
-from fetch_hand_sim.commands.main import COMMANDS, main, ros_arguments
+from fetch_hand_sim.__main__ import COMMANDS, main, ros_arguments
 
 
-def leaves(commands=COMMANDS, path=()):
-    """Every command that runs something, with the words that name it."""
-    for name, command in commands.items():
-        if command.commands:
-            yield from leaves(command.commands, (*path, name))
-        else:
-            yield (*path, name), command
-
-
-def test_every_executable_has_a_command_and_every_command_its_executable():
-    named = [command.executable for _, command in leaves() if command.executable]
-    points = distribution('fetch_hand_sim').entry_points.select(group='console_scripts')
-    assert sorted([*named, 'fetch_hand_sim']) == sorted(points.names), (
-        'setup.py and COMMANDS in fetch_hand_sim/commands/main.py differ'
-    )
-
-
-@pytest.mark.parametrize(
-    'path', [path for path, each in leaves() if not each.is_node], ids=' '.join
-)
-def test_a_command_has_the_help_of_what_it_stands_for(path, capsys, monkeypatch):
-    monkeypatch.setattr(sys, 'argv', [])
-    with pytest.raises(SystemExit) as caught:
-        main([*path, '--help'])
-    assert caught.value.code == 0
-    assert 'usage: ' in (shown := capsys.readouterr().out)
-    assert 'fetch_hand_sim [-h]' not in shown
-
-
-def test_options_and_exit_code_are_those_of_the_executable(tmp_path, capsys, monkeypatch):
+def test_options_and_exit_code_of_a_subcommand(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sys, 'argv', [])
     assert main(['episodes', 'list', str(tmp_path), '--task', 'FetchPush']) == 0
     assert capsys.readouterr().out.startswith('0 episodes')
     assert main(['episodes', 'list', str(tmp_path / 'none')]) == 2
-    assert capsys.readouterr().err.startswith('list_episodes: ')
+    assert capsys.readouterr().err.startswith('fetch_hand_sim episodes list: ')
 
 
 @pytest.mark.parametrize('arguments', [[], ['--help'], ['episodes'], ['episodes', '--help']])

@@ -12,7 +12,7 @@ import sys
 import numpy as np
 import pytest
 
-from fetch_hand_sim.commands import export_episodes
+from fetch_hand_sim.commands import episodes_export
 from fetch_hand_sim.datasets.writing import move_all
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
 from policy_node.training import generate_episodes
@@ -32,7 +32,7 @@ def episodes(tmp_path_factory):
 def test_parquet_holds_every_value(episodes, tmp_path, capsys):
     parquet = pytest.importorskip('pyarrow.parquet')
     arguments = [str(episodes), '--to', 'parquet', '--output', str(tmp_path)]
-    assert export_episodes.main(arguments) == 0
+    assert episodes_export.main(arguments) == 0
     assert '2 episodes of FetchPush' in capsys.readouterr().out
     rows = parquet.read_table(tmp_path / f'{TASK}.parquet').to_pylist()
     about = parquet.read_table(tmp_path / f'{TASK}_episodes.parquet').to_pylist()
@@ -56,7 +56,7 @@ def test_parquet_holds_every_value(episodes, tmp_path, capsys):
         assert json.loads(about[index]['metadata']) == arrays.metadata
         said = json.loads(about[index]['result'])
         assert about[index]['return'] == float(said['return']), 'the last bit too'
-    assert export_episodes.main(arguments) == 1
+    assert episodes_export.main(arguments) == 1
     assert 'nothing is overwritten' in capsys.readouterr().err
 
 
@@ -65,7 +65,7 @@ def test_minari_holds_every_value_and_recovers_the_environment(episodes, tmp_pat
     pytest.importorskip('pyarrow')
     monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path))
     arguments = [str(episodes), '--to', 'minari', '--output', str(tmp_path)]
-    assert export_episodes.main(arguments) == 0
+    assert episodes_export.main(arguments) == 0
     dataset = minari.load_dataset(f'{TASK}/logged-v0')
     assert (dataset.total_episodes, dataset.total_steps) == (2, 100)
     for episode, arrays in zip(dataset.iterate_episodes(), load_episodes(episodes), strict=True):
@@ -92,7 +92,7 @@ def test_episodes_of_the_recovered_environment_are_as_long_as_those_logged(
     pytest.importorskip('pyarrow')
     monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path))
     path = Recorder('FetchReach', 50.0, timing=timing).record(EpisodeDirectory(tmp_path / 'logged'))
-    assert export_episodes.main([str(path), '--to', 'minari', '--output', str(tmp_path)]) == 0
+    assert episodes_export.main([str(path), '--to', 'minari', '--output', str(tmp_path)]) == 0
     dataset = minari.load_dataset('FetchReach/logged-v0')
     assert dataset.total_steps == steps
     description = dataset.storage.metadata['description']
@@ -112,7 +112,7 @@ def test_a_full_disk_leaves_nothing_that_stands_in_the_way(episodes, tmp_path, f
     code = (
         'import resource, sys\n'
         'resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n'
-        'from fetch_hand_sim.commands.export_episodes import main\n'
+        'from fetch_hand_sim.commands.episodes_export import main\n'
         'sys.exit(main(sys.argv[1:]))'
     )
     arguments = [str(episodes), '--to', format_, '--output', str(tmp_path)]
@@ -120,7 +120,7 @@ def test_a_full_disk_leaves_nothing_that_stands_in_the_way(episodes, tmp_path, f
     (line,) = run.stderr.splitlines()
     assert run.returncode == 1 and 'File too large' in line
     assert list(tmp_path.iterdir()) == []
-    assert export_episodes.main(arguments) == 0, capsys.readouterr()
+    assert episodes_export.main(arguments) == 0, capsys.readouterr()
     assert not [path for path in tmp_path.rglob('*') if path.name.startswith('.')]
 
 
@@ -141,10 +141,10 @@ def test_of_two_tasks_none_is_written_where_one_is_there(two_tasks, tmp_path, fo
     pytest.importorskip({'parquet': 'pyarrow', 'minari': 'minari'}[format_])
     (tmp_path / there).mkdir(parents=True)
     arguments = [str(two_tasks), '--to', format_, '--output', str(tmp_path)]
-    assert export_episodes.main(arguments) == 1
+    assert episodes_export.main(arguments) == 1
     assert [path.name for path in tmp_path.iterdir()] == [there.partition('/')[0]]
     (tmp_path / there).rmdir()
-    assert export_episodes.main(arguments) == 0
+    assert episodes_export.main(arguments) == 0
 
 
 @pytest.mark.parametrize('format_', ['parquet', 'minari'])
@@ -166,10 +166,10 @@ def test_of_two_tasks_none_is_written_where_there_is_no_room_for_both(
     arguments = [str(two_tasks), '--to', format_, '--output', str(tmp_path)]
     with monkeypatch.context() as patch:
         patch.setattr(library, write, once)
-        assert export_episodes.main(arguments) == 1
+        assert episodes_export.main(arguments) == 1
     assert 'No space left' in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-    assert export_episodes.main(arguments) == 0
+    assert episodes_export.main(arguments) == 0
 
 
 @pytest.mark.parametrize('format_', ['parquet', 'minari'])
@@ -181,7 +181,7 @@ def test_of_two_exports_at_once_one_writes_and_the_other_finds_it_there(
     write = {'parquet': 'write_table', 'minari': 'create_dataset_from_buffers'}[format_]
     library = pytest.importorskip(module)
     written, others = getattr(library, write), []
-    command = [sys.executable, '-m', 'fetch_hand_sim.commands.export_episodes', str(two_tasks)]
+    command = [sys.executable, '-m', 'fetch_hand_sim', 'episodes', 'export', str(two_tasks)]
     options = ['--to', format_, '--output', str(tmp_path)]
 
     def begin_another(*arguments, **more):
@@ -192,7 +192,7 @@ def test_of_two_exports_at_once_one_writes_and_the_other_finds_it_there(
         return written(*arguments, **more)
 
     monkeypatch.setattr(library, write, begin_another)
-    assert export_episodes.main([str(episodes), *options]) == 0
+    assert episodes_export.main([str(episodes), *options]) == 0
     (line,) = others[0].communicate()[1].splitlines()
     assert others[0].returncode == 1 and 'exists; nothing is overwritten' in line
     first = {'parquet': f'{TASK}.parquet', 'minari': TASK}[format_]
@@ -208,19 +208,19 @@ def test_a_minari_dataset_has_episodes_of_one_environment(tmp_path, monkeypatch,
     for control_hz in (25.0, 50.0, 25.0):
         Recorder('FetchReach', control_hz).record(logged)
     arguments = [str(tmp_path / 'logged'), '--output', str(tmp_path), '--to']
-    assert export_episodes.main([*arguments, 'minari']) == 1
+    assert episodes_export.main([*arguments, 'minari']) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert 'FetchReach_000001_seed0: control_hz 50.0, and 25.0 in ' in line
     dataset = minari.load_dataset('FetchReach/logged-v0')
     assert (dataset.total_episodes, dataset.total_steps) == (2, 100)
     # Tables say the rate of each.
-    assert export_episodes.main([*arguments, 'parquet']) == 0
+    assert episodes_export.main([*arguments, 'parquet']) == 0
 
 
 def test_a_dataset_name_that_no_disk_takes_is_one_line(episodes, tmp_path, capsys):
     pytest.importorskip('minari')
     arguments = [str(episodes), '--to', 'minari', '--output', str(tmp_path), '--name', 'x' * 300]
-    assert export_episodes.main(arguments) == 1
+    assert episodes_export.main(arguments) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert 'File name too long' in line
 
@@ -229,7 +229,7 @@ def test_of_two_tables_none_is_written_beside_one_that_is_there(episodes, tmp_pa
     pytest.importorskip('pyarrow')
     there = tmp_path / f'{TASK}_episodes.parquet'
     there.write_text('mine')
-    assert export_episodes.main([str(episodes), '--to', 'parquet', '--output', str(tmp_path)]) == 1
+    assert episodes_export.main([str(episodes), '--to', 'parquet', '--output', str(tmp_path)]) == 1
     assert f'{there.name} exists' in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [there] and there.read_text() == 'mine'
 
@@ -245,9 +245,9 @@ def test_minari_datasets_in_folders_of_folders_stand_beside_each_other(
     names = ('logged-v0', 'me/logged-v0', 'me/logged-v1')
     for name in names:
         arguments = [str(episodes), '--to', 'minari', '--output', 'minari', '--name', name]
-        assert export_episodes.main(arguments) == 0
+        assert episodes_export.main(arguments) == 0
     assert sorted(minari.list_local_datasets()) == [f'{TASK}/{name}' for name in names]
-    assert export_episodes.main(arguments) == 1
+    assert episodes_export.main(arguments) == 1
 
 
 @pytest.mark.parametrize(('format_', 'module'), [('parquet', 'pyarrow'), ('minari', 'minari')])
@@ -255,26 +255,26 @@ def test_a_missing_extra_is_one_line(episodes, tmp_path, format_, module):
     code = (
         'import sys\n'
         f'sys.modules[{module!r}] = None\n'
-        'from fetch_hand_sim.commands.export_episodes import main\n'
+        'from fetch_hand_sim.commands.episodes_export import main\n'
         'sys.exit(main(sys.argv[1:]))'
     )
     arguments = [episodes, '--to', format_, '--output', tmp_path / 'x']
     run = subprocess.run([sys.executable, '-c', code, *arguments], capture_output=True, text=True)
     assert run.returncode == 2
     (line,) = run.stderr.splitlines()
-    assert line.startswith(f'export_episodes: {module} missing: pip install')
+    assert line.startswith(f'fetch_hand_sim episodes export: {module} missing: pip install')
 
 
 def test_usage_errors(tmp_path, capsys):
     arguments = ['--to', 'parquet', '--output', str(tmp_path / 'x')]
-    assert export_episodes.main([str(tmp_path / 'missing'), *arguments]) == 2
-    assert export_episodes.main([str(tmp_path), *arguments]) == 2
+    assert episodes_export.main([str(tmp_path / 'missing'), *arguments]) == 2
+    assert episodes_export.main([str(tmp_path), *arguments]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 2
     with pytest.raises(SystemExit) as caught:
-        export_episodes.main([str(tmp_path), '--to', 'paper', '--output', 'x'])
+        episodes_export.main([str(tmp_path), '--to', 'paper', '--output', 'x'])
     assert caught.value.code == 2
     with pytest.raises(SystemExit):
-        export_episodes.main([str(tmp_path), *arguments, '--name', 'mine'])
+        episodes_export.main([str(tmp_path), *arguments, '--name', 'mine'])
     assert '--name is for --to minari, not parquet' in capsys.readouterr().err
 
 
@@ -287,9 +287,9 @@ def test_of_a_folder_only_what_is_asked_for_is_exported(episodes, tmp_path, monk
     recorder.write(writer, recorder.ticks()[:5])
     writer.abort('the robot stopped')
     arguments = [str(folder), '--to', 'minari', '--output', str(tmp_path / 'minari')]
-    assert export_episodes.main([*arguments, '--name', 'all']) == 0
+    assert episodes_export.main([*arguments, '--name', 'all']) == 0
     assert f'3 episodes, 1 of them interrupted, of {TASK}' in capsys.readouterr().out
-    assert export_episodes.main([*arguments, '--name', 'whole', '--complete']) == 0
+    assert episodes_export.main([*arguments, '--name', 'whole', '--complete']) == 0
     assert f'2 episodes of {TASK}' in capsys.readouterr().out
     monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path / 'minari'))
     for name, complete in (('all', [True, True, False]), ('whole', [True, True])):
@@ -297,9 +297,9 @@ def test_of_a_folder_only_what_is_asked_for_is_exported(episodes, tmp_path, monk
         told = dataset.storage.get_episode_metadata(dataset.episode_indices)
         assert [each['complete'] for each in told] == complete
         assert dataset.storage.metadata['dataset_size'] == dataset.storage.get_size()
-    assert export_episodes.main([*arguments, '--task', 'FetchReach']) == 2
+    assert episodes_export.main([*arguments, '--task', 'FetchReach']) == 2
     assert f'none of 3 episodes in {folder} is one of' in capsys.readouterr().err
-    assert export_episodes.main([str(tmp_path), *arguments[1:]]) == 2
+    assert episodes_export.main([str(tmp_path), *arguments[1:]]) == 2
     assert f'{tmp_path} holds no episode; there are some in {folder}' in capsys.readouterr().err
 
 
@@ -322,7 +322,7 @@ def test_minari_looks_afterwards_where_it_looked_before(before, episodes, tmp_pa
     if before is not None:
         monkeypatch.setenv('MINARI_DATASETS_PATH', before)
     arguments = [str(episodes), '--to', 'minari', '--output', str(tmp_path)]
-    assert export_episodes.main(arguments) == 0
+    assert episodes_export.main(arguments) == 0
     assert os.environ.get('MINARI_DATASETS_PATH') == before
 
 
@@ -331,7 +331,7 @@ def test_what_a_killed_export_left_goes(episodes, tmp_path, monkeypatch):
     left.mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
     assert (
-        export_episodes.main([str(episodes), '--to', 'minari', '--output', str(tmp_path / 'out')])
+        episodes_export.main([str(episodes), '--to', 'minari', '--output', str(tmp_path / 'out')])
         == 0
     )
     assert not [path for path in (tmp_path / 'out').iterdir() if path.name.endswith('.partial')]
@@ -344,7 +344,7 @@ def test_an_episode_and_a_link_to_it_are_one(episodes, tmp_path, capsys):
     for name in ('a', 'b'):
         (folder / name).symlink_to(first)
     assert (
-        export_episodes.main([str(folder), '--to', 'parquet', '--output', str(tmp_path / 'out')])
+        episodes_export.main([str(folder), '--to', 'parquet', '--output', str(tmp_path / 'out')])
         == 0
     )
     printed = capsys.readouterr()

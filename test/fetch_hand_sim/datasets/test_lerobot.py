@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fetch_hand_sim.commands import export_episodes
+from fetch_hand_sim.commands import episodes_export
 from fetch_hand_sim.datasets import lerobot
 from fetch_hand_sim.datasets.lerobot_film import color_statistics
 from fetch_hand_sim.datasets.writing import why_apart
@@ -36,7 +36,7 @@ def episodes(tmp_path_factory):
 
 
 def _export(source: Path, output: Path) -> int:
-    return export_episodes.main([str(source), '--to', 'lerobot', '--output', str(output)])
+    return episodes_export.main([str(source), '--to', 'lerobot', '--output', str(output)])
 
 
 @pytest.fixture(scope='module')
@@ -131,7 +131,7 @@ def test_films_show_every_frame_and_say_where_each_episode_begins(episodes, tmp_
     except RuntimeError as error:
         pytest.skip(str(error))
     arguments = ['--to', 'lerobot', '--output', str(tmp_path), '--pictures', '64x48']
-    assert export_episodes.main([str(episodes), *arguments]) == 0
+    assert episodes_export.main([str(episodes), *arguments]) == 0
     reader = imageio_ffmpeg.read_frames(str(tmp_path / TASK / FILM))
     about = next(reader)
     pictures = [np.frombuffer(picture, np.uint8).reshape(48, 64, 3) for picture in reader]
@@ -183,7 +183,7 @@ def test_films_that_cannot_be_are_refused(episodes, tmp_path, arguments, says, c
 
 def export_code(arguments: list[str]) -> int:
     try:
-        return export_episodes.main(arguments)
+        return episodes_export.main(arguments)
     except SystemExit as end:
         return int(end.code or 0)
 

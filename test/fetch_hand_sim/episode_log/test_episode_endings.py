@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fetch_hand_sim.commands import recover_episodes
+from fetch_hand_sim.commands import episodes_recover
 from fetch_hand_sim.episode_log import find_episodes, find_leftovers, read_episode
 from msgs_spec.tasks import task_spec
 from support import SUPPORT, script_environment
@@ -67,7 +67,7 @@ def lost_seconds(directory, factor, ticks):
         for finished in find_episodes(path):
             assert read_episode(finished).is_complete
         assert len(find_leftovers(path)) <= 1 + MOST_UNSTORED
-        assert recover_episodes.main([directory]) == 0
+        assert episodes_recover.main([directory]) == 0
         assert find_leftovers(path) == []
     known = {
         (int(name.name.split('_')[1]), message.log_time_ns)

@@ -19,7 +19,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from fetch_hand_sim.commands import recover_episodes
+from fetch_hand_sim.commands import episodes_recover
 from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
     EpisodeExistsError,
@@ -125,7 +125,7 @@ def test_a_killed_recorder_leaves_an_episode_marked_as_unfinished(killed):
     for read in (read_episode, read_summary, load_episodes):
         with pytest.raises(EpisodeReadError, match='truncated by a kill') as caught:
             read(leftover.path)
-        assert f'`recover_episodes {directory}`' in str(caught.value)
+        assert f'`fetch_hand_sim episodes recover {directory}`' in str(caught.value)
         assert_one_line(caught.value)
 
 
@@ -291,11 +291,11 @@ def test_of_two_recoveries_at_once_one_makes_the_bag_and_the_other_says_so(
         result = None if step == 'publish' else do(*arguments, **options)
         calls.append(step)
         if len(calls) == call + 1:
-            assert recover_episodes.main([str(directory)]) == 0
+            assert episodes_recover.main([str(directory)]) == 0
         return do(*arguments, **options) if step == 'publish' else result
 
     monkeypatch.setattr(durable, step, meanwhile)
-    assert recover_episodes.main([str(directory)]) == 0
+    assert episodes_recover.main([str(directory)]) == 0
     said = capsys.readouterr().out
     assert said.count(f'\nrecovered {directory}') == 1, said
     path = directory / leftover.name

@@ -71,7 +71,7 @@ def test_crafted_files_end_in_one_line_within_two_seconds_and_half_a_gigabyte(ep
     # What one process keeps of all readings levels off.
     assert report['held_bytes'] < 750 * 10**6
     # Most are found out, and by far not all: what is only strange is read.
-    assert 0.2 * CRAFTED < report['outcomes']['check_episode exit 2'] < CRAFTED
+    assert 0.2 * CRAFTED < report['outcomes']['episodes check exit 2'] < CRAFTED
 
 
 def test_a_pipe_is_no_episode(tmp_path):

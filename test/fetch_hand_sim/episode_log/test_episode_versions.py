@@ -6,12 +6,12 @@ import hashlib
 import shutil
 from pathlib import Path
 
-from fetch_hand_sim.commands import check_episode, list_episodes
+from fetch_hand_sim.commands import episodes_check, episodes_list
 from fetch_hand_sim.episode_log import load_episodes, read_episode, read_summary, recover_episode
 from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
 
-# Logged by `generate_episodes` of version 0.1 at revision 2ce2393; never to be written again.
+# Logged by version 0.1 at revision 2ce2393; never to be written again.
 OLD = Path(__file__).parents[2] / 'data' / 'episodes_0_1'
 EPISODE = OLD / 'FetchReach_000000_seed0'
 FILE = EPISODE / f'{EPISODE.name}_0.mcap'
@@ -34,9 +34,9 @@ def test_it_reads_and_loads():
 
 
 def test_it_checks(capsys):
-    assert check_episode.main([str(OLD)]) == 0
+    assert episodes_check.main([str(OLD)]) == 0
     assert 'identical, 51 ticks, 459 messages' in capsys.readouterr().out
-    assert list_episodes.main([str(OLD)]) == 0
+    assert episodes_list.main([str(OLD)]) == 0
     assert '1 episodes' in capsys.readouterr().out
 
 

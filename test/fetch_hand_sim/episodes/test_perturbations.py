@@ -7,7 +7,7 @@ import copy
 import numpy as np
 import pytest
 
-from fetch_hand_sim.commands.check_episode import main as check_episode
+from fetch_hand_sim.commands.episodes_check import main as episodes_check
 from fetch_hand_sim.episode_log import read_episode
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.perturbations import accept_perturbation, bounded_wrench
@@ -151,7 +151,7 @@ def test_a_logged_episode_says_so_and_the_check_pushes_as_well(simulation, tmp_p
     episode = read_episode(path)
     assert episode.metadata['perturb_limit'] == '10.0'
     assert len(episode.topics['/perturb'].messages) == 3
-    assert check_episode([str(path)]) == 0, capsys.readouterr()
+    assert episodes_check([str(path)]) == 0, capsys.readouterr()
 
 
 @pytest.mark.parametrize('seed', range(20))

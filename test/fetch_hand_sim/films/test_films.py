@@ -17,7 +17,7 @@ from gymnasium.wrappers import TimeLimit
 from PIL import Image
 
 import fetch_hand_sim
-from fetch_hand_sim.commands.render_episode import main as render_episode
+from fetch_hand_sim.commands.episodes_film import main as episodes_film
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError, load_episodes
 from fetch_hand_sim.films.film import check_kind, check_size, write_film, write_picture
 from fetch_hand_sim.films.playing import Film, film_episode
@@ -193,9 +193,10 @@ def test_a_sheet_that_a_file_cannot_hold_is_one_line_before_drawing(
     monkeypatch.setattr(Studio, 'picture', lambda *_: pytest.fail('drawn'))
     out = tmp_path / f'x.{kind}'
     arguments = ['--grid', '20x1', '--size', '4096x48', '--out', str(out)]
-    assert render_episode([str(folder), *arguments]) == 2
+    assert episodes_film([str(folder), *arguments]) == 2
     assert capsys.readouterr().err == (
-        f'render_episode: 81958x48 pixels; allowed: {largest} a side of a .{kind} file\n'
+        'fetch_hand_sim episodes film: 81958x48 pixels; '
+        f'allowed: {largest} a side of a .{kind} file\n'
     )
     check_size(out, largest, min(largest, 2**28 // largest))
     with pytest.raises(ValueError, match='allowed: 268435456 in all'):
@@ -209,7 +210,7 @@ def test_in_a_grid_pictures_say_who_is_at_the_goal(folder, tmp_path):
     index = next(index for index, each in enumerate(zip(*reached, strict=True)) if any(each))
     path = tmp_path / 'grid.png'
     arguments = ['--grid', '3x1', '--out', str(path), '--size', '64x48', '--frame', str(index)]
-    assert render_episode([str(folder), *arguments]) == 0
+    assert episodes_film([str(folder), *arguments]) == 0
     with Image.open(path) as image:
         edge = np.asarray(image)[24, ::66].astype(int)
     is_green = edge[:, 1] > edge[:, 0] + 40
@@ -252,7 +253,7 @@ def test_in_a_grid_all_episodes_have_the_same_time(folder, monkeypatch):
 def test_command_writes_a_film_and_a_picture(folder, tmp_path, capsys):
     for out, more in (('grid.png', ['--grid', '2x2']), ('one.jpg', ['--camera', 'lidar'])):
         path = tmp_path / out
-        assert render_episode([str(folder), '--out', str(path), '--size', '64x48', *more]) == 0
+        assert episodes_film([str(folder), '--out', str(path), '--size', '64x48', *more]) == 0
         said = capsys.readouterr().out.splitlines()
         assert said[-1].startswith(str(path))
         alone = ['FetchReach_000000_seed0 alone, of 3 episodes; --grid CxR takes several']
@@ -275,9 +276,9 @@ def partly_damaged(folder, tmp_path):
 def test_what_cannot_be_read_is_left_out_and_said(partly_damaged, tmp_path, capsys):
     path = tmp_path / 'grid.png'
     arguments = ['--grid', '2x1', '--out', str(path), '--size', '64x48']
-    assert render_episode([str(partly_damaged), *arguments]) == 0
+    assert episodes_film([str(partly_damaged), *arguments]) == 0
     error = capsys.readouterr().err
-    assert error.startswith('render_episode: skipped ') and error.count('\n') == 1
+    assert error.startswith('fetch_hand_sim episodes film: skipped ') and error.count('\n') == 1
     assert 'FetchReach_000000_seed0_0.mcap: truncated' in error
     with Image.open(path) as image:
         right = np.asarray(image)[:, 68:]
@@ -288,18 +289,21 @@ def test_if_nothing_can_be_read_there_is_one_line(partly_damaged, tmp_path, caps
     for file in partly_damaged.glob('*/*.mcap'):
         file.write_bytes(b'')
     arguments = ['--grid', '2x2', '--out', str(tmp_path / 'grid.png')]
-    assert render_episode([str(partly_damaged), *arguments]) == 2
+    assert episodes_film([str(partly_damaged), *arguments]) == 2
     error = capsys.readouterr().err
-    assert error.startswith('render_episode: none of 3 episodes can be read; the first: ')
+    assert error.startswith(
+        'fetch_hand_sim episodes film: none of 3 episodes can be read; the first: '
+    )
     assert error.count('\n') == 1
 
 
 @pytest.mark.parametrize('number', [51, -52])
 def test_a_frame_that_is_not_there_is_one_line(folder, tmp_path, number, capsys):
     out = ['--out', str(tmp_path / 'x.png'), '--frame', str(number)]
-    assert render_episode([str(folder), *out]) == 2
+    assert episodes_film([str(folder), *out]) == 2
     assert capsys.readouterr().err == (
-        f'render_episode: FetchReach_000000_seed0: frame {number}; allowed: -51 ... 50\n'
+        f'fetch_hand_sim episodes film: FetchReach_000000_seed0: frame {number}; '
+        'allowed: -51 ... 50\n'
     )
     assert list(tmp_path.iterdir()) == []
 
@@ -307,7 +311,7 @@ def test_a_frame_that_is_not_there_is_one_line(folder, tmp_path, number, capsys)
 @pytest.mark.usefixtures('opengl')
 def test_a_camera_that_is_not_there_is_one_line(folder, tmp_path, capsys):
     more = ['--camera', 'nosuch']
-    code = render_episode([str(folder), '--out', str(tmp_path / 'x.png'), *more])
+    code = episodes_film([str(folder), '--out', str(tmp_path / 'x.png'), *more])
     error = capsys.readouterr().err
     assert code == 2 and error.count('\n') == 1 and 'allowed' in error
 
@@ -317,7 +321,7 @@ def test_a_camera_that_is_not_there_is_one_line(folder, tmp_path, capsys):
     [('x.gif', '--frame', 'a picture (.png, .jpg)'), ('x.PNG', '--speed', 'a film (.mp4, .gif')],
 )
 def test_what_a_kind_of_file_has_no_use_for_is_refused(folder, tmp_path, name, option, of, capsys):
-    assert render_episode([str(folder), '--out', str(tmp_path / name), option, '2']) == 2
+    assert episodes_film([str(folder), '--out', str(tmp_path / name), option, '2']) == 2
     error = capsys.readouterr().err
     assert f'{option} is of {of}' in error and error.count('\n') == 1
     assert list(tmp_path.iterdir()) == []
@@ -326,7 +330,7 @@ def test_what_a_kind_of_file_has_no_use_for_is_refused(folder, tmp_path, name, o
 @pytest.mark.parametrize('size', ['100', '100x', '4x4x4', '0x7', '9999x7'])
 def test_a_size_is_two_numbers(folder, size, capsys):
     with pytest.raises(SystemExit) as caught:
-        render_episode([str(folder), '--out', 'x.png', '--size', size])
+        episodes_film([str(folder), '--out', 'x.png', '--size', size])
     error = capsys.readouterr().err
     assert caught.value.code == 2 and error.count('\n') == 1
     assert f'{size!r} given; allowed: 1x1 ... 4096x4096' in error
@@ -338,7 +342,7 @@ def test_without_opengl_it_says_what_to_install(folder, tmp_path):
         'def gone(name): raise OSError(name)\n'
         'import fetch_hand_sim.simulation.opengl as opengl\n'
         'opengl._is_installed = lambda library: False\n'
-        'from fetch_hand_sim.commands.render_episode import main\n'
+        'from fetch_hand_sim.commands.episodes_film import main\n'
         f'sys.exit(main([{str(folder)!r}, "--out", {str(tmp_path / "x.png")!r}]))'
     )
     environment = {'PATH': '/usr/bin:/bin', 'PYTHONPATH': ':'.join(sys.path)}
@@ -347,8 +351,8 @@ def test_without_opengl_it_says_what_to_install(folder, tmp_path):
     )
     assert result.returncode == 1
     assert result.stderr == (
-        'render_episode: rendering needs OpenGL: apt install libegl1 libgl1-mesa-dri, or apt '
-        'install libosmesa6\n'
+        'fetch_hand_sim episodes film: rendering needs OpenGL: '
+        'apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6\n'
     )
 
 
@@ -402,7 +406,7 @@ def test_the_film_of_an_episode_is_that_of_the_command(folder, opengl, tmp_path)
     episode = sorted(folder.iterdir())[0]
     film = Film.of_episode(episode, width=64, height=48)
     out = tmp_path / 'film.gif'
-    assert render_episode([str(episode), '--out', str(out), '--size', '64x48']) == 0
+    assert episodes_film([str(episode), '--out', str(out), '--size', '64x48']) == 0
     assert film.save(tmp_path / 'same.gif').read_bytes() == out.read_bytes()
     with pytest.raises(ValueError, match='nowhere'):
         Film.of_episode(tmp_path / 'nowhere')

@@ -37,7 +37,7 @@ def make_info(task: str = 'FetchPush', **changes: Any) -> ActorInfo:
         layer_norm=True,
         control_hz=25.0,
         seed=7,
-        command="train_her --task FetchPush --set 'hidden_sizes=8,8'",
+        command="fetch_hand_sim train --task FetchPush --set 'hidden_sizes=8,8'",
         source_revision='abc',
         env_steps=1000,
         config={'gamma': 0.98},

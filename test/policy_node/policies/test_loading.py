@@ -39,7 +39,7 @@ def test_shipped_actors_answer_as_torch_does(task: str) -> None:
 def test_policies_are_asked_as_stable_baselines3_asks(name: str) -> None:
     policy: Any = load_policy(name, 'FetchReach').policy
     observation = observations(task_spec('FetchReach'), 2)
-    # As its `evaluate_policy` does.
+    # As its `fetch_hand_sim evaluate` does.
     starts = np.ones(2, dtype=bool)
     action, state = policy.predict(
         observation, state=None, episode_start=starts, deterministic=True

@@ -163,4 +163,4 @@ def test_what_acts_wrongly_later_is_said_in_one_line(
     words = ['--policy', f'{module}:{function}', '--task', 'FetchReach', '--trust']
     assert evaluate([*words, '--episodes', '2', '--threads', '1']) == 1
     error = capsys.readouterr().err
-    assert error == f'evaluate_policy: {module}:{function} fails: {line}\n'
+    assert error == f'fetch_hand_sim evaluate: {module}:{function} fails: {line}\n'

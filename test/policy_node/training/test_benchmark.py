@@ -156,7 +156,9 @@ def test_a_benchmark_runs_reports_and_is_not_run_again(
     assert (report / 'benchmark.png').read_bytes()[:4] == b'\x89PNG'
     assert (report / 'benchmark.txt').read_text() in printed
     runs = list(read_runs(report).values())
-    assert all(run['command'].startswith('benchmark --seeds 0 --steps 1200') for run in runs)
+    assert all(
+        run['command'].startswith('fetch_hand_sim benchmark --seeds 0 --steps 1200') for run in runs
+    )
     assert [[steps for steps, _ in run['curve']] for run in runs] == [[400, 800, 1200]] * 2
     rows = list(csv.DictReader((report / 'benchmark.csv').open()))
     assert [row['arm'] for row in rows] == ['her_sparse', 'ddpg_dense']
@@ -176,7 +178,7 @@ def test_a_second_ctrl_c_ends_jobs_at_once(tmp_path: Path) -> None:
     """Amid an evaluation that would take minutes."""
     arguments = small(tmp_path, '--arms', 'her_sparse', 'her_dense', '--jobs', '2')
     arguments += ['--set', 'evaluation_episodes=1000000', '--set', 'evaluate_every=400']
-    command = [sys.executable, '-m', 'policy_node.training.studies', *arguments]
+    command = [sys.executable, '-m', 'fetch_hand_sim', 'benchmark', *arguments]
     benchmark = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     logs = [tmp_path / 'FetchReach' / arm / 'seed0' / 'progress.csv' for arm in ARMS][:2]
     deadline = time.monotonic() + 120
@@ -218,7 +220,7 @@ def test_ctrl_c_keeps_what_there_is_and_the_same_command_goes_on(
     assert not (tmp_path / 'FetchReach' / 'her_dense').exists()
     assert main(arguments) == 0
     commands = (first / 'command.txt').read_text().splitlines()
-    assert commands == [shlex.join(['benchmark', *arguments])] * 2
+    assert commands == [shlex.join(['fetch_hand_sim', 'benchmark', *arguments])] * 2
     assert read_progress(first / 'progress.csv')[-1]['env_steps'] == 4_000
     assert 'continues' not in capsys.readouterr().out
 
@@ -317,7 +319,7 @@ def test_an_output_that_cannot_be_a_folder_is_one_line(
     (tmp_path / 'file').write_text('')
     assert main(small(tmp_path / 'file')) == 2
     assert capsys.readouterr().err == (
-        f'benchmark: {tmp_path / "file"} cannot hold runs: File exists\n'
+        f'fetch_hand_sim benchmark: {tmp_path / "file"} cannot hold runs: File exists\n'
     )
 
 

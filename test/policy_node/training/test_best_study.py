@@ -136,8 +136,9 @@ def test_a_report_that_cannot_be_written_ends_no_job(
     place = Recorder(tmp_path, limit=2)
     assert run_jobs(jobs_of('--output', str(tmp_path)), place, tmp_path, full)
     assert sorted(place.order) == sorted(TASKS)
-    assert "benchmark: no report yet: [Errno 28] No space left on device: 'runs.csv'" in (
-        capsys.readouterr().err
+    assert (
+        "fetch_hand_sim benchmark: no report yet: [Errno 28] No space left on device: 'runs.csv'"
+        in (capsys.readouterr().err)
     )
 
 
@@ -178,7 +179,7 @@ def test_processes_end_by_the_signal_that_came_though_all_get_sigterm(tmp_path: 
 def test_two_at_once_are_stopped_resumed_and_shipped(tmp_path: Path) -> None:
     arguments = [*TINY, '--tasks', *EGGS, 'FetchReach', '--jobs', '2', '--steps', '2000']
     arguments += ['--episodes', '4', '--output', str(tmp_path)]
-    module = [sys.executable, '-m', 'policy_node.training.studies', *arguments]
+    module = [sys.executable, '-m', 'fetch_hand_sim', 'benchmark', *arguments]
     first, second, other = (tmp_path / task / 'best' / 'seed0' for task in (*EGGS, 'FetchReach'))
     process = subprocess.Popen(module, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
@@ -207,7 +208,7 @@ def test_two_at_once_are_stopped_resumed_and_shipped(tmp_path: Path) -> None:
         assert read_progress(folder / 'progress.csv')[-1]['env_steps'] == 2000
     report = json.loads((tmp_path / 'actors' / 'HandManipulateEggFull.json').read_text())
     assert report['init_from']['task'] == EGGS[0] and steps_behind(report) > 2000
-    assert report['command'].startswith('benchmark --study best')
+    assert report['command'].startswith('fetch_hand_sim benchmark --study best')
     names = {f'{task}{end}' for task in (*EGGS, 'FetchReach') for end in ('.json', '.png')}
     assert names <= {path.name for path in (tmp_path / 'actors').iterdir()}
     table = (tmp_path / 'actors.md').read_text()

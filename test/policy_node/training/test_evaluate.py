@@ -199,7 +199,7 @@ def test_former_names_work_and_say_what_they_are_called_now(
     assert main(['--actor', 'resting', *arguments]) == 0
     captured = capsys.readouterr()
     assert 'FetchReach: resting, 2 episodes' in captured.out
-    assert captured.err == 'evaluate_policy: --actor is now called --policy\n'
+    assert captured.err == 'fetch_hand_sim evaluate: --actor is now called --policy\n'
     path = tmp_path / 'model.zip'
     path.write_bytes(b'')
     assert main(['--policy', f'sb3:SAC:{path}', '--trust', *arguments]) == 2

@@ -196,7 +196,9 @@ def test_a_study_runs_measures_and_gives_the_same_bits_again(
     assert runs[:-2] == kept
     for arm, run in zip(('future', 'weighted'), runs[-2:], strict=True):
         assert (run['arm'], run['env_steps'], run['parts']) == (arm, 800, 1)
-        assert run['processor_seconds'] > 0 and run['command'].startswith('benchmark --study unb')
+        assert run['processor_seconds'] > 0 and run['command'].startswith(
+            'fetch_hand_sim benchmark --study unb'
+        )
     page = (report / 'README.md').read_text()
     assert page.startswith('# Before') and page.endswith('after\n') and 'old' not in page
     assert '\n| FetchReach | `weighted`: half future, half actual, importance weights | 1' in page
@@ -367,7 +369,7 @@ def test_a_run_with_a_damaged_actor_or_log_is_one_line(
     write_file(folder / 'latest.safetensors', b'cut')
     assert main(arguments) == 1
     error = capsys.readouterr().err
-    assert 'benchmark: FetchReach/actual/seed0: ' in error and error.count('\n') == 1
+    assert 'fetch_hand_sim benchmark: FetchReach/actual/seed0: ' in error and error.count('\n') == 1
     write_file(folder / 'progress.csv', b'env_steps\n400\n')
     assert main(arguments) == 1
     assert 'progress.csv contains no evaluation' in capsys.readouterr().err

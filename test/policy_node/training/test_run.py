@@ -359,7 +359,7 @@ def test_a_signal_is_answered_at_once_and_keeps_the_run(
     process.send_signal(number)
     assert process.stderr is not None
     lines = iter(process.stderr.readline, '')
-    assert any('train_her: stopping after this cycle' in line for line in lines)
+    assert any('fetch_hand_sim train: stopping after this cycle' in line for line in lines)
     assert process.poll() is None, 'said before the cycle was over'
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 128 + number
@@ -431,7 +431,7 @@ def test_what_a_run_will_need_is_checked_before_its_first_step(tmp_path: Path) -
     )
     result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
     assert result.returncode == 2, result.stderr
-    assert 'train_her: matplotlib' in result.stderr
+    assert 'fetch_hand_sim train: matplotlib' in result.stderr
     assert "pip install 'fetch_hand_sim[train]'" in result.stderr
     assert result.stderr.count('\n') == 1 and not (tmp_path / 'run').exists()
 

@@ -68,7 +68,7 @@ def test_fetch_reach_is_learnt_from_nothing(tmp_path: Path) -> None:
     _, info = checkpoint.load(tmp_path / 'run' / 'best.safetensors', task='FetchReach')
     assert info.success.items() >= {'last_step': 1.0, 'episodes': 200, 'rule': 'gymnasium'}.items()
     assert info.success['stay'] > 0.9 and info.success['distance'] < 0.05
-    assert info.command.startswith('train_her --task FetchReach --success-target 1')
+    assert info.command.startswith('fetch_hand_sim train --task FetchReach --success-target 1')
     assert info.source_revision and 0 < info.env_steps <= 40_000
     rows = read_progress(tmp_path / 'run' / 'progress.csv')
     assert rows[-1]['eval_success'] == 1.0 and rows[-1]['eval_stay'] > 0.9
@@ -460,13 +460,13 @@ def test_networks_whose_files_could_not_be_read_are_refused_at_once(tmp_path: Pa
 
 def test_a_run_that_began_anew_has_one_part(tmp_path: Path) -> None:
     """One that was killed before it had saved anything does not count."""
-    (tmp_path / 'command.txt').write_text('train_her of before\n')
-    train_run(small_config(total_steps=800), tmp_path, command='train_her of now')
-    assert (tmp_path / 'command.txt').read_text() == 'train_her of now\n'
+    (tmp_path / 'command.txt').write_text('fetch_hand_sim train of before\n')
+    train_run(small_config(total_steps=800), tmp_path, command='fetch_hand_sim train of now')
+    assert (tmp_path / 'command.txt').read_text() == 'fetch_hand_sim train of now\n'
     train_run(small_config(total_steps=1600), tmp_path, resume=True, command='more')
-    assert (tmp_path / 'command.txt').read_text() == 'train_her of now\nmore\n'
+    assert (tmp_path / 'command.txt').read_text() == 'fetch_hand_sim train of now\nmore\n'
     train_run(small_config(total_steps=1600), tmp_path, resume=True, command='nothing to do')
-    assert (tmp_path / 'command.txt').read_text() == 'train_her of now\nmore\n'
+    assert (tmp_path / 'command.txt').read_text() == 'fetch_hand_sim train of now\nmore\n'
 
 
 def test_a_run_that_goes_on_says_that_its_log_is_lost(

@@ -1,6 +1,6 @@
-"""`recover_episodes DIR`: makes valid bags of the episodes that a crash or a full disk cut off.
+"""Make valid bags of the episodes that a crash or a full disk interrupted.
 
-Exit code 0: nothing is left unfinished; 1: something could not be recovered, named on stderr;
+Exit code 0: no unfinished episode is left; 1: an episode could not be recovered (stderr names it);
 2: bad usage.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,7 +32,7 @@ from node_runtime.command_line import (
     say,
 )
 
-_NAME = 'recover_episodes'
+_NAME = 'fetch_hand_sim episodes recover'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -98,7 +97,3 @@ def _recover(leftover: Path) -> bool:
         f'{episode.duration_s:.2f} s, {state}'
     )
     return True
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,19 +1,17 @@
-"""`export_episodes DIR --to parquet|minari|lerobot --output DIR`: logged episodes as datasets.
+"""Write logged episodes as Parquet, Minari or LeRobot datasets, one for each task.
 
-Exit code 0: all episodes are in the datasets; 1: something was skipped, named on stderr, or could
-not be written; 2: bad usage.
+Exit code 0: all episodes are in the datasets; 1: an episode was skipped (stderr names it) or a
+dataset could not be written; 2: bad usage.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from fetch_hand_sim.commands.episode_filter import add_filter_options, is_wanted
-from fetch_hand_sim.commands.picture_size import picture_size
+from fetch_hand_sim.commands.options import add_filter_options, is_wanted, picture_size
 from fetch_hand_sim.datasets import minari
 from fetch_hand_sim.datasets.parquet import export_parquet
 from fetch_hand_sim.datasets.writing import ByTask, why_apart
@@ -39,7 +37,7 @@ from node_runtime.command_line import (
     say,
 )
 
-_NAME = 'export_episodes'
+_NAME = 'fetch_hand_sim episodes export'
 _TITLES = {'parquet': 'Parquet', 'minari': 'Minari', 'lerobot': 'LeRobot'}
 _NEEDED = {'parquet': ('pyarrow',), 'minari': ('pyarrow', 'minari'), 'lerobot': ('pyarrow',)}
 
@@ -185,7 +183,3 @@ def _export_lerobot(options: argparse.Namespace, by_task: ByTask) -> dict[str, P
         raise UsageError(str(error)) from None
     except RuntimeError as error:
         raise CommandError(str(error)) from None
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""`check_episode PATH...`: runs logged episodes again and compares every message bit for bit.
+"""Simulate logged episodes again and compare every message bit for bit.
 
 Exit code 0: all are identical; 1: an episode differs; 2: bad usage, or a file cannot be checked.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from node_runtime.command_line import (
     say,
 )
 
-_NAME = 'check_episode'
+_NAME = 'fetch_hand_sim episodes check'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -92,7 +91,3 @@ def _check(episodes: Sequence[Path], results: list[CheckResult], is_quiet: bool)
 def _as_json(result: CheckResult) -> dict[str, Any]:
     values = dataclasses.asdict(result)
     return {**values, 'path': str(result.path), 'identical': result.difference is None}
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -1,17 +1,16 @@
-"""`render_episode FILE --out film.mp4`: a film or picture of a logged episode, or of many at once.
+"""Write a film or a picture of a logged episode, or of a grid of episodes; no display is needed.
 
-Needs no display. What cannot be read in a folder is skipped, named on stderr. Exit code 0: written;
-1: something failed; 2: bad usage, or nothing that can be read.
+Unreadable episodes in a folder are skipped and named on stderr. Exit code 0: written; 1: drawing or
+writing failed; 2: bad usage, or no readable episode.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from fetch_hand_sim.commands.picture_size import picture_size, two_numbers
+from fetch_hand_sim.commands.options import picture_size, two_numbers
 from msgs_spec.arrays import Picture
 from node_runtime.command_line import (
     EXIT_SUCCESS,
@@ -24,7 +23,7 @@ from node_runtime.command_line import (
     say,
 )
 
-_NAME = 'render_episode'
+_NAME = 'fetch_hand_sim episodes film'
 _SPEEDS = (0.01, 100.0)
 
 
@@ -125,7 +124,3 @@ def _counted(pictures: Iterator[Picture], advance: Callable[[int], None]) -> Ite
     for picture in pictures:
         yield picture
         advance(1)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

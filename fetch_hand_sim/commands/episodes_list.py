@@ -1,6 +1,6 @@
-"""`list_episodes DIR`: the episodes in a directory as a table.
+"""List the episodes in a folder as a table.
 
-Exit code 0: everything was read; 1: something was skipped, named on stderr; 2: bad usage.
+Exit code 0: all were read; 1: an episode was skipped (stderr names it); 2: bad usage.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from fetch_hand_sim.commands.episode_filter import add_filter_options, is_wanted
+from fetch_hand_sim.commands.options import add_filter_options, is_wanted
 from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeReadError,
@@ -36,7 +36,7 @@ from node_runtime.command_line import (
     run_command,
 )
 
-_NAME = 'list_episodes'
+_NAME = 'fetch_hand_sim episodes list'
 _COLUMNS = ('episode', 'task', 'seed', 'steps', 'return', 'success', 'seconds', 'KiB', 'ended')
 _NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB'})
 # Every column fits, whatever a file says: of a name that is cut short nobody finds the episode, so
@@ -133,7 +133,7 @@ def _run(options: argparse.Namespace) -> int:
         if not (episodes or errors) and (below := folders_below(options.directory)):
             print(f'there are some in {below}')
     for leftover in leftovers:
-        remedy = '' if leftover.problem else '; recover_episodes makes a bag of it'
+        remedy = '' if leftover.problem else '; fetch_hand_sim episodes recover makes a bag of it'
         print(f'{leftover}{remedy}', file=sys.stderr if options.json else sys.stdout)
     for skipped in errors:
         complain(_NAME, f'skipped {skipped}')
@@ -163,7 +163,3 @@ def _as_json(episode: EpisodeSummary) -> dict[str, Any]:
         'complete': outcome.is_complete,
         'reason': outcome.reason,
     }
-
-
-if __name__ == '__main__':
-    sys.exit(main())
