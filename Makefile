@@ -101,6 +101,7 @@ tables: env
 	$(BIN)/python tools/interface_table.py --write docs/interface.md
 	$(BIN)/python tools/readme_tables.py --write README.md docs/simulation.md docs/training.md
 	$(BIN)/python tools/task_pages.py --write
+	$(BIN)/python tools/robustness_overview.py
 
 pictures: env
 	$(BIN)/python tools/make_pictures.py

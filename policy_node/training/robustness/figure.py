@@ -1,14 +1,14 @@
-"""The figure of a robustness result: one panel for each disturbance."""
+"""Figures of robustness results: the curves of one policy, and the overview of many."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from msgs_spec.disturbances import PRESETS
 from msgs_spec.tasks import task_spec
-from policy_node.training.robustness.sweeps import KEPT, sweeps_of
+from policy_node.training.robustness.sweeps import KEPT, SWEEPS, Sweep, kept_up_to, sweeps_of
 
 _COLUMNS = 4
 
@@ -58,3 +58,39 @@ def _panel(axes: Any, labels: list[str], measured: list[Any], undisturbed: float
     axes.axhline(KEPT * undisturbed, linestyle='--', linewidth=0.8, color='gray')
     axes.set_xticks(places, labels, fontsize='small')
     axes.set_ylim(-0.03, 1.03)
+
+
+def draw_overview(results: Sequence[Mapping[str, Any]]) -> bytes:
+    """Return a PNG with one row per policy: the level of each disturbance that it withstands.
+
+    Args:
+        results: What the command wrote, one per policy.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.0, 1.4 + 0.32 * len(results)), layout='constrained')
+    axes = figure.subplots()
+    shares = [[_cell(result, sweep)[0] for sweep in SWEEPS] for result in results]
+    axes.imshow(shares, cmap='RdYlGn', vmin=0.0, vmax=1.0, aspect='auto', alpha=0.75)
+    for row, result in enumerate(results):
+        for column, sweep in enumerate(SWEEPS):
+            text = _cell(result, sweep)[1]
+            axes.text(column, row, text, ha='center', va='center', fontsize='small')
+    titles = [f'{sweep.name},\n{sweep.unit}' for sweep in SWEEPS]
+    axes.set_xticks(range(len(SWEEPS)), titles, fontsize='x-small', rotation=30, ha='left')
+    axes.xaxis.tick_top()
+    axes.set_yticks(range(len(results)), [each['policy'] for each in results], fontsize='small')
+    file = io.BytesIO()
+    figure.savefig(file, dpi=110)
+    return file.getvalue()
+
+
+def _cell(result: Mapping[str, Any], sweep: Sweep) -> tuple[float, str]:
+    """Return the share of the levels that a policy withstands (NaN: none there) and its text."""
+    if sweep not in sweeps_of(task_spec(result['task'])):
+        return float('nan'), ''
+    success = {key: point['success'] for key, point in result['points'].items()}
+    level = kept_up_to(sweep, success, success['none 0'])
+    if level is None:
+        return 0.0, f'< {sweep.levels[0]:g}'
+    return (sweep.levels.index(level) + 1) / len(sweep.levels), f'{level:g}'

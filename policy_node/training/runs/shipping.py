@@ -63,7 +63,7 @@ def ship(
         UsageError: If the folder takes no file.
     """
     candidate = _read_candidate(run, name)
-    target = actors / f'{candidate.info.task}.safetensors'
+    target = actors / f'{candidate.name}.safetensors'
     _require_rate(target, candidate.info.control_hz)
     old = _evaluation_in(_evaluation_file(target))
     if (old.get('run_sha256'), old.get('episodes')) == (candidate.sha256, episodes):
@@ -105,6 +105,17 @@ class _Candidate:
     state: TrainingState | None
 
     @property
+    def name(self) -> str:
+        """Name of the shipped file: the task, with `_robust` where that recipe trained it."""
+        is_robust = self.info.config.get('recipe') == 'robust'
+        return f'{self.info.task}_robust' if is_robust else self.info.task
+
+    @property
+    def disturbances(self) -> str | None:
+        """Disturbances that it was trained with and is evaluated with."""
+        return self.info.config.get('disturbances') or None
+
+    @property
     def command(self) -> str:
         """What it was trained with."""
         return commands_of(self.run) or self.info.command
@@ -130,6 +141,7 @@ def _evaluate(candidate: _Candidate, episodes: int, num_envs: int, threads: int)
         num_envs=min(num_envs, episodes),
         num_threads=threads,
         control_hz=info.control_hz,
+        disturbances=candidate.disturbances,
     )
     summary = summarize(evaluate(simulation, candidate.actor, episodes, FIRST_SEED))
     # After an hour of episodes nobody may read the table any more; the actor is saved all the same.
@@ -150,13 +162,14 @@ def _write(candidate: _Candidate, target: Path, summary: dict[str, Any]) -> None
     if candidate.progress[-1].get('updates') or not curve.is_file():
         files[curve] = _curve_bytes(candidate)
     report = {
-        'actor': info.task,
+        'actor': candidate.name,
         'sha256': sha256(actor),
         'run_sha256': candidate.sha256,
         'env_steps': info.env_steps,
         'command': info.command,
         'init_from': info.init_from,
         'source_revision': info.source_revision,
+        **({'disturbances': candidate.disturbances} if candidate.disturbances else {}),
         **summary,
     }
     # The last: without it the actor is shipped again.

@@ -101,7 +101,7 @@ def test_every_shipped_actor_loads_and_is_bounded() -> None:
     assert 'FetchReach' in shipped_actors()
     for name, path in shipped_actors().items():
         assert actor_path(name) == path
-        actor = load_actor(name, task=name)
+        actor = load_actor(name, task=name.removesuffix('_robust'))
         observation = {
             'observation': np.full((3, actor.shape.observation_size), 1e6),
             'desired_goal': np.zeros((3, actor.shape.goal_size)),

@@ -25,14 +25,18 @@ SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_ep
 SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'total_steps': 800, 'evaluate_every': 400}
 
 
+NAMES = ('FetchReach', 'FetchReach_robust')
 TEXT = '{"success_gymnasium": 0.5, "mean_return": -1, "episodes": "9"}'
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    folder = tmp_path / 'run'
+    return trained(tmp_path / 'run', 'best')
+
+
+def trained(folder: Path, recipe: str) -> Path:
     folder.mkdir()
-    trainer = Trainer(recipe_config('FetchReach', 'best', **SMALL), folder, Workers())
+    trainer = Trainer(recipe_config('FetchReach', recipe, **SMALL), folder, Workers())
     log = RunLog(folder, 800, 0.0)
     trainer.train(log)
     log.close()
@@ -110,6 +114,17 @@ def test_a_folder_that_takes_no_actor_is_refused_before_any_episode(
     assert ship(run, actors, 2) == 2
     error = capsys.readouterr().err
     assert 'FetchReach.safetensors cannot be written: ' in error and error.count('\n') == 1
+
+
+def test_a_robust_actor_lies_beside_the_other_and_is_evaluated_as_it_was_trained(
+    run: Path, tmp_path: Path
+) -> None:
+    actors = tmp_path / 'actors'
+    assert ship(run, actors, 2) == ship(trained(tmp_path / 'robust', 'robust'), actors, 2) == 0
+    reports = {name: json.loads((actors / f'{name}.json').read_text()) for name in NAMES}
+    assert [report['actor'] for report in reports.values()] == list(NAMES)
+    assert 'disturbances' not in reports['FetchReach']
+    assert 'latency' in reports['FetchReach_robust']['disturbances']
 
 
 def test_json_and_actor_are_of_one_run(run: Path, tmp_path: Path) -> None:
