@@ -76,9 +76,6 @@ COMMANDS = {
         'measure the success rate of a policy', 'policy_node.training.evaluate_policy'
     ),
     'robustness': Command(
-        'measure success on disturbed robots', 'policy_node.training.robustness.command'
-    ),
-    'robustness': Command(
         'measure success under disturbances', 'policy_node.training.robustness.command', ('train',)
     ),
     'benchmark': Command(
