@@ -175,7 +175,7 @@ class PhysicsDisturbance(_Group):
 
 @dataclass(frozen=True)
 class PushDisturbance(_Group):
-    """Random pushes of one tick on the object, or on the end of the arm where there is none.
+    """Random pushes of one tick on the object, or on gripper or palm in tasks without an object.
 
     Attributes:
         force: Standard deviation per axis, as a share of the weight of what is pushed.
@@ -212,7 +212,7 @@ class Disturbances:
 
     @property
     def is_off(self) -> bool:
-        """Whether nothing is disturbed."""
+        """True if nothing is disturbed."""
         return self == Disturbances()
 
     def scaled(self, factor: float) -> Disturbances:
@@ -279,7 +279,7 @@ def read_disturbances(given: str | Mapping[str, Any] | Disturbances | None) -> D
             disturbances.
 
     Raises:
-        ValueError: If it is none of these, or a value is not allowed.
+        ValueError: If the form is unknown, or a value is not allowed.
     """
     if given is None or given in ('', 'none', 'off'):
         return Disturbances()

@@ -24,7 +24,7 @@ Ids = NDArray[np.intp]
 _BLOCK = 64
 # Tracking that is lost comes back after half a second.
 _LOST_TICKS = 12
-# What an episode draws once, by the name of its field; `_drawn` says from what.
+# Group and field of each range from which an episode draws once.
 _SPANS = {
     'action_latency': ('action', 'latency'),
     'joint_latency': ('joints', 'latency'),
@@ -365,7 +365,7 @@ def _object_address(model: mujoco.MjModel) -> int | None:
 
 
 def _pushed_body(task: Task) -> int:
-    """The object; the gripper or the palm where there is none."""
+    """Return the object, or the gripper or palm in tasks without one."""
     names = ('object0', 'object', 'robot0:gripper_link', 'robot0:palm')
     numbers = (mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_BODY.value, n) for n in names)
     return int(next((number for number in numbers if number > 0), task.model.nbody - 1))
@@ -396,7 +396,7 @@ class _Lever:
 
 
 def _moves(model: mujoco.MjModel, dof: int, body: int) -> bool:
-    """Whether a degree of freedom moves a body."""
+    """Return whether a degree of freedom moves a body."""
     mover = int(model.dof_bodyid[dof])
     while body:
         if body == mover:

@@ -120,7 +120,7 @@ class VariedPhysics:
         live['body_inertia'][ids, body] *= factor[:, None]
         live['body_subtreemass'][ids, body] += added
         live['body_subtreemass'][ids, 0] += added
-        # What `mj_setConst` derives for a free body.
+        # `mj_setConst` derives these for a free body.
         live['body_invweight0'][ids, body] /= factor[:, None]
         first = int(self._task.model.body_dofadr[body])
         live['dof_invweight0'][ids, first : first + 6] /= factor[:, None]
