@@ -50,7 +50,7 @@ def _off(kind: Kind) -> Any:
 
 
 def _checked(name: str, value: Any, kind: Kind) -> Any:
-    """Return a value in its form, or raise a `ValueError` that says what is allowed."""
+    """Return a value in its form, or raise a `ValueError` with the allowed range."""
     lowest, highest = _LIMITS[kind]
     is_range = isinstance(_OFF[kind], tuple)
     numbers = list(value) if is_range and isinstance(value, (list, tuple)) else [value]

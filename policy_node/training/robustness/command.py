@@ -1,7 +1,7 @@
 """Measure the success of a policy under ten disturbances at rising levels and under the presets.
 
-The result is a JSON file, a CSV file and a figure. A command that was interrupted goes on with the
-points that the JSON file lacks.
+The result is a JSON file, a CSV file and a figure. After an interruption the same command continues
+with the missing points.
 """
 
 from __future__ import annotations

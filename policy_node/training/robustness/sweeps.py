@@ -77,7 +77,7 @@ SWEEPS = (
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """What is evaluated: a disturbance at a level, a preset (level 1), or `none`."""
+    """One evaluation: a disturbance at a level, a preset (level 1), or `none`."""
 
     name: str
     level: float
