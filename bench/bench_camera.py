@@ -24,8 +24,7 @@ from bench_rate import Watcher, report  # noqa: E402
 from bench_view import start  # noqa: E402
 
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
-from msgs_spec.topics import topic  # noqa: E402
-from msgs_spec.view_topics import view_topic  # noqa: E402
+from msgs_spec.topics import topic, view_topic  # noqa: E402
 from node_runtime.event_loop import EventLoop  # noqa: E402
 from node_runtime.ros import rclpy_profile, ros_message_class  # noqa: E402
 from node_runtime.transport import keep_discovery_local  # noqa: E402

@@ -1,12 +1,13 @@
-"""Everything the simulation says at one stamp, and the messages that say it."""
+"""One tick of a robot and its messages."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from msgs_spec.arrays import Array
@@ -14,7 +15,7 @@ from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import build_status
 from msgs_spec.observations import Readings
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
-from msgs_spec.schemas import serialize
+from msgs_spec.schemas import deserialize, message_class, serialize
 from msgs_spec.tasks import (
     REWARD_TYPES,
     SUCCESS_RULES,
@@ -24,7 +25,7 @@ from msgs_spec.tasks import (
     substeps_per_tick,
 )
 from msgs_spec.text import one_of
-from msgs_spec.topics import GROUND_TRUTH, TopicSpec, ground_truth_topics, topics
+from msgs_spec.topics import GROUND_TRUTH, LATEST_TICK, TopicSpec, ground_truth_topics, topics
 
 Phase = Literal['waiting', 'reset', 'running', 'finished']
 # What each says of the tick it comes with. An episode that is given up ends without `finished`.
@@ -232,3 +233,37 @@ class TickEncoder:
         """Returns `episode_status` alone, for a simulation that has not started."""
         message = build_status(self._status, stamp_ns, 'episode', status.to_values())
         return self._status, serialize(self._status.type_name, message)
+
+
+def join_messages(messages: Sequence[tuple[TopicSpec, bytes]]) -> bytes:
+    """Return the CDR bytes of `latest_tick` for the messages of a tick.
+
+    `data` contains the CDR bytes of the messages in order. `layout` has a dimension for each: the
+    name of the topic as label, and the number of bytes as size and stride.
+    """
+    dimension, layout = (
+        message_class(f'std_msgs/msg/MultiArray{part}') for part in ('Dimension', 'Layout')
+    )
+    parts = [
+        dimension(label=spec.name, size=len(data), stride=len(data)) for spec, data in messages
+    ]
+    data = np.frombuffer(b''.join(data for _, data in messages), np.uint8)
+    message = message_class(LATEST_TICK.type_name)(layout(dim=parts, data_offset=0), data)
+    return serialize(LATEST_TICK.type_name, message)
+
+
+def split_messages(data: bytes) -> dict[str, bytes]:
+    """Return the CDR bytes of each topic in a `latest_tick`, in order.
+
+    Raises:
+        ValueError: If the bytes are not such a message, or the sizes do not add up.
+    """
+    message = deserialize(LATEST_TICK.type_name, data)
+    rest, parts = bytes(message.data), {}
+    for part in message.layout.dim:
+        if part.size > len(rest):
+            raise ValueError(f'{part.label!r} has {len(rest)} bytes left, not {part.size}')
+        parts[part.label], rest = rest[: part.size], rest[part.size :]
+    if rest:
+        raise ValueError(f'{len(rest)} bytes belong to no topic')
+    return parts

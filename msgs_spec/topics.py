@@ -34,6 +34,8 @@ COMMAND = QosSpec(depth=10, reliability='reliable', durability='volatile')
 CLOCK = QosSpec(depth=1, reliability='reliable', durability='volatile')
 
 
+# Tasks to remember. Publishers choose the names of joints, so the number of tasks is unlimited.
+_TASKS = 256
 WORLD = 'world'
 
 _POSITION = VectorPart('position', 3, 'm')
@@ -264,8 +266,7 @@ def relative_name(resolved: str) -> str:
     return f'{GROUND_TRUTH}/{name}' if is_true_state else name
 
 
-# Bounded: whoever publishes chooses names of joints, and so any number of tasks.
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=_TASKS)
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
     """Returns all topics of a task.
 
@@ -293,4 +294,82 @@ def topic(task: TaskSpec, name: str) -> TopicSpec:
     found = {spec.name: spec for spec in topics(task)}
     if name not in found:
         raise ValueError(f'{task.name} has no topic {name!r}; allowed: {", ".join(found)}')
+    return found[name]
+
+
+# Topics of `visualization_node`, for standard tools; none of them is logged.
+
+# Prefix by which tools group the scalars of a tick.
+_SCALARS = 'scalars/'
+
+_FRAMES = 'tf2_msgs/msg/TFMessage'
+_IMAGES = 'sensor_msgs/msg/'
+SHOWN = (
+    TopicSpec(
+        'robot_description',
+        'std_msgs/msg/String',
+        'URDF, generated from the model.',
+        qos=LATCHED,
+    ),
+    TopicSpec('/tf', _FRAMES, 'Links, object and goal; where `tf2_msgs` is installed.'),
+    TopicSpec('/tf_static', _FRAMES, 'Fixed frames, including the camera.', qos=LATCHED),
+    TopicSpec(
+        'goal_markers',
+        'visualization_msgs/msg/MarkerArray',
+        'Goal, achieved goal, object, table; while it has subscribers.',
+        frame=WORLD,
+    ),
+    TopicSpec('camera/image_raw', f'{_IMAGES}Image', 'A picture; while it has subscribers.'),
+    TopicSpec(
+        'camera/image_raw/compressed',
+        f'{_IMAGES}CompressedImage',
+        'The same as JPEG for `image_transport`; while it has subscribers.',
+    ),
+    TopicSpec('camera/camera_info', f'{_IMAGES}CameraInfo', 'Its calibration, of the same stamp.'),
+)
+
+
+def _scalar(name: str, unit: str, text: str) -> TopicSpec:
+    """Return a topic of one number: the x of a vector, because ROS has no stamped number."""
+    layout = (VectorPart(name, 1, unit),)
+    return TopicSpec(f'{_SCALARS}{name}', 'geometry_msgs/msg/Vector3Stamped', text, layout)
+
+
+@lru_cache(maxsize=_TASKS)
+def scalar_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
+    """Return the topics of the numbers of a tick that tools plot, stamped with the tick."""
+    found = []
+    if task.position_counts:
+        found.append(_scalar('distance', 'm', 'From the achieved to the desired position.'))
+    if task.rotation_threshold is not None:
+        found.append(
+            _scalar(
+                'rotation',
+                'rad',
+                'From the achieved to the desired rotation, by the success rule: up to 2 pi by '
+                '`gymnasium`.',
+            )
+        )
+    return (
+        *found,
+        _scalar('reward', '', 'As `reward`; from the first step of an episode on.'),
+        _scalar('is_success', '', 'As `is_success`, 0 or 1.'),
+    )
+
+
+@lru_cache(maxsize=_TASKS)
+def view_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
+    """Return all topics of `visualization_node` for a task."""
+    return (*SHOWN, *scalar_topics(task))
+
+
+def view_topic(task: TaskSpec, name: str) -> TopicSpec:
+    """Return a topic of `visualization_node` by name.
+
+    Raises:
+        ValueError: If the topic is unknown; the message lists the known ones.
+    """
+    found = {spec.name: spec for spec in view_topics(task)}
+    if name not in found:
+        raise ValueError(f'{task.name} has no topic {name!r} to view; allowed: {", ".join(found)}')
     return found[name]

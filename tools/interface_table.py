@@ -16,8 +16,7 @@ from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, Comma
 from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS, GoalKind, TaskSpec, VectorPart
 from msgs_spec.tick import PHASES, EpisodeStatus
-from msgs_spec.topics import MONITORING, QosSpec, TopicSpec, topics
-from msgs_spec.view_topics import view_topics
+from msgs_spec.topics import MONITORING, QosSpec, TopicSpec, topics, view_topics
 
 START, END = '<!-- interface table -->', '<!-- /interface table -->'
 

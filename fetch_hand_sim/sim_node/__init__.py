@@ -1,7 +1,7 @@
 """`sim_node`: one simulated robot on the network.
 
-`robot.py` holds what a robot does and how it answers, without ROS; `node.py` is the node around
-it. Nothing is imported here that takes long, so that Ctrl-C finds its handler in place.
+`robot.py` is the robot without ROS, `node.py` the node around it. Slow imports happen in `main`,
+after its handlers of signals.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ SUMMARY = 'One simulated robot on the network.'
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs `sim_node`; returns the exit code."""
+    """Run `sim_node` and return the exit code."""
 
     def load() -> Callable[[], RunnableNode]:
         from fetch_hand_sim.sim_node.node import SimNode

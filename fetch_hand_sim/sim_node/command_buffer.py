@@ -1,8 +1,8 @@
-"""Holds the latest valid command and says what the next tick applies.
+"""The newest valid command of a robot.
 
-Habits of ros2_control's forward_command_controller: a command of the wrong size or with a value
-that is not finite is dropped and counted, out of range is clipped, nothing is applied before the
-first valid one, and when commands stop for longer than the timeout the robot holds.
+As ros2_control's forward_command_controller does: commands of a wrong size or with values that are
+not finite are dropped and counted, values out of range are clipped, nothing is applied before the
+first valid command, and after the timeout the robot holds.
 """
 
 from __future__ import annotations
@@ -19,28 +19,27 @@ from msgs_spec.actions import clip_command, command_limits
 from msgs_spec.arrays import Array
 from msgs_spec.robots import RobotSpec
 
-# Characters of a received name that an error line repeats.
+# Characters of a received name in an error line.
 _NAME_SHOWN = 40
-# A value this many times the width of its range beyond a limit is no overshoot of a controller.
+# Multiple of the range beyond a limit that a controller does not overshoot by.
 _FAR = 2.0
 
 
 class CommandBuffer:
-    """The latest valid command of one robot.
+    """The newest valid command of one robot.
 
     Args:
-        robot: Whose commands.
-        timeout: Seconds after which the last command is replaced by holding; 0 never.
+        robot: The robot.
+        timeout: Seconds after which the robot holds; 0 for never.
         clock: A steady clock, seconds.
 
     Attributes:
-        timeout: As above.
         accepted: Valid commands so far.
-        clipped: Those of them that were clipped.
-        far_out: Those of them that were so far out of range that somebody took another unit.
+        clipped: Commands that were clipped.
+        far_out: Clipped commands far out of range, probably in another unit.
         rejected: Other commands, by reason.
-        last_far_out: What was said of the last command that was far out of range.
-        last_rejection: Why the last command was rejected; empty if it was not.
+        last_far_out: The value far out of range and its limits.
+        last_rejection: Why the last command was rejected; empty if it was valid.
         has_fresh_command: Whether a command came since the last `take` or `start_episode`.
     """
 
@@ -69,22 +68,22 @@ class CommandBuffer:
         return self._command is not None
 
     def age(self) -> float | None:
-        """Seconds since the last valid command of any episode, or None if none ever came."""
+        """Return the seconds since the last valid command of any episode, or None."""
         return None if self._received_at is None else self._clock() - self._received_at
 
     def start_episode(self, resting_command: ArrayLike) -> None:
-        """Forgets the command.
+        """Forget the command.
 
         Args:
-            resting_command: (action size,): what applies until one comes, and the base of commands
-                that name only some joints.
+            resting_command: (action size,): applies until the first command, and is the base of
+                commands that name only some joints.
         """
         self._resting = np.array(resting_command, dtype=np.float64)
         self._command = None
         self.has_fresh_command = False
 
     def accept(self, values: ArrayLike) -> None:
-        """Takes a whole command, in order.
+        """Store a whole command, in order.
 
         Raises:
             ValueError: If its size is wrong or a value is not finite; the buffer is unchanged.
@@ -96,11 +95,11 @@ class CommandBuffer:
         self._store(command)
 
     def accept_named(self, names: Sequence[str], positions: ArrayLike) -> None:
-        """Takes joint positions by name, in any order; joints not named keep their target.
+        """Store joint positions by name, in any order; other joints keep their target.
 
         Raises:
-            ValueError: If names and positions do not match, a name is unknown or given twice,
-                or a value is not finite; the buffer is unchanged.
+            ValueError: If names and positions do not match, a name is unknown or given twice, or a
+                value is not finite; the buffer is unchanged.
         """
         values = np.asarray(positions, dtype=np.float64).ravel()
         if len(names) != values.size:
@@ -120,19 +119,19 @@ class CommandBuffer:
         self._store(command)
 
     def count_rejection(self, reason: str, line: str) -> None:
-        """Counts what never was a command.
+        """Count a message that contains no command.
 
         Args:
             reason: Short, for counting: `wrong size`, `not finite`, `unknown joint`, ...
-            line: What was given and what is allowed.
+            line: The given and the allowed values.
         """
         self.rejected[reason] += 1
         self.last_rejection = line
 
     def take(self) -> Array:
-        """Returns what the next tick applies, (action size,), command units, within limits.
+        """Return the command of the next tick, (action size,), command units, within limits.
 
-        What came since the last tick answers it and is never too old, however slow the ticks are.
+        A command that came since the last tick is never too old, however slow the ticks are.
         """
         is_fresh, self.has_fresh_command = self.has_fresh_command, False
         if self._command is None:
@@ -141,7 +140,7 @@ class CommandBuffer:
         return self._holding(self._command) if is_late else self._command
 
     def _holding(self, command: Array) -> Array:
-        """Keeps the pose: the gripper stops and keeps its grip, joints keep their targets."""
+        """Return the command that holds: the gripper keeps its grip, joints keep their targets."""
         if not self._robot.has_gripper_command:
             return command
         keeps = [part.name == 'gripper' for part in self._robot.command]

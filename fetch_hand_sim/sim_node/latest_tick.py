@@ -1,4 +1,4 @@
-"""Says the latest tick to those who only look, as often as is worth looking at."""
+"""The topic `latest_tick`: all messages of the newest tick in one, at a limited rate."""
 
 from __future__ import annotations
 
@@ -7,29 +7,28 @@ from collections.abc import Callable
 from typing import Protocol
 
 from fetch_hand_sim.sim_node.robot import Messages
-from msgs_spec.latest_tick import join_messages
-from msgs_spec.tick import Tick, TickEncoder
+from msgs_spec.tick import Tick, TickEncoder, join_messages
 from msgs_spec.topics import LATEST_TICKS_PER_SECOND
 
 _PERIOD = 1.0 / LATEST_TICKS_PER_SECOND
 
 
 class Output(Protocol):
-    """What is needed of a publisher of rclpy."""
+    """The methods of rclpy's publisher that are needed here."""
 
     def publish(self, msg: bytes) -> None:
-        """Sends a message."""
+        """Send a message."""
 
     def get_subscription_count(self) -> int:
-        """How many hear it."""
+        """Return the number of subscribers."""
 
 
 class LatestTick:
-    """Publishes the messages of the latest tick in one, while somebody subscribes.
+    """Publishes the newest tick while the topic has subscribers.
 
     Args:
-        output: Of the topic.
-        encoder: Adds `episode_status` where a tick comes without.
+        output: Publisher of the topic.
+        encoder: Adds `episode_status` to ticks without it.
         clock: A steady clock, seconds.
     """
 
@@ -41,27 +40,27 @@ class LatestTick:
         self._clock = clock
         self._due = 0.0
         self._latest: tuple[Tick, Messages] | None = None
-        self._is_said = False
+        self._is_published = False
 
     def take(self, tick: Tick, messages: Messages) -> None:
-        """Takes a tick with its messages, and says it if it is time."""
-        self._latest, self._is_said = (tick, messages), False
-        self.say_when_due()
+        """Store a tick with its messages, and publish it if the rate allows."""
+        self._latest, self._is_published = (tick, messages), False
+        self.publish_when_due()
 
     def repeat(self) -> None:
-        """Has the tick said again, to those who have come since."""
-        self._is_said = False
+        """Publish the last tick once more, for new subscribers."""
+        self._is_published = False
 
-    def say_when_due(self) -> None:
-        """Says the latest tick unless it has been, it is too soon, or nobody listens."""
+    def publish_when_due(self) -> None:
+        """Publish the newest tick if it is unpublished, due, and has subscribers."""
         now = self._clock()
-        if self._latest is None or self._is_said or now < self._due:
+        if self._latest is None or self._is_published or now < self._due:
             return
-        # A tick that was late does not hold up the next.
+        # A late tick does not delay the next one.
         self._due = max(self._due, now - _PERIOD) + _PERIOD
         if self._output.get_subscription_count() == 0:
             return
-        self._is_said = True
+        self._is_published = True
         (tick, messages), status = self._latest, []
         if all(spec.name != 'episode_status' for spec, _ in messages):
             status = [self._encoder.encode_status(tick.stamp_ns, tick.status)]

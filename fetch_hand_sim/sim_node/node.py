@@ -1,6 +1,6 @@
-"""The ROS node around a `Robot`.
+"""The ROS node of a `Robot`.
 
-One thread does everything but completing log files, because a tick takes 2 ms of 40.
+One thread does everything but writing log files: a tick takes 2 of 40 ms.
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node import NODE_NAME
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
+from fetch_hand_sim.sim_node.health import WAITING_PERIOD, Reporter
 from fetch_hand_sim.sim_node.latest_tick import LatestTick
-from fetch_hand_sim.sim_node.pacing import RealTimePacer
 from fetch_hand_sim.sim_node.receivers import Receivers
-from fetch_hand_sim.sim_node.reporter import WAITING_PERIOD, LogState, Reporter
 from fetch_hand_sim.sim_node.robot import Messages, Robot
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
@@ -37,7 +36,6 @@ from msgs_spec.parameters import SIM_NODE
 from msgs_spec.robots import read_joint_prefix
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import LATEST_TICK, MONITORING, ground_truth_topics, topics
-from node_runtime.command_line import UsageError
 from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import NodeFailure, StopSignals
 from node_runtime.ros import (
@@ -48,27 +46,27 @@ from node_runtime.ros import (
 from node_runtime.ros_parameters import declare_parameters, set_callback
 
 _WARN_PERIOD = 1.0
-# Seconds a beat may take: none begins that close to a tick.
+# Seconds that a beat may take. No beat begins that close to a tick.
 _BEAT_TIME = 0.01
-# Callbacks that are served before a tick which is due: far more than an orderly network leaves.
+# Maximum number of callbacks before a due tick, far more than in normal operation.
 _SERVED_FIRST = 100
-# What may happen to a disk, and stops the log alone; another error names no place for one.
-_OF_A_DISK = (errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO)
-# Seconds a robot waits for the name of a commander who is about to give it.
-_INTRODUCTION_TIME = 1.0
+# Errors of a disk that stop logging but not the simulation.
+_DISK_ERRORS = (errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO)
+# Seconds to wait for the latched `policy_status` of a new policy.
+_POLICY_STATUS_TIME = 1.0
 
 
 class SimNode(Node):
     """Publishes the state of one robot at every tick and applies the commands it receives.
 
     Raises:
-        UsageError: If a parameter is not allowed.
+        ValueError: If a parameter is not allowed.
     """
 
     def __init__(self) -> None:
         super().__init__(NODE_NAME, start_parameter_services=False)
         self._settings = declare_parameters(self, SIM_NODE)
-        self._refuse_simulated_time()
+        self._reject_simulated_time()
         self._robot = self._make_robot()
         self._warn_after: dict[str, float] = {}
         self._recording_context: RecordingContext | None = None
@@ -80,8 +78,14 @@ class SimNode(Node):
         self._watch = GraphWatch(self, self._robot.runner.spec, self._outputs)
         open_services(self, self._robot)
         now = time.monotonic()
-        self._reporter = Reporter(self, self._robot, self._watch, self._log_state)
-        self._has_introduction = False
+        self._reporter = Reporter(
+            self,
+            self._robot,
+            self._watch,
+            self._settings['episode_dir'],
+            lambda: self._has_log_failed,
+        )
+        self._has_policy_status = False
         self._beat_due = self._ticked_at = now
         self._report_due = now + REPORT_PERIOD
         self.add_on_set_parameters_callback(set_callback(SIM_NODE, makes_time=True))
@@ -89,42 +93,41 @@ class SimNode(Node):
 
     # Set-up
 
-    def _refuse_simulated_time(self) -> None:
-        """Goes on in wall time where a launch file tells all nodes to use simulated time."""
+    def _reject_simulated_time(self) -> None:
+        """Stay in wall time where a launch file sets `use_sim_time` for all nodes."""
         if self.get_parameter('use_sim_time').value:
             self.set_parameters([Parameter('use_sim_time', value=False)])
             self.get_logger().warning(
-                'use_sim_time is set back to false: sim_node makes simulated time and follows none'
+                'use_sim_time is set back to false: sim_node itself publishes simulated time'
             )
 
     def _make_robot(self) -> Robot:
         values = self._settings
-        try:
-            simulation = Simulation(
-                values['task'],
-                num_envs=1,
-                num_threads=1,
-                reward_type=values['reward_type'],
-                success_rule=values['success_rule'],
-                control_hz=values['control_hz'],
-                disturbances=values['disturbances'],
-            )
-            prefix = read_joint_prefix(simulation.spec.robot, values['joint_prefix'])
-        except ValueError as error:
-            raise UsageError(str(error)) from None
+        simulation = Simulation(
+            values['task'],
+            num_envs=1,
+            num_threads=1,
+            reward_type=values['reward_type'],
+            success_rule=values['success_rule'],
+            control_hz=values['control_hz'],
+            disturbances=values['disturbances'],
+        )
         runner = EpisodeRunner(
             simulation,
             first_seed=values['seed'],
             episodes=values['episodes'],
-            joint_prefix=prefix,
+            joint_prefix=read_joint_prefix(simulation.spec.robot, values['joint_prefix']),
         )
-        pacer = RealTimePacer(
-            simulation.tick_duration, values['real_time_factor'], time.monotonic()
+        schedule = TickSchedule(
+            values['mode'],
+            simulation.tick_duration,
+            values['real_time_factor'],
+            time.monotonic(),
         )
         robot = Robot(
             runner,
             CommandBuffer(runner.spec.robot, values['command_timeout']),
-            TickSchedule(values['mode'], pacer),
+            schedule,
             self._emit,
         )
         robot.perturb_limit = values['perturb_limit']
@@ -133,7 +136,7 @@ class SimNode(Node):
     def _open_topics(self) -> dict[str, Publisher]:
         receivers = Receivers(self._robot, self._recorder, self._on_commander, self._warn)
         publishers = {}
-        # Who hears of the task has seen before whether there is `latest_tick`.
+        # `latest_tick` comes before the topics of the task, so that viewers never miss it.
         for spec in (*MONITORING, *topics(self._robot.runner.spec)):
             message_class = ros_message_class(spec.type_name)
             profile = rclpy_profile(spec.qos)
@@ -145,7 +148,7 @@ class SimNode(Node):
         return publishers
 
     def _open_ground_truth(self) -> None:
-        """Offer the true state too, once something disturbs the robot."""
+        """Publish the true state too, once something disturbs the robot."""
         if read_disturbances(self._settings['disturbances']).is_off:
             return
         for spec in ground_truth_topics(self._robot.runner.spec):
@@ -167,12 +170,12 @@ class SimNode(Node):
         except FileExistsError:
             pass
         except OSError as error:
-            if error.errno not in _OF_A_DISK:
-                raise UsageError(f'episode_dir: {directory}: {error.strerror}') from None
+            if error.errno not in _DISK_ERRORS:
+                raise ValueError(f'episode_dir: {directory}: {error.strerror}') from None
         try:
             leftovers = find_leftovers(Path(directory))
         except EpisodeLogError as error:
-            raise UsageError(f'episode_dir: {error}') from None
+            raise ValueError(f'episode_dir: {error}') from None
         for leftover in leftovers:
             self.get_logger().warning(str(leftover))
         return EpisodeRecorder(
@@ -188,20 +191,20 @@ class SimNode(Node):
     # Running
 
     def run(self, stop: StopSignals) -> None:
-        """Runs episodes until all are done or the signals say stop.
+        """Run episodes until all are done or a signal.
 
         Raises:
-            NodeFailure: If all are done and not all could be logged.
+            NodeFailure: If all episodes are done but not all were logged.
         """
         loop = EventLoop(self)
-        self.get_logger().info(self._introduction())
+        self.get_logger().info(self._description())
         try:
             self._publish(self._robot.waiting_status())
             if self._settings['wait_for_commands']:
                 self._wait_for_commander(loop, stop)
             gc.collect()
             gc.freeze()
-            self._robot.schedule.pacer.restart(time.monotonic())
+            self._robot.schedule.restart(time.monotonic())
             while not stop and not self._robot.runner.is_done:
                 self._serve_until_due(loop, stop)
                 self._beat_when_due()
@@ -209,18 +212,14 @@ class SimNode(Node):
             self._close(stop)
             loop.close()
         if self._robot.runner.is_done and self._has_log_failed:
-            # Of a number of episodes that was asked for, some are on no disk.
             raise NodeFailure(f'not all episodes are in {self._settings["episode_dir"]}')
 
     @property
     def _has_log_failed(self) -> bool:
         return self._recorder is not None and self._recorder.has_failed
 
-    def _log_state(self) -> LogState:
-        return LogState(self._settings['episode_dir'], self._has_log_failed)
-
-    def _introduction(self) -> str:
-        """What is simulated, how fast, where to find it and who is to command it."""
+    def _description(self) -> str:
+        """Return a line about the task, the pace, the topics and the log."""
         values = self._settings
         pace = 'as fast as possible'
         if values['mode'] == 'lockstep':
@@ -230,14 +229,11 @@ class SimNode(Node):
         return (
             f'{values["task"]}, {values["control_hz"]:g} ticks per simulated second, {pace}; '
             f'topics in {self.get_namespace()}; log: {values["episode_dir"] or "off"}; '
-            + ('waits for commands' if values['wait_for_commands'] else 'nobody commands yet')
+            + ('waits for commands' if values['wait_for_commands'] else 'no commands yet')
         )
 
     def _wait_for_commander(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Lets nothing move until there is a commander who hears everything.
-
-        A step begins the first episode without one, and then it goes on as any other.
-        """
+        """Stand still until a connected policy publishes commands, or a step starts the episode."""
         watch = self._watch
         while not (watch.inputs.commanders and watch.are_subscribers_connected()):
             if stop or self._robot.runner.has_started:
@@ -247,20 +243,20 @@ class SimNode(Node):
             if self._robot.is_reset_due:
                 self._robot.tick_when_due()
             self._beat_when_due()
-        # Latched, so it comes a little after its publisher is seen; the log names who commands.
-        end = time.monotonic() + _INTRODUCTION_TIME
-        while not stop and watch.has_policy_status() and not self._has_introduction:
+        # The log names the policy, whose latched status comes a little after its publisher.
+        end = time.monotonic() + _POLICY_STATUS_TIME
+        while not stop and watch.has_policy_status() and not self._has_policy_status:
             if time.monotonic() > end:
                 return
             loop.wait(BEAT)
 
     def _serve_until_due(self, loop: EventLoop, stop: StopSignals) -> None:
-        """Serves one callback, or all that wait and then the tick that is due."""
+        """Serve one callback, or all waiting ones and then the due tick."""
         remaining = self._robot.wait()
         if remaining > 0.0:
             loop.wait(min(remaining, BEAT))
             return
-        # In lockstep every command is a tick, so that the next one waits for its own.
+        # In lockstep every command brings a tick of its own.
         if self._robot.schedule.mode != 'lockstep':
             loop.serve_pending(_SERVED_FIRST)
         # A callback may have paused the robot.
@@ -269,24 +265,24 @@ class SimNode(Node):
             self._ticked_at = time.monotonic()
 
     def _beat_when_due(self) -> None:
-        """Does what has to happen a few times a second; a tick that is near goes first."""
+        """Do what is needed a few times a second; a tick that is near goes first."""
         now = time.monotonic()
         if now < self._beat_due or (
             self._robot.wait() < _BEAT_TIME and now < self._beat_due + BEAT
         ):
             return
         self._beat_due = now + BEAT
-        self._latest_tick.say_when_due()
+        self._latest_tick.publish_when_due()
         if now - self._ticked_at >= BEAT:
             self._stand_still(now)
         if now >= self._report_due:
             self._report_due = next_report(self._report_due, now)
             self._watch.update()
-            self._forget_who_left()
+            self._clear_departed_policy()
             self._publish(self._reporter.report(now))
 
     def _stand_still(self, now: float) -> None:
-        """Keeps time alive without ticks; lets whoever comes late hear the last one."""
+        """Publish `/clock` while idle and repeat the last tick for new subscribers."""
         robot, watch = self._robot, self._watch
         has_started = robot.runner.has_started
         if robot.schedule.is_paused or not has_started:
@@ -301,7 +297,7 @@ class SimNode(Node):
         elif not has_started:
             is_waiting = now - self._ticked_at > WAITING_PERIOD
         if is_waiting:
-            self._reporter.say_what_is_waited_for()
+            self._reporter.log_waiting()
 
     def _emit(self, tick: Tick, messages: Messages) -> None:
         if self._watch.has_newcomer and self._watch.are_subscribers_connected():
@@ -309,7 +305,7 @@ class SimNode(Node):
         self._publish(messages)
         self._latest_tick.take(tick, messages)
         if tick.status.phase == 'reset':
-            self._forget_who_left()
+            self._clear_departed_policy()
         if self._recorder is not None:
             self._recorder.record(tick, messages)
         if tick.status.phase == 'finished':
@@ -327,7 +323,7 @@ class SimNode(Node):
     def _publish(self, messages: Messages) -> None:
         for spec, data in messages:
             publisher = self._outputs.get(spec.name)
-            # None where another robot owns the clock.
+            # None for `/clock` where another robot publishes it.
             if publisher is not None:
                 publisher.publish(data)
 
@@ -345,19 +341,19 @@ class SimNode(Node):
         self.get_logger().info(f'{_episode_line(episode.status)}{end}, {episode.path}')
 
     def _warn(self, topic: str, line: str) -> None:
-        # A logger's own throttle would have one topic silence the others.
+        # The logger's own throttle would let one topic silence the others.
         now = time.monotonic()
         if now >= self._warn_after.get(topic, 0.0):
             self._warn_after[topic] = now + _WARN_PERIOD
             self.get_logger().warning(f'{topic} dropped: {line}')
 
     def _on_commander(self, checkpoint_sha256: str | None) -> None:
-        self._has_introduction = True
+        self._has_policy_status = True
         if self._recording_context is not None:
             self._recording_context.checkpoint_sha256 = checkpoint_sha256
 
-    def _forget_who_left(self) -> None:
-        """Whoever commands after an actor has left gives actions of its own."""
+    def _clear_departed_policy(self) -> None:
+        """Clear the checkpoint hash when the policy disappears."""
         context = self._recording_context
         if (
             context is not None
@@ -374,7 +370,7 @@ class SimNode(Node):
             elif change.name == 'seed':
                 self._robot.runner.set_next_seed(int(change.value))
                 if not self._robot.runner.has_started:
-                    # What is latched says the seed of the first episode.
+                    # The latched status contains the seed of the first episode.
                     self._publish(self._robot.waiting_status())
             elif change.name == 'command_timeout':
                 self._robot.buffer.timeout = float(change.value)

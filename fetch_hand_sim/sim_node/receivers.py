@@ -1,4 +1,4 @@
-"""What the robot does with the bytes it receives; nothing here needs rclpy."""
+"""Received messages of a robot: reading, dispatch, logging. Without rclpy."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from msgs_spec.topics import TopicSpec
 
 
 class ReceivedLog(Protocol):
-    """Keeps what was received beside what was published."""
+    """The recorder, as far as received messages are concerned."""
 
     def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool) -> None:
-        """Takes the CDR bytes of one message, and whether the robot refused it."""
+        """Record the CDR bytes of one message, and whether the robot rejected it."""
 
 
 class Receivers:
-    """Hands received messages to a robot; what it refuses is said and counted, never raised.
+    """Pass received messages to a robot; rejected ones are counted and reported, never raised.
 
-    The log gets every message that can be read, also a command that is refused. Bytes that are no
-    message of their type, or more of them than a reader of logs takes, are dropped before.
+    The log contains every readable message, also rejected commands. Unreadable and oversized bytes
+    are dropped.
 
     Args:
-        robot: Gets commands and goals.
-        log: Gets messages; None for none.
-        on_commander: Gets the SHA-256 of the commander's checkpoint, None if it has none.
-        warn: Gets the topic and a line about what was refused; expected to throttle.
+        robot: Executes commands and goals.
+        log: Records messages; None for no log.
+        on_commander: Receives the SHA-256 of the policy's checkpoint, or None.
+        warn: Receives the topic and a line about a rejected message; throttles.
     """
 
     def __init__(
@@ -54,28 +54,28 @@ class Receivers:
         }
 
     def callback(self, spec: TopicSpec) -> Callable[[bytes], None]:
-        """Returns what a raw subscription of this topic calls with the bytes of each message."""
+        """Return the callback of a raw subscription."""
         handle = self._handlers[spec.name]
 
         def on_message(data: bytes) -> None:
             message = self._read(spec, data)
             if message is None:
                 return
-            is_refused = False
+            is_rejected = False
             try:
                 handle(spec, message)
             except ValueError as error:
-                is_refused = True
+                is_rejected = True
                 self._warn(spec.name, str(error))
             if self._log is not None:
                 # Serialised again, because senders leave the bytes between fields uninitialised.
                 data = serialize(spec.type_name, message)
-                self._log.record_received(spec, data, is_refused=is_refused)
+                self._log.record_received(spec, data, is_refused=is_rejected)
 
         return on_message
 
     def _read(self, spec: TopicSpec, data: bytes) -> Any:
-        """The message, or None after a line and a count where there is none."""
+        """Return the message, or None after counting and reporting unreadable bytes."""
         try:
             require_short(data)
         except ValueError as error:

@@ -1,4 +1,4 @@
-"""One robot: what it was told, when it moves, what it answers. Knows nothing of ROS."""
+"""One simulated robot without ROS: ticks, services, goals and pushes."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from msgs_spec.topics import TopicSpec
 
 Messages = list[tuple[TopicSpec, bytes]]
 
-# Seconds within which a commander answers a tick.
+# Seconds within which a policy answers a tick.
 _ANSWER_TIME = 0.2
-# Seconds without a command, where there should be one, that pass without a word.
+# Seconds without a command after which it counts as missing.
 _LONGEST_SILENCE = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a service says: whether it did what was asked, and why or why not."""
+    """The answer of a service: success, and the effect or the reason."""
 
     success: bool
     message: str
@@ -36,16 +36,14 @@ class Answer:
 
 @dataclass(slots=True)
 class Counters:
-    """What a robot has done since it started.
+    """Counts since the start of the robot.
 
     Attributes:
-        ticks: Ticks published, resets included.
+        ticks: Published ticks, resets included.
         episodes: Episodes that ran to their end.
-        successes: Those of them whose last tick was a success.
+        successes: Episodes whose last tick was a success.
         given_up: Episodes ended by a reset.
         goals_set: Goals accepted from outside.
-        goals_rejected: Goals refused.
-        last_goal_rejection: Why the last of them was.
         tick_time: Wall time of a tick: command, physics, encoding, publishing, logging.
     """
 
@@ -60,22 +58,19 @@ class Counters:
 
 
 class Robot:
-    """Ticks when they are due, and does what services and topics ask for.
+    """Ticks when they are due, and executes services and received goals.
 
     Args:
-        runner: Makes the ticks.
-        buffer: Says what they apply.
-        schedule: Says when they are due.
-        emit: Gets every tick with its messages.
+        runner: Computes the ticks.
+        buffer: Holds the command to apply.
+        schedule: Decides when ticks are due.
+        emit: Receives every tick with its messages.
         clock: A steady clock, seconds.
 
     Attributes:
-        runner: As above.
-        buffer: As above.
-        schedule: As above.
-        counters: What the robot has done.
-        perturb_limit: Largest force of a push, N; 0 refuses all.
-        last_messages: Those of the last tick; whoever hears them again can tell by the stamp.
+        counters: Counts since the start.
+        perturb_limit: Largest force of a push, N; 0 rejects all.
+        last_messages: Messages of the last tick, to be repeated for new subscribers.
     """
 
     def __init__(
@@ -99,7 +94,7 @@ class Robot:
         self._reset_due: float | None = None
 
     def wait(self) -> float:
-        """Seconds until the next tick is due; the first reset needs no command."""
+        """Return the seconds until the next tick is due; the first reset needs no command."""
         now = self._clock()
         has_command = self.buffer.has_fresh_command or not self.runner.has_started
         wait = self.schedule.wait(now, has_command)
@@ -107,21 +102,21 @@ class Robot:
 
     @property
     def stands_still(self) -> bool:
-        """Whether only a person or a command brings the next tick."""
+        """Whether the next tick needs a command or a service call."""
         waits = self.schedule.waits_for_commands and self.runner.has_started
         return self.schedule.is_paused or waits
 
     @property
     def is_reset_due(self) -> bool:
-        """Whether a tick of its own is due that begins the episode which was asked for."""
+        """Whether a requested reset is due as a tick of its own."""
         return self._reset_due is not None and self._reset_due <= self._clock()
 
     @property
     def misses_commands(self) -> bool:
-        """Whether a second or more has passed without a command that is due, pauses left out.
+        """Whether an expected command is a second or more late, pauses left out.
 
-        That is one for the next tick in lockstep, and any where there was one before; there
-        `command_timeout` and two ticks in slow motion may be longer than a second.
+        In lockstep every tick expects one. In real time commands are expected after the first; the
+        limit is longer where `command_timeout` or two ticks in slow motion are longer.
         """
         schedule = self.schedule
         if schedule.is_paused or not self.runner.has_started:
@@ -129,16 +124,16 @@ class Robot:
         now = self._clock()
         if schedule.mode == 'lockstep':
             return now - max(self._ticked_at, self._resumed_at) > _LONGEST_SILENCE
-        silence = max(_LONGEST_SILENCE, self.buffer.timeout, 2.0 * schedule.pacer.period)
+        silence = max(_LONGEST_SILENCE, self.buffer.timeout, 2.0 * schedule.period)
         return min(self.buffer.age() or 0.0, now - self._resumed_at) > silence
 
     def tick_when_due(self) -> None:
-        """Runs the tick that `wait` says is due."""
+        """Run the tick that is due by `wait`."""
         self.schedule.begin(self._clock())
         self.tick()
 
     def tick(self) -> None:
-        """Applies the latest command, advances by one tick and emits it."""
+        """Apply the latest command, advance by one tick and emit it."""
         began = self._clock()
         tick = self.runner.advance(self.buffer.take())
         phase = tick.status.phase
@@ -154,27 +149,25 @@ class Robot:
         self.counters.ticks += 1
         self.counters.tick_time.add(self._ticked_at - began)
 
-    # What a robot that stands still says
+    # Messages without a tick
 
     def waiting_status(self) -> Messages:
-        """`/clock` and `episode_status` of a robot that has not started."""
+        """Return `/clock` and `episode_status` of a robot that has not started."""
         stamp_ns = self.runner.stamp_ns
         status = self._encoder.encode_status(stamp_ns, self.runner.waiting_status())
         return [self.clock_message(), status]
 
     def clock_message(self) -> tuple[TopicSpec, bytes]:
-        """`/clock` of a robot that stands still."""
+        """Return `/clock` at the present simulated time."""
         return self._encoder.encode_clock(self.runner.stamp_ns)
 
-    def set_goal(self, topic: TopicSpec, message: Any) -> None:
-        """Replaces the goal of the running episode from the next tick on.
+    # Received messages
 
-        Args:
-            topic: `set_goal` of the task.
-            message: What was received.
+    def set_goal(self, topic: TopicSpec, message: Any) -> None:
+        """Replace the goal of the running episode from the next tick on.
 
         Raises:
-            ValueError: If it is refused, see `accept_goal`.
+            ValueError: If `accept_goal` rejects it.
         """
         try:
             accept_goal(self.runner, topic, message)
@@ -184,29 +177,25 @@ class Robot:
         self.counters.goals_set += 1
 
     def count_rejected_goal(self, reason: str) -> None:
-        """Counts a goal that was refused, and keeps why."""
+        """Count a rejected goal and keep the reason."""
         self.counters.goals_rejected += 1
         self.counters.last_goal_rejection = reason
 
     def perturb(self, topic: TopicSpec, message: Any) -> None:
-        """Pushes a body during the next tick.
-
-        Args:
-            topic: `perturb` of the task.
-            message: What was received.
+        """Push a body during the next tick.
 
         Raises:
-            ValueError: If it is refused, see `accept_perturbation`.
+            ValueError: If `accept_perturbation` rejects it.
         """
         accept_perturbation(self.runner, topic, message, self.perturb_limit)
 
     # Services and parameters
 
     def reset(self, *, to_first_episode: bool = False) -> Answer:
-        """Gives the running episode up; a robot that stands still begins the next one by itself.
+        """End the running episode; a robot that stands still starts the next one by itself.
 
         Args:
-            to_first_episode: Whether to begin the whole series again, not only the next episode.
+            to_first_episode: Whether to restart the whole series.
         """
         runner = self.runner
         episode, was_running = runner.episode, not runner.is_between_episodes
@@ -223,20 +212,20 @@ class Robot:
             return Answer(
                 True, f'{ends}; the next tick {starts}; commands and goals count from then on'
             )
-        self._reset_due = self._time_of_silence()
+        self._reset_due = self._silence_begins()
         return Answer(True, f'{ends}; a tick of its own {starts}')
 
-    def _time_of_silence(self) -> float:
-        """When no command is on its way that answers the last tick.
+    def _silence_begins(self) -> float:
+        """Return the time from which no command for the last tick is on its way.
 
-        Such a command would otherwise count for the state after the reset, and its commander be a
-        tick behind from then on.
+        Such a command would otherwise answer the state after the reset, and the policy would lag
+        one tick behind from then on.
         """
         is_answered = self.schedule.is_paused or self.buffer.has_fresh_command
         return self._clock() if is_answered else self._ticked_at + _ANSWER_TIME
 
     def pause(self, paused: bool) -> Answer:
-        """Stops ticks and simulated time, or goes on."""
+        """Pause or resume ticks and simulated time."""
         if paused == self.schedule.is_paused:
             return Answer(True, 'already paused' if paused else 'already running')
         self.schedule.set_paused(paused, self._clock())
@@ -244,11 +233,11 @@ class Robot:
         return Answer(True, f'{"paused" if paused else "running"} at {self._now()}')
 
     def step(self, ticks: int = 1) -> Answer:
-        """Runs ticks at once."""
+        """Run ticks at once."""
         if self.schedule.mode == 'realtime' and not self.schedule.is_paused:
             return Answer(False, 'a running simulation cannot be stepped; pause it first')
         if not 1 <= ticks <= MAX_STEPS:
-            return Answer(False, f'{ticks} ticks asked for; allowed: 1 ... {MAX_STEPS}')
+            return Answer(False, f'{ticks} ticks given; allowed: 1 ... {MAX_STEPS}')
         for done in range(ticks):
             if self.runner.is_done:
                 return Answer(False, f'all episodes are done; {done} of {ticks} ticks ran')
@@ -256,7 +245,7 @@ class Robot:
         return Answer(True, f'{ticks} run, now at {self._now()}')
 
     def set_real_time_factor(self, factor: float) -> None:
-        """Changes the pace from now on."""
+        """Change the pace from now on."""
         self.schedule.set_real_time_factor(factor, self._clock())
 
     def _now(self) -> str:

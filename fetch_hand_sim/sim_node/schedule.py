@@ -1,72 +1,94 @@
-"""When the next tick is due: by the clock, by a command, or by a step while paused."""
+"""The time of the next tick: by the wall clock, or after a command in lockstep."""
 
 from __future__ import annotations
 
 import math
 from typing import Literal
 
-from fetch_hand_sim.sim_node.pacing import RealTimePacer
-
 Mode = Literal['realtime', 'lockstep']
 
 
 class TickSchedule:
-    """Decides, and never looks at a clock itself. Times are seconds of any steady one.
+    """Deadlines of ticks. Times are seconds of any steady clock; the first tick is due at once.
 
     Args:
-        mode: `realtime` follows the pacer, `lockstep` the commands.
-        pacer: With its first tick due at the start.
+        mode: `realtime` follows the clock, `lockstep` the commands.
+        tick_duration: Simulated seconds per tick.
+        real_time_factor: Simulated seconds per second; 0 is as fast as possible.
+        now: The present time.
 
     Attributes:
-        mode: As above.
-        pacer: As above.
-        is_paused: Whether there are no ticks.
-        changes: How often it was paused, told to go on, or given a pace.
+        is_paused: Whether ticks are suspended.
+        changes: Number of pauses, resumptions and changes of the pace.
+        missed_ticks: Deadlines that passed without a tick.
     """
 
-    def __init__(self, mode: Mode, pacer: RealTimePacer) -> None:
+    def __init__(
+        self, mode: Mode, tick_duration: float, real_time_factor: float, now: float
+    ) -> None:
         self.mode = mode
-        self.pacer = pacer
         self.is_paused = False
         self.changes = 0
+        self.missed_ticks = 0
+        self._tick_duration = tick_duration
+        self._factor = real_time_factor
+        self._due = now
+        self._began = -math.inf
+
+    @property
+    def period(self) -> float:
+        """Seconds between ticks; 0 for as fast as possible."""
+        return self._tick_duration / self._factor if self._factor else 0.0
 
     @property
     def waits_for_commands(self) -> bool:
-        """Whether only a command brings the next tick."""
+        """Whether the next tick needs a command."""
         return self.mode == 'lockstep' and not self.is_paused
 
     @property
     def asked_rate(self) -> float | None:
-        """Ticks per second of wall time asked for; None where none are."""
-        period = self.pacer.period
-        return 1.0 / period if period and self.mode == 'realtime' and not self.is_paused else None
+        """Requested ticks per second of wall time; None in lockstep, paused or without a limit."""
+        is_paced = self.period and self.mode == 'realtime' and not self.is_paused
+        return 1.0 / self.period if is_paced else None
 
     def wait(self, now: float, has_command: bool) -> float:
-        """Seconds until the next tick is due: 0 now, infinity when something has to happen first.
+        """Return the seconds until the next tick; infinity while paused or without a command.
 
         Args:
-            now: The time now.
+            now: The present time.
             has_command: Whether a command waits to be applied, or none is needed.
         """
-        if self.is_paused:
+        if self.is_paused or (self.mode == 'lockstep' and not has_command):
             return math.inf
-        if self.mode == 'lockstep':
-            return 0.0 if has_command else math.inf
-        return max(0.0, self.pacer.remaining(now))
+        is_paced = self.mode == 'realtime' and self._factor
+        return max(0.0, self._due - now) if is_paced else 0.0
 
     def begin(self, now: float) -> None:
-        """Notes that a due tick begins."""
-        if self.mode == 'realtime' and not self.is_paused:
-            self.pacer.advance(now)
+        """Set the next deadline, because the due tick begins.
+
+        Missed deadlines are counted and skipped: the robot never runs faster to catch up.
+        """
+        if self.mode != 'realtime' or self.is_paused:
+            return
+        self._began = now
+        self._due += self.period
+        if self.period and self._due <= now:
+            missed = int((now - self._due) / self.period) + 1
+            self.missed_ticks += missed
+            self._due += missed * self.period
 
     def set_paused(self, paused: bool, now: float) -> None:
-        """Pauses or goes on; what was missed meanwhile is not made up for."""
+        """Pause, or resume without catching up."""
         self.is_paused = paused
         self.changes += 1
-        self.pacer.restart(now)
+        self.restart(now)
 
     def set_real_time_factor(self, factor: float, now: float) -> None:
-        """Changes the pace from now on."""
-        self.pacer.real_time_factor = factor
+        """Change the pace from now on."""
+        self._factor = factor
         self.changes += 1
-        self.pacer.restart(now)
+        self.restart(now)
+
+    def restart(self, now: float) -> None:
+        """Make the next tick due now, but not earlier than a period after the last one."""
+        self._due = max(now, self._began + self.period)

@@ -31,8 +31,7 @@ from msgs_spec.diagnostics import REPORT_PERIOD, Increase, Report, encode_report
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import DIAGNOSTICS, TopicSpec
-from msgs_spec.view_topics import SHOWN, scalar_topics
+from msgs_spec.topics import DIAGNOSTICS, SHOWN, TopicSpec, scalar_topics
 from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import NodeFailure, StopSignals
 from node_runtime.ros import (
@@ -56,7 +55,7 @@ _SERVED_FIRST = 200
 
 
 class VisualizationNode(Node):
-    """Publishes the topics of `msgs_spec.view_topics`.
+    """Publishes the topics of `msgs_spec.topics`.
 
     Raises:
         UsageError: If a parameter is not allowed.

@@ -6,7 +6,7 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.view.robot_watch import SeenTick
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.tasks import SuccessRule, TaskSpec
-from msgs_spec.view_topics import scalar_topics
+from msgs_spec.topics import scalar_topics
 
 
 class Scalars:

@@ -6,9 +6,8 @@ import pytest
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.latest_tick import join_messages, split_messages
 from msgs_spec.schemas import deserialize, serialize
-from msgs_spec.tick import TickEncoder
+from msgs_spec.tick import TickEncoder, join_messages, split_messages
 from msgs_spec.topics import LATEST_TICK
 
 

@@ -66,10 +66,13 @@ def test_a_robot_without_a_log_says_what_it_is_and_how_episodes_end(start_proces
     output, errors = sim.communicate(timeout=30.0)
     assert sim.returncode == 0, errors
     use_sim_time, first, *episodes = (output + errors).strip().splitlines()
-    assert 'use_sim_time is set back to false: sim_node makes simulated time' in use_sim_time
+    assert (
+        'use_sim_time is set back to false: sim_node itself publishes simulated time'
+        in use_sim_time
+    )
     assert first.endswith(
         'FetchReach, 25 ticks per simulated second, as fast as possible; topics in /arm1; '
-        'log: off; nobody commands yet'
+        'log: off; no commands yet'
     )
     assert [re.search(r'episode \d seed \d: 50 steps, return', line)[0] for line in episodes] == [
         'episode 0 seed 5: 50 steps, return',
@@ -79,7 +82,7 @@ def test_a_robot_without_a_log_says_what_it_is_and_how_episodes_end(start_proces
 
 def test_two_robots_of_one_name_are_both_told_so(start_process: Start) -> None:
     sims = [start_process(*SIM_NODE, *ros_args()) for _ in range(2)]
-    line = '2 publish as one robot: /sim_node, /sim_node; start each in a namespace of its own'
+    line = '2 nodes publish as one robot: /sim_node, /sim_node; give each its own namespace'
     with client(REACH) as robot:
         robot.subscribe('/diagnostics')
         robot.spin_until(
@@ -103,7 +106,7 @@ def test_a_goal_of_a_wrong_type_is_reported(start_process: Start) -> None:
 def test_a_robot_in_another_namespace_names_the_policy_that_waits(start_process: Start) -> None:
     policy = start_process(*POLICY_NODE)
     sim = start_process(*SIM_NODE, *ros_args(mode='lockstep'), '-r', '__ns:=/arm1')
-    text = 'nobody publishes any; /policy_node waits for a robot on /episode_status'
+    text = 'no node publishes any; /policy_node waits for a robot on /episode_status'
     with client(REACH) as robot:
         robot.subscribe('/diagnostics')
         robot.spin_until(

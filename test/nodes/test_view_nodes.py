@@ -39,8 +39,7 @@ from fetch_hand_sim.view.requests import (
 )
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.tasks import task_spec
-from msgs_spec.topics import LATCHED, topic, topics
-from msgs_spec.view_topics import scalar_topics, view_topic
+from msgs_spec.topics import LATCHED, scalar_topics, topic, topics, view_topic
 from node_runtime.event_loop import EventLoop
 from node_runtime.ros import rclpy_profile, ros_message_class
 from support.episode_recorder import Recorder

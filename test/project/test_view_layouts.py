@@ -16,8 +16,7 @@ import yaml
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.codecs import build_message
 from msgs_spec.tasks import TASKS, GoalKind
-from msgs_spec.topics import MONITORING, topics
-from msgs_spec.view_topics import view_topics
+from msgs_spec.topics import MONITORING, topics, view_topics
 from support import ROOT
 
 PUBLISHED = {f'/{spec.name.strip("/")}' for task in TASKS.values() for spec in view_topics(task)}

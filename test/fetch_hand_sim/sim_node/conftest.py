@@ -8,7 +8,6 @@ import pytest
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
-from fetch_hand_sim.sim_node.pacing import RealTimePacer
 from fetch_hand_sim.sim_node.robot import Robot
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.simulation import Simulation
@@ -34,11 +33,10 @@ def make(simulations):
     def make(mode='realtime', task='FetchReach', factor=1.0, episodes=0):
         clock, ticks = Clock(), []
         runner = EpisodeRunner(simulations[task], episodes=episodes)
-        pacer = RealTimePacer(0.04, factor, clock.now)
         robot = Robot(
             runner,
             CommandBuffer(runner.spec.robot, 0.5, clock),
-            TickSchedule(mode, pacer),
+            TickSchedule(mode, 0.04, factor, clock.now),
             lambda tick, messages: ticks.append((tick, messages)),
             clock,
         )

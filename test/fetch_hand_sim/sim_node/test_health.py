@@ -44,7 +44,8 @@ def test_report_of_a_healthy_robot(make):
         (
             {'clock_publishers': ['/b/sim_node']},
             Level.ERROR,
-            '/clock comes from /b/sim_node too; start all robots but one with publish_clock:=false',
+            '/clock is also published by /b/sim_node; start all robots but one with '
+            'publish_clock:=false',
         ),
         (
             {'log': 'logging to episodes has failed', 'has_log_failed': True},
@@ -52,14 +53,14 @@ def test_report_of_a_healthy_robot(make):
             'logging to episodes has failed',
         ),
         (
-            {'commander_problems': ['2 publish commands: /a, /b']},
+            {'input_problems': ['2 publish commands: /a, /b']},
             Level.WARN,
             '2 publish commands: /a, /b',
         ),
         (
             {'robots': ['/sim_node', '/sim_node'], 'clock_publishers': ['/other']},
             Level.ERROR,
-            '2 publish as one robot: /sim_node, /sim_node; start each in a namespace of its own: '
+            '2 nodes publish as one robot: /sim_node, /sim_node; give each its own namespace: '
             '--ros-args -r __ns:=/robot2',
         ),
     ],
@@ -90,15 +91,15 @@ def test_only_who_publishes_the_clock_minds_others_who_do(make):
             Level.WARN,
             '1 commands clipped from far out of range; y is 100; allowed: -1 ... 1 x 0.05 m',
         ),
-        ('stalled', Level.WARN, 'tick 1 of episode 0 waits for a valid command; nobody publishes'),
+        ('stalled', Level.WARN, 'tick 1 of episode 0 waits for a valid command; no node publishes'),
         (
             'elsewhere',
             Level.WARN,
-            'nobody publishes any; /policy_node waits for a robot on /episode_status',
+            'no node publishes any; /policy_node waits for a robot on /episode_status',
         ),
         ('stopped', Level.WARN, 'commands have stopped, the robot holds; /policy_node sends none'),
         ('two stopped', Level.WARN, 'the robot holds; /a, /policy_node send none'),
-        ('diverged', Level.ERROR, 'MuJoCo lost the state 1 times'),
+        ('diverged', Level.ERROR, 'the simulation diverged 1 times'),
     ],
 )
 def test_report_says_what_went_wrong_in_the_robot(make, monkeypatch, problem, level, text):
@@ -152,7 +153,7 @@ def test_a_period_with_a_pause_or_another_pace_in_it_is_not_judged(make):
     case.robot.set_real_time_factor(1.0)
     assert pass_a_second().level is Level.OK
     case.clock.now += 1.0
-    assert '0.0 ticks per second, not the 25.0 asked' in health.report(FINE, case.clock.now).message
+    assert '0.0 ticks per second instead of 25.0' in health.report(FINE, case.clock.now).message
 
 
 @pytest.mark.parametrize('factor', [0.01, 0.1])

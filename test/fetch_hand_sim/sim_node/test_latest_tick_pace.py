@@ -6,9 +6,8 @@ import pytest
 
 from fetch_hand_sim.sim_node.latest_tick import LatestTick
 from msgs_spec.codecs import decode_status
-from msgs_spec.latest_tick import split_messages
 from msgs_spec.schemas import deserialize
-from msgs_spec.tick import EpisodeStatus, TickEncoder
+from msgs_spec.tick import EpisodeStatus, TickEncoder, split_messages
 from msgs_spec.topics import LATEST_TICKS_PER_SECOND
 
 
@@ -59,21 +58,21 @@ def test_the_last_tick_before_a_robot_stands_still_is_said_once(case) -> None:
     for _ in range(3):
         case.tick(0.001)
     case.clock.now += 1.0
-    case.latest.say_when_due()
-    case.latest.say_when_due()
+    case.latest.publish_when_due()
+    case.latest.publish_when_due()
     assert case.output.said[-1] == 2 and len(case.output.said) == len(set(case.output.said))
     case.clock.now += 1.0
     case.latest.repeat()
-    case.latest.say_when_due()
+    case.latest.publish_when_due()
     assert case.output.said[-2:] == [2, 2]
 
 
 def test_nothing_is_said_to_nobody_and_who_comes_hears_the_last(case) -> None:
-    case.latest.say_when_due()
+    case.latest.publish_when_due()
     case.output.listeners = 0
     for _ in range(5):
         case.tick(0.1)
     assert case.output.said == []
     case.output.listeners, case.clock.now = 1, case.clock.now + 0.1
-    case.latest.say_when_due()
+    case.latest.publish_when_due()
     assert case.output.said == [4]

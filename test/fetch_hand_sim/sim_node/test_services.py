@@ -9,8 +9,7 @@ from __future__ import annotations
 import sys
 from types import ModuleType, SimpleNamespace
 
-from fetch_hand_sim.sim_node.services import open_services
-from fetch_hand_sim.sim_node.simulation_interfaces import SimulationInterfaces
+from fetch_hand_sim.sim_node.services import SimulationInterfaces, open_services
 from msgs_spec.services import INTERFACE_SERVICES, SERVICES, STANDARD_SERVICES
 
 

@@ -13,7 +13,7 @@ from fetch_hand_sim.view.robot_watch import SeenTick
 from fetch_hand_sim.visualization_node.scalars import Scalars
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.tasks import TASKS, task_spec
-from msgs_spec.view_topics import scalar_topics
+from msgs_spec.topics import scalar_topics
 
 STAMP = 3_000_000_007
 

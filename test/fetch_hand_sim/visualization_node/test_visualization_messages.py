@@ -30,7 +30,7 @@ from fetch_hand_sim.visualization_node.messages import (
 from fetch_hand_sim.visualization_node.transforms import Transforms, frame_prefix, view_transform
 from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TASKS
-from msgs_spec.view_topics import view_topic
+from msgs_spec.topics import view_topic
 from support.frames import tree
 
 STAMP = 3_000_000_007
