@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from fetch_hand_sim.sim_node import simulation_interfaces
+from fetch_hand_sim.sim_node import services
 from fetch_hand_sim.simulation.scene import Frame, Scene
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.rotations import quaternion_to_matrix
@@ -139,7 +139,7 @@ class Simulator:
 
 def test_constants_are_those_of_the_installed_release() -> None:
     messages = needs('simulation_interfaces')
-    ours, result = simulation_interfaces, messages.Result
+    ours, result = services, messages.Result
     assert (ours.FEATURE_UNSUPPORTED, ours.OK, ours.OPERATION_FAILED) == (
         result.RESULT_FEATURE_UNSUPPORTED,
         result.RESULT_OK,
@@ -166,9 +166,7 @@ def test_simulation_interfaces_answer_as_their_definitions_say(start_process: St
         simulator = Simulator(connection)
         features = simulator('get_simulator_features').features
         known = messages.SimulatorFeatures
-        assert set(features.features) == {
-            getattr(known, name) for name in simulation_interfaces.FEATURES
-        }
+        assert set(features.features) == {getattr(known, name) for name in services.FEATURES}
         # What is offered by a service or an action is in the list, and the other way round.
         assert known.STEP_SIMULATION_ACTION not in features.features
         assert known.SIMULATION_RESET_TIME not in features.features
