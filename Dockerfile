@@ -16,7 +16,7 @@ ENV PATH=/ros2_ws/venv/bin:$PATH MUJOCO_GL=egl
 # gigabytes: --build-arg PIP_OPTIONS='--extra-index-url <index>', as in CONTRIBUTING.md.
 ARG PIP_OPTIONS=
 RUN pip install --no-cache-dir $PIP_OPTIONS \
-        'numpy<2' gymnasium gymnasium-robotics==1.4.2 lz4 mcap mujoco==4.0.0 pillow rich rosbags safetensors shtab \
+        'numpy<2' 'setuptools<80' gymnasium gymnasium-robotics==1.4.2 lz4 mcap mujoco==4.0.0 pillow rich rosbags safetensors shtab \
         threadpoolctl torch==2.13.0 websockets zstandard
 
 COPY . src/fetch_hand_sim

@@ -42,7 +42,8 @@ TEST = [
     'pytest',
     'pytest-timeout',
     'pytest-xdist',
-    'setuptools',
+    # colcon-core needs it below 80.
+    'setuptools<80',
     'yourdfpy',
 ]
 

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -75,6 +76,15 @@ def pytest_configure(config: pytest.Config) -> None:
     )
     for variable in ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'):
         os.environ.pop(variable, None)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module:
+    """Override the hook of ROS's `launch_testing`, which imports every module in its folder's name.
+
+    With that hook, a module that skips itself or fails to import ends the collection of its folder.
+    """
+    return pytest.Module.from_parent(parent, path=module_path)
 
 
 @pytest.fixture(scope='session')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
+import re
 import shlex
 import shutil
 import stat
@@ -203,6 +204,20 @@ def test_colcon_test_runs_the_tests(workspace):
     expected = listing.count('::')
     assert expected > 10
     assert counts == {'tests': expected, 'failures': 0, 'errors': 0, 'skipped': 0}
+
+
+def test_colcon_test_collects_every_module(workspace):
+    """Beside the pytest plugin of `launch_testing`, and without optional libraries."""
+    plugin = ('-p', 'support.launch_testing_collection')
+    arguments = ('--collect-only', '-q', *plugin, '-m', 'release or not release')
+    shown = ('--event-handlers', 'console_direct+')
+    output = colcon(workspace, 'test', *shown, '--pytest-args', *arguments).stdout
+    collected = set(re.findall(r'^(test/\S+?\.py)::', output, re.MULTILINE))
+    skipped = set(re.findall(r'^SKIPPED .* (test/\S+?\.py):\d+: could not', output, re.MULTILINE))
+    modules = {name for name in tracked_files() if re.fullmatch(r'test/.*test_\w+\.py', name)}
+    assert modules - collected == skipped, output[-2000:]
+    assert 'test/policy_node/policies/test_foreign_actors.py' in skipped
+    assert len(skipped) < 10
 
 
 def test_installed_sim_node_runs_an_episode(prefix, in_install, start_process, tmp_path):

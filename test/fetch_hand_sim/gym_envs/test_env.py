@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from stable_baselines3 import DDPG, HerReplayBuffer
 
 import fetch_hand_sim
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
@@ -307,12 +306,13 @@ def test_the_flat_view_is_the_concatenation():
 
 
 def test_stable_baselines3_learns_with_hindsight():
+    library = pytest.importorskip('stable_baselines3')
     torch.set_num_threads(1)
     env = make('FetchReach')
-    model = DDPG(
+    model = library.DDPG(
         'MultiInputPolicy',
         env,
-        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_class=library.HerReplayBuffer,
         policy_kwargs={'net_arch': [16]},
         learning_starts=100,
         batch_size=32,

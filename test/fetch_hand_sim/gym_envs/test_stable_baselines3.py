@@ -6,12 +6,15 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+
+from fetch_hand_sim.gym_envs.registration import environment_id
+from support.hindsight import assert_goals_are_exchanged
+
+pytest.importorskip('stable_baselines3')
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from fetch_hand_sim.gym_envs.registration import environment_id
 from fetch_hand_sim.gym_envs.stable_baselines3 import FetchHandVecEnv
-from support.hindsight import assert_goals_are_exchanged
 
 
 @pytest.mark.parametrize('threshold', [None, 10.0])

@@ -12,9 +12,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
 
 import fetch_hand_sim  # noqa: F401  registers the environments
 from fetch_hand_sim.episodes.runner import EpisodeRunner
@@ -28,6 +26,8 @@ from policy_node.policies.loading import TaskMissing, load_actor, load_policy
 from policy_node.policies.shipped import shipped_actors
 from support.fresh_actor import fresh_actor, observations
 
+onnx = pytest.importorskip('onnx')
+TensorProto, helper, numpy_helper = onnx.TensorProto, onnx.helper, onnx.numpy_helper
 REACH = task_spec('FetchReach')
 
 

@@ -7,11 +7,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 
 from policy_node.policies.loading import load_policy
-from policy_node.policies.onnx_export import export
 from support import peak_memory, reset_peak_memory
 from support.fresh_actor import fresh_actor
 
@@ -96,6 +94,8 @@ def test_damaged_and_crafted_checkpoints(change, actor, tmp_path, hostile_count)
 
 def test_damaged_and_crafted_onnx_files(actor, tmp_path, hostile_count) -> None:
     generator = np.random.default_rng(7)
+    onnx = pytest.importorskip('onnx')
+    export = pytest.importorskip('policy_node.policies.onnx_export').export
     source, path = tmp_path / 'a.safetensors', tmp_path / 'a.onnx'
     source.write_bytes(actor)
     export(source, path)

@@ -18,9 +18,12 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks import registry
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
 from policy_node import load_policy
-from policy_node.training import Run, train
 from policy_node.training.runs.trainer import _collecting_thread
 from support import script_environment
+
+for _library in ('matplotlib', 'tensorboard'):
+    pytest.importorskip(_library)
+from policy_node.training import Run, train  # noqa: E402
 
 torch.set_num_threads(1)
 
