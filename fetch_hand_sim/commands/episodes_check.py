@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fetch_hand_sim.episode_log import EpisodeReadError, expand_episodes
-from fetch_hand_sim.episode_log.summary import holds_no_episode
+from fetch_hand_sim.episode_log.files import holds_no_episode
 from fetch_hand_sim.episodes.checker import CheckResult, EpisodeChecker
 from node_runtime.command_line import (
     EXIT_FAILURE,

@@ -22,7 +22,7 @@ from fetch_hand_sim.episode_log import (
     read_summary,
 )
 from fetch_hand_sim.episode_log.arrays import load_episode
-from fetch_hand_sim.episode_log.summary import holds_no_episode
+from fetch_hand_sim.episode_log.files import holds_no_episode
 from node_runtime.command_line import (
     EXIT_FAILURE,
     EXIT_SUCCESS,

@@ -20,12 +20,13 @@ from fetch_hand_sim.commands.options import add_filter_options, is_wanted
 from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeReadError,
+    EpisodeSummary,
     find_episodes,
     find_leftovers,
     read_summary,
 )
-from fetch_hand_sim.episode_log.episode_record import integer_or_none
-from fetch_hand_sim.episode_log.summary import EpisodeSummary, folders_below
+from fetch_hand_sim.episode_log.files import folders_below
+from fetch_hand_sim.episode_log.metadata import integer_or_none
 from msgs_spec.text import printable
 from node_runtime.command_line import (
     EXIT_FAILURE,

@@ -16,7 +16,7 @@ from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeReadError,
     Leftover,
-    durable,
+    files,
     find_leftovers,
     read_summary,
     recover_episode,
@@ -72,9 +72,15 @@ def _run(options: argparse.Namespace) -> int:
 def _find(directory: Path) -> list[Leftover]:
     """The unfinished episodes in a folder; of the folder of one, as lists name it, that one."""
     path = Path(os.path.abspath(directory))
-    if durable.active_name(path) is None:
+    if files.active_name(path) is None:
         return find_leftovers(directory)
     return [each for each in find_leftovers(path.parent) if each.path == path]
+
+
+def _without_messages(leftover: Path) -> str:
+    aside = files.aside_path(leftover.parent, files.active_name(leftover) or '')
+    what = f'moved to {aside}' if aside.exists() else 'removed'
+    return f'{what}: {leftover} was killed before its first messages were written'
 
 
 def _recover(leftover: Path) -> bool:
@@ -82,7 +88,7 @@ def _recover(leftover: Path) -> bool:
     try:
         path = recover_episode(leftover)
         if path is None:
-            say(f'cleared away {leftover}: it was killed before its first messages were written')
+            say(_without_messages(leftover))
             return True
         episode = read_summary(path)
     except EpisodeInUseError as error:
@@ -91,6 +97,9 @@ def _recover(leftover: Path) -> bool:
     except (EpisodeLogError, EpisodeReadError) as error:
         complain(_NAME, error)
         return False
+    aside = files.aside_path(leftover.parent, episode.path.parent.name)
+    if aside.exists():
+        say(f'the damaged file is kept in {aside}')
     state = 'complete' if episode.is_complete else 'marked as interrupted'
     say(
         f'recovered {episode.path.parent}: {episode.message_count} messages, '

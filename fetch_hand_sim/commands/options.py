@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
-from fetch_hand_sim.episode_log.episode_record import HasOutcome
+from fetch_hand_sim.episode_log.metadata import HasOutcome
 from msgs_spec.parameters import LARGEST_PICTURE_SIDE
 from msgs_spec.tasks import TASKS
 

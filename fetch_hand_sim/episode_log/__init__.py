@@ -1,27 +1,23 @@
 """Episodes as MCAP files: one rosbag2 bag per episode, complete or marked as interrupted."""
 
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episodes
-from fetch_hand_sim.episode_log.episode_metadata import episode_metadata
-from fetch_hand_sim.episode_log.episode_record import EpisodeOutcome, EpisodeRecord
-from fetch_hand_sim.episode_log.episodes import EpisodeDirectory, episode_name
+from fetch_hand_sim.episode_log.bag import Attachment, LogSettings
 from fetch_hand_sim.episode_log.errors import (
     EpisodeExistsError,
     EpisodeInUseError,
     EpisodeLogError,
     EpisodeReadError,
 )
-from fetch_hand_sim.episode_log.leftovers import Leftover, find_leftovers
-from fetch_hand_sim.episode_log.log_times import log_time
-from fetch_hand_sim.episode_log.reader import Episode, read_episode
-from fetch_hand_sim.episode_log.recovery import recover_episode
-from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
-from fetch_hand_sim.episode_log.summary import (
-    EpisodeSummary,
-    expand_episodes,
-    find_episodes,
-    read_summary,
+from fetch_hand_sim.episode_log.files import expand_episodes, find_episodes
+from fetch_hand_sim.episode_log.metadata import EpisodeOutcome, EpisodeRecord, episode_metadata
+from fetch_hand_sim.episode_log.reader import Episode, EpisodeSummary, read_episode, read_summary
+from fetch_hand_sim.episode_log.recovery import Leftover, find_leftovers, recover_episode
+from fetch_hand_sim.episode_log.writer import (
+    EpisodeDirectory,
+    EpisodeWriter,
+    episode_name,
+    log_time,
 )
-from fetch_hand_sim.episode_log.writer import EpisodeWriter
 
 __all__ = [
     'Attachment',

@@ -1,4 +1,4 @@
-"""Episodes as arrays, to learn from: a file at a time, not a message at a time."""
+"""Load episodes as arrays for learning."""
 
 from __future__ import annotations
 
@@ -10,20 +10,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.episode_log.episode_record import EpisodeOutcome, EpisodeRecord, HasOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
-from fetch_hand_sim.episode_log.messages import MessageFile, MessageRows, read_messages
-from fetch_hand_sim.episode_log.reader import episode_records
-from fetch_hand_sim.episode_log.summary import expand_episodes
+from fetch_hand_sim.episode_log.files import expand_episodes
+from fetch_hand_sim.episode_log.metadata import EpisodeOutcome, EpisodeRecord, HasOutcome
+from fetch_hand_sim.episode_log.reader import EpisodeFile, MessageRows, read_file
 from msgs_spec.actions import action_from_command
 from msgs_spec.arrays import Array, Flags
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import TaskSpec
-from msgs_spec.topics import relative_name, topic
+from msgs_spec.topics import topic
 
 
-# Compared by identity: arrays compare number by number, and cannot say whether all are equal.
+# Compared by identity, because `==` of arrays is an array.
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeArrays(HasOutcome):
     """One episode of N steps.
@@ -32,19 +31,19 @@ class EpisodeArrays(HasOutcome):
 
     Attributes:
         path: The MCAP file.
-        spec: The task, `episode_ticks` as many as the episode has where it is whole.
+        spec: The task with the `episode_ticks` of the episode.
         observations: `observation`, `achieved_goal` and `desired_goal`, (N + 1, size) each, as
             `Simulation` returns them, bit for bit.
         actions: (N, action size), normalised to [-1, 1].
-        commands: (N, action size), what was applied, command units.
+        commands: (N, action size), applied commands, command units.
         rewards: (N,).
         terminated: (N,): no task ends in a terminal state, so all False.
         truncated: (N,): True at the last step, where time, divergence or an interruption ended it.
         success: (N + 1,): whether the goal was reached.
         stamps: (N + 1,) simulated time, nanoseconds.
-        metadata: The record `episode`, and
-        record: the same, typed.
-        result: The record `episode_result`; `outcome` is the same, typed.
+        metadata: The record `episode`.
+        record: The same, parsed.
+        result: The record `episode_result`; `outcome` is the same, parsed.
     """
 
     path: Path
@@ -66,20 +65,21 @@ class EpisodeArrays(HasOutcome):
 
     @property
     def goals(self) -> Array:
-        """Desired goals, (N + 1, goal size); they change where somebody set another."""
+        """Desired goals, (N + 1, goal size); they change when a user sets another goal."""
         return self.observations['desired_goal']
 
 
 def load_episodes(
     path: Path | str, on_skip: Callable[[EpisodeReadError], None] | None = None
 ) -> list[EpisodeArrays]:
-    """Loads one episode, or all of a directory of episodes, by name.
+    """Load one episode, or all of a directory of episodes, by name.
 
-    Interrupted episodes come too, as far as their ticks are whole; `is_complete` tells them.
+    Interrupted episodes are included up to their last whole tick; `is_complete` marks them.
 
     Args:
         path: A bag directory, an MCAP file, or a directory of either.
-        on_skip: Called for what cannot be read, which is left out then; None raises instead.
+        on_skip: Called with the error of each unreadable episode, which is left out; None raises
+            that error.
 
     Raises:
         EpisodeReadError: If the path, or with `on_skip` None any episode, cannot be read.
@@ -96,11 +96,10 @@ def load_episodes(
 
 
 def load_episode(path: Path) -> EpisodeArrays:
-    """Loads one episode; see `load_episodes`."""
-    file = read_messages(path)
-    metadata, result = episode_records(file.path, file.metadata)
+    """Load one episode; see `load_episodes`."""
+    file = read_file(path)
     try:
-        return _Decoder(file, metadata).decode(result)
+        return _Decoder(file).decode()
     except EpisodeReadError:
         raise
     except (ValueError, KeyError) as error:
@@ -120,27 +119,25 @@ def _assembler(task: TaskSpec, control_hz: float) -> ObservationAssembler:
 class _Decoder:
     """Decodes the topics of one file and joins them by tick."""
 
-    def __init__(self, file: MessageFile, metadata: dict[str, str]) -> None:
+    def __init__(self, file: EpisodeFile) -> None:
         self._file = file
-        self._metadata = metadata
-        self._record = EpisodeRecord.parse(metadata)
+        self._record = EpisodeRecord.parse(file.metadata)
         self._task = self._record.task
         self._assembler = _assembler(self._task, self._record.control_hz)
-        self._resolved = {relative_name(name): name for name in file.offsets}
 
-    def decode(self, result: dict[str, str]) -> EpisodeArrays:
-        states = {spec.name: self._rows(spec.name) for spec in self._assembler.topics}
-        success = self._rows('is_success')
-        # Of an episode that was cut off, the last tick may be there in part.
+    def decode(self) -> EpisodeArrays:
+        states = {spec.name: self._file.rows(spec.name) for spec in self._assembler.topics}
+        success = self._file.rows('is_success')
+        # A cut-off episode may contain a part of its last tick.
         ticks = min(len(rows.data) for rows in (*states.values(), success))
-        ticks = min(ticks, 1 + self._file.count(self._name('applied_command')))
+        ticks = min(ticks, 1 + self._file.count('applied_command'))
         stamps, vectors = self._states(states, ticks)
         rewards = self._steps('reward', stamps)[:, 0]
         commands = self._steps('applied_command', stamps)
         steps = ticks - 1
-        outcome = EpisodeOutcome.parse(result)
+        outcome = EpisodeOutcome.parse(self._file.result)
         if outcome.is_complete and outcome.steps not in (None, steps):
-            raise ValueError(f'it says {outcome.steps} steps and holds {steps}')
+            raise ValueError(f'it records {outcome.steps} steps and contains {steps}')
         return EpisodeArrays(
             path=self._file.path,
             spec=self._record.spec,
@@ -152,22 +149,15 @@ class _Decoder:
             truncated=np.arange(steps) == steps - 1,
             success=self._decoded('is_success', success, stamps, first=0)[:, 0] != 0.0,
             stamps=stamps,
-            metadata=self._metadata,
+            metadata=self._file.metadata,
             record=self._record,
-            result=result,
+            result=self._file.result,
         )
-
-    def _rows(self, name: str) -> MessageRows:
-        return self._file.rows(self._name(name))
-
-    def _name(self, name: str) -> str:
-        """The name of a topic in the file."""
-        return self._resolved.get(name, name)
 
     def _states(
         self, rows: dict[str, MessageRows], ticks: int
     ) -> tuple[NDArray[np.int64], dict[str, Array]]:
-        """Vectors of the observed topics, which share the stamp of each tick."""
+        """Return stamps and vectors of the observed topics, which share the stamp of each tick."""
         vectors: dict[str, Array] = {}
         stamps: NDArray[np.int64] | None = None
         for name, found in rows.items():
@@ -181,15 +171,15 @@ class _Decoder:
         return stamps, vectors
 
     def _steps(self, name: str, stamps: NDArray[np.int64]) -> Array:
-        """Vectors of a topic that starts with the first step."""
+        """Return the vectors of a topic that starts with the first step."""
         if len(stamps) == 1:
             return np.zeros((0, topic(self._task, name).size))
-        return self._decoded(name, self._rows(name), stamps, first=1)
+        return self._decoded(name, self._file.rows(name), stamps, first=1)
 
     def _decoded(
         self, name: str, rows: MessageRows, stamps: NDArray[np.int64], first: int
     ) -> Array:
-        """Vectors of a topic without stamps, whose log times tell the tick."""
+        """Return the vectors of a topic without stamps; log times give the ticks."""
         count = len(stamps) - first
         ticks = np.searchsorted(stamps, rows.log_times[:count], side='right') - 1
         if not np.array_equal(ticks, np.arange(first, len(stamps))):

@@ -1,44 +1,294 @@
-"""Reads an episode back: raw messages per topic, metadata records, attachments."""
+"""Read episode files. All commands read them through `read_file`, so they accept the same files."""
 
 from __future__ import annotations
 
 import shlex
-import struct
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
-from typing import BinaryIO
 
-import zstandard
-from mcap.exceptions import McapError
-from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Metadata, Schema
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys import get_types_from_msg
+from rosbags.typesys.base import TypesysError
 
-from fetch_hand_sim.episode_log import durable
-from fetch_hand_sim.episode_log.episode_bag import EPISODE, EPISODE_RESULT
-from fetch_hand_sim.episode_log.episode_record import HasOutcome
+from fetch_hand_sim.episode_log import files
+from fetch_hand_sim.episode_log.bag import EPISODE, EPISODE_RESULT
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
-from fetch_hand_sim.episode_log.limits import MAX_SUMMARY_BYTES
-from fetch_hand_sim.episode_log.untrusted import read_records, require_size
-from msgs_spec.text import one_line
-
-# CRC of the summary and magic, bytes.
-FILE_END = 4 + 8
-
-# What the mcap package and its decompressors raise on damaged bytes.
-DAMAGED = (
-    McapError,
-    ValueError,
-    KeyError,
-    IndexError,
-    OverflowError,
-    MemoryError,
-    RuntimeError,
-    EOFError,
-    struct.error,
-    zstandard.ZstdError,
+from fetch_hand_sim.episode_log.indexes import parse_file
+from fetch_hand_sim.episode_log.limits import MAX_FILE_BYTES
+from fetch_hand_sim.episode_log.metadata import HasOutcome, parse_task
+from fetch_hand_sim.episode_log.records import (
+    MESSAGE,
+    MESSAGE_FIELD_BYTES,
+    AttachmentRecord,
+    Channel,
+    Contents,
+    Messages,
+    Schema,
+    shown,
 )
+from msgs_spec.codecs import message_stamp
+from msgs_spec.schemas import deserialize, schema_text
+from msgs_spec.tasks import TaskSpec
+from msgs_spec.text import one_line
+from msgs_spec.topics import TopicSpec, ground_truth_topics, relative_name, topics
+
+_CLOCK = '/clock'
+# Characters of a message definition without comments; the longest of the contract has 1,700.
+_LONGEST_SCHEMA = 8000
+
+
+@dataclass(frozen=True, slots=True)
+class MessageRows:
+    """The messages of one topic, in order of log time.
+
+    Attributes:
+        log_times: (n,), nanoseconds.
+        data: (n, size) CDR bytes.
+    """
+
+    log_times: NDArray[np.int64]
+    data: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeFile(HasOutcome):
+    """An episode file, checked as a whole.
+
+    Attributes:
+        path: The MCAP file.
+        metadata: The record `episode`.
+        result: The record `episode_result`.
+        attachments: All attachments.
+        schemas: By id.
+        channels: By id; no two have the same topic.
+        messages: All messages, sorted by log time.
+        size_bytes: Size of the file.
+    """
+
+    path: Path
+    metadata: dict[str, str]
+    result: dict[str, str]
+    attachments: list[AttachmentRecord]
+    schemas: dict[int, Schema]
+    channels: dict[int, Channel]
+    messages: Messages
+    size_bytes: int
+
+    def count(self, name: str) -> int:
+        """Return the number of messages of a topic, named as the contract names it."""
+        return len(self._indices(name))
+
+    def rows(self, name: str) -> MessageRows:
+        """Return the messages of a topic, named as the contract names it.
+
+        Raises:
+            EpisodeReadError: If there are none, or not all have the same size.
+        """
+        indices = self._indices(name)
+        starts, headers = self.messages.starts[indices], self.messages.headers[indices]
+        sizes = np.unique(headers['size']).tolist()
+        if len(sizes) != 1:
+            found = f'sizes {sizes[:5]}' if sizes else 'no message'
+            raise EpisodeReadError(f'{self.path}: {found} of {name}; one size is needed')
+        size = sizes[0] - MESSAGE_FIELD_BYTES
+        buffer = np.frombuffer(self.messages.unpacked, np.uint8)
+        data = buffer[starts[:, None] + np.arange(MESSAGE.itemsize, MESSAGE.itemsize + size)]
+        return MessageRows(headers['log_time'].astype(np.int64), data)
+
+    def _indices(self, name: str) -> NDArray[np.int64]:
+        for id, channel in self.channels.items():
+            if relative_name(channel.topic) == name.lstrip('/'):
+                return np.flatnonzero(self.messages.headers['channel'] == id)
+        return np.zeros(0, dtype=np.int64)
+
+
+def read_file(path: Path | str) -> EpisodeFile:
+    """Read an episode file with all checks.
+
+    Args:
+        path: The bag directory, or its MCAP file.
+
+    Raises:
+        EpisodeReadError: If there is no such file, it is damaged, ambiguous or no episode, or its
+            topics are not those of its task.
+    """
+    file = files.mcap_file(Path(path))
+    with one_line_errors(file):
+        with file.open('rb') as stream:
+            data = stream.read(MAX_FILE_BYTES + 1)
+        if len(data) > MAX_FILE_BYTES:
+            raise ValueError(f'a file of more than {MAX_FILE_BYTES} bytes')
+        contents, messages = parse_file(data)
+        records = {record.name: record.content for record in contents.metadata}
+        for name in (EPISODE, EPISODE_RESULT):
+            if name not in records:
+                raise ValueError(
+                    f'no episode, there is no metadata record {name!r}; some tools that convert '
+                    'bags leave it out'
+                )
+        require_contract(records[EPISODE], contents)
+        return EpisodeFile(
+            path=file,
+            metadata=records[EPISODE],
+            result=records[EPISODE_RESULT],
+            attachments=contents.attachments,
+            schemas=contents.schemas,
+            channels=contents.channels,
+            messages=messages,
+            size_bytes=len(data),
+        )
+
+
+@contextmanager
+def one_line_errors(file: Path) -> Iterator[None]:
+    """Turn the errors of a file into `EpisodeReadError`, in one line that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise EpisodeReadError(f'{file}: {error.strerror or error}') from error
+    except EpisodeReadError:
+        raise
+    except (ValueError, MemoryError) as error:
+        reason = _why_unfinished(file) or one_line(error)
+        raise EpisodeReadError(f'{file}: {reason}') from error
+
+
+def _why_unfinished(file: Path) -> str:
+    """Return what to do about a file in the hidden directory of an episode; '' for others."""
+    if files.active_name(file.parent) is None:
+        return ''
+    with suppress(OSError):
+        if files.is_locked(file):
+            return 'still being written'
+    directory = shlex.quote(str(file.parent.parent))
+    return (
+        f'truncated by a kill or a full disk; `fetch_hand_sim episodes recover {directory}` ends it'
+    )
+
+
+# The contract
+
+
+def require_contract(metadata: dict[str, str], contents: Contents) -> None:
+    """Compare names, types and definitions of the topics with those of the task.
+
+    Topics of an unknown task are not compared: nothing can decode them.
+
+    Raises:
+        ValueError: If a topic, its type or its definition is not that of the task, or the topics
+            have different namespaces.
+    """
+    try:
+        task = parse_task(metadata)
+    except ValueError:
+        return
+    known = _known_topics(task)
+    namespaces = set()
+    for channel in contents.channels.values():
+        spec = known.get(relative_name(channel.topic))
+        schema = contents.schemas.get(channel.schema_id)
+        type_name = schema.name if schema else 'none'
+        if spec is None or spec.type_name != type_name:
+            raise ValueError(
+                f'{task.name} has no topic {shown(channel.topic)} of type {shown(type_name)}'
+            )
+        if (channel.encoding, schema and schema.encoding) != ('cdr', 'ros2msg'):
+            raise ValueError(
+                f'{channel.topic} has the encodings {shown(channel.encoding)} and '
+                f'{shown(schema.encoding if schema else "")}; allowed: cdr, ros2msg'
+            )
+        if schema and not _defines(spec.type_name, schema.text):
+            raise ValueError(f'{channel.topic} has another definition of {type_name} than ROS 2')
+        if spec.name.startswith('/') and spec.name != channel.topic:
+            raise ValueError(f'topic {shown(channel.topic)}; allowed: {spec.name}')
+        if not spec.name.startswith('/'):
+            namespaces.add(channel.topic.removesuffix(f'/{spec.name}'))
+    if len(namespaces) > 1:
+        found = ', '.join(map(shown, sorted(namespaces)[:3]))
+        raise ValueError(f'topics in several namespaces, {found}; allowed: one')
+
+
+def contract_topics(metadata: dict[str, str]) -> dict[str, TopicSpec]:
+    """Return the topics of the task of an episode, by name without a leading slash.
+
+    Raises:
+        ValueError: If the task is unknown.
+    """
+    return _known_topics(parse_task(metadata))
+
+
+@lru_cache(maxsize=256)
+def _known_topics(task: TaskSpec) -> dict[str, TopicSpec]:
+    specs = (*topics(task), *ground_truth_topics(task))
+    return {spec.name.lstrip('/'): spec for spec in specs}
+
+
+@lru_cache(maxsize=256)
+def _defines(type_name: str, text: bytes) -> bool:
+    """Whether a `ros2msg` text has the fields that ROS 2 Jazzy gives the type."""
+    expected = schema_text(type_name)
+    if text == expected.encode():
+        return True
+    lines = text.decode(errors='replace').splitlines()
+    stripped = (line.partition('#')[0].strip() for line in lines)
+    short = '\n'.join(line for line in stripped if line)
+    if len(short) > _LONGEST_SCHEMA:
+        return False
+    try:
+        found = get_types_from_msg(short, type_name)
+    except (TypesysError, RecursionError, KeyError):
+        return False
+    known = get_types_from_msg(expected, type_name)
+    return all(name in found and found[name][1] == fields for name, (_, fields) in known.items())
+
+
+# Summaries and whole episodes
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeSummary(HasOutcome):
+    """An episode without its messages.
+
+    Attributes:
+        path: The MCAP file.
+        metadata: The record `episode`.
+        result: The record `episode_result`.
+        message_count: Messages in the file.
+        duration_s: Simulated seconds from the first message to the last.
+        size_bytes: Size of the file.
+    """
+
+    path: Path
+    metadata: dict[str, str]
+    result: dict[str, str]
+    message_count: int
+    duration_s: float
+    size_bytes: int
+
+
+def read_summary(path: Path | str) -> EpisodeSummary:
+    """Read what an episode is and how it ended, with the checks of `read_episode`.
+
+    Args:
+        path: The bag directory, or its MCAP file.
+
+    Raises:
+        EpisodeReadError: If there is no such file, or it is damaged, ambiguous or no episode.
+    """
+    file = read_file(path)
+    times = file.messages.headers['log_time']
+    return EpisodeSummary(
+        path=file.path,
+        metadata=file.metadata,
+        result=file.result,
+        message_count=len(times),
+        duration_s=(int(times[-1]) - int(times[0])) / 1e9 if len(times) else 0.0,
+        size_bytes=file.size_bytes,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +296,14 @@ class LoggedMessage:
     """One message.
 
     Attributes:
-        log_time_ns: Simulated time plus rank, see `log_times`.
+        log_time_ns: Simulated time plus rank, see `log_time`.
+        publish_time_ns: The same.
         sequence: Number of the message in its topic, from 0.
         data: CDR bytes; `msgs_spec.schemas.deserialize` reads them.
     """
 
     log_time_ns: int
+    publish_time_ns: int
     sequence: int
     data: bytes
 
@@ -75,7 +327,7 @@ class LoggedTopic:
 
 @dataclass(frozen=True, slots=True)
 class Episode(HasOutcome):
-    """What a file says.
+    """An episode with all its messages.
 
     Attributes:
         path: The MCAP file.
@@ -93,129 +345,131 @@ class Episode(HasOutcome):
 
 
 def read_episode(path: Path | str) -> Episode:
-    """Reads an episode with all checks.
+    """Read an episode with all its messages.
 
     Args:
         path: The bag directory, or its MCAP file.
 
     Raises:
-        EpisodeReadError: If there is no such file, or it is truncated, damaged or no episode.
+        EpisodeReadError: If there is no such file, or it is damaged, ambiguous or no episode.
     """
-    file = mcap_file(Path(path))
-    contents = _Contents()
-    with one_line_errors(file), file.open('rb') as stream:
-        for record in read_records(stream):
-            contents.take(record)
-        check_summary(stream, contents.summary_start, contents.summary_crc)
-    metadata, result = episode_records(file, contents.metadata)
-    return Episode(file, contents.topics, metadata, result, contents.attachments)
-
-
-class _Contents:
-    """What the records of a file add up to."""
-
-    def __init__(self) -> None:
-        self.topics: dict[str, LoggedTopic] = {}
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.attachments: dict[str, bytes] = {}
-        self.summary_start = 0
-        self.summary_crc = 0
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, LoggedTopic] = {}
-
-    def take(self, record: McapRecord) -> None:
-        match record:
-            case Message():
-                self._channels[record.channel_id].messages.append(
-                    LoggedMessage(record.log_time, record.sequence, record.data)
-                )
-            case Metadata():
-                self.metadata[record.name] = dict(record.metadata)
-            case Attachment():
-                self.attachments[record.name] = record.data
-            case Footer():
-                self.summary_start, self.summary_crc = record.summary_start, record.summary_crc
-            case Schema():
-                self._schemas[record.id] = record
-            case Channel() if record.id not in self._channels:
-                self.topics[record.topic] = self._channels[record.id] = LoggedTopic(
-                    type_name=self._schemas[record.schema_id].name,
-                    qos_yaml=record.metadata.get('offered_qos_profiles', ''),
-                    type_hash=record.metadata.get('topic_type_hash', ''),
-                )
-
-
-def episode_records(
-    file: Path, records: Mapping[str, dict[str, str]]
-) -> tuple[dict[str, str], dict[str, str]]:
-    """Returns what makes a file an episode: its records `episode` and `episode_result`.
-
-    Raises:
-        EpisodeReadError: If one is missing.
-    """
-    for name in (EPISODE, EPISODE_RESULT):
-        if name not in records:
-            reason = _unfinished(file) or f'no episode, there is no metadata record {name!r}'
-            raise EpisodeReadError(f'{file}: {reason}')
-    return records[EPISODE], records[EPISODE_RESULT]
-
-
-def check_summary(stream: BinaryIO, start: int, expected_crc: int) -> None:
-    """Checks the one CRC that `StreamReader` leaves out; it covers all but itself and the magic."""
-    if require_size(stream) - start > MAX_SUMMARY_BYTES:
-        raise ValueError(f'summary larger than {MAX_SUMMARY_BYTES} bytes')
-    stream.seek(start)
-    if expected_crc not in (0, zlib.crc32(stream.read()[:-FILE_END])):
-        raise ValueError('crc validation failed in Summary')
-
-
-def mcap_file(path: Path) -> Path:
-    """Returns the MCAP file of a bag directory, or the path itself if it is no directory.
-
-    Raises:
-        EpisodeReadError: If the directory does not hold exactly one, or cannot be read.
-    """
-    try:
-        if not path.is_dir():
-            if path.exists() and not path.is_file():
-                raise EpisodeReadError(f'{path} is no regular file')  # A pipe would never end.
-            return path
-        # `glob` finds nothing where it may not look.
-        files = sorted(file for file in path.iterdir() if is_mcap(file) and file.is_file())
-    except OSError as error:
-        raise EpisodeReadError(f'{path}: {error.strerror}') from error
-    if len(files) != 1:
-        raise EpisodeReadError(
-            f'{path} holds {len(files)} MCAP files; an episode is a directory of one'
-        )
-    return files[0]
-
-
-def is_mcap(path: Path) -> bool:
-    """Whether a name is that of an MCAP file, and of none that macOS puts beside it in archives."""
-    return path.suffix == '.mcap' and not path.name.startswith('._')
-
-
-@contextmanager
-def one_line_errors(file: Path) -> Iterator[None]:
-    """Says in one line what is wrong with a file, whatever noticed it."""
-    try:
-        yield
-    except OSError as error:
-        raise EpisodeReadError(f'{file}: {error.strerror or error}') from error
-    except DAMAGED as error:
-        reason = _unfinished(file) or f'truncated, damaged or no MCAP file ({one_line(error)})'
-        raise EpisodeReadError(f'{file}: {reason}') from error
-
-
-def _unfinished(file: Path) -> str:
-    """What to say of a file in the hidden directory of an episode; empty for others."""
-    if durable.active_name(file.parent) is None:
-        return ''
-    with suppress(OSError):
-        if durable.is_locked(file):
-            return 'still being written'
-    directory = shlex.quote(str(file.parent.parent))
-    return (
-        f'truncated by a kill or a full disk; `fetch_hand_sim episodes recover {directory}` ends it'
+    file = read_file(path)
+    found: dict[int, LoggedTopic] = {}
+    for id, sequence, log_time, publish_time, data in file.messages.rows():
+        if id not in found:
+            found[id] = _logged_topic(file, id)
+        found[id].messages.append(LoggedMessage(log_time, publish_time, sequence, data))
+    return Episode(
+        path=file.path,
+        topics={file.channels[id].topic: logged for id, logged in found.items()},
+        metadata=file.metadata,
+        result=file.result,
+        attachments={each.name: each.data for each in file.attachments},
     )
+
+
+def _logged_topic(file: EpisodeFile, id: int) -> LoggedTopic:
+    channel = file.channels[id]
+    schema = file.schemas.get(channel.schema_id)
+    return LoggedTopic(
+        type_name=schema.name if schema else '',
+        qos_yaml=channel.metadata.get('offered_qos_profiles', ''),
+        type_hash=channel.metadata.get('topic_type_hash', ''),
+    )
+
+
+# Episodes tick by tick
+
+
+@dataclass(frozen=True, slots=True)
+class TickMessage:
+    """A message of a tick.
+
+    Attributes:
+        topic: Its topic; the name is relative to the namespace of the robot.
+        logged: The message.
+        number: Number of the message in its topic, from 0.
+    """
+
+    topic: TopicSpec
+    logged: LoggedMessage
+    number: int
+
+    @property
+    def log_time_ns(self) -> int:
+        """Log time in nanoseconds."""
+        return self.logged.log_time_ns
+
+    @property
+    def data(self) -> bytes:
+        """CDR bytes."""
+        return self.logged.data
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedTick:
+    """The messages from one stamp to the next.
+
+    Attributes:
+        stamp_ns: Stamp of the tick.
+        published: Messages that the robot published, in order.
+        received: Messages that the robot received after them, in order.
+    """
+
+    stamp_ns: int
+    published: list[TickMessage] = field(default_factory=list)
+    received: list[TickMessage] = field(default_factory=list)
+
+    def find(self, name: str) -> TickMessage | None:
+        """Return the published message of a topic, or None."""
+        return next((m for m in self.published if m.topic.name == name), None)
+
+
+def logged_topics(episode: Episode) -> dict[str, TopicSpec]:
+    """Return the topics of an episode as its task defines them, by resolved name.
+
+    Raises:
+        EpisodeReadError: If the task is unknown, or the episode has no messages.
+    """
+    try:
+        known = contract_topics(episode.metadata)
+    except ValueError as error:
+        raise EpisodeReadError(f'{episode.path}: {error}') from error
+    if not episode.topics:
+        raise EpisodeReadError(f'{episode.path}: an episode without messages')
+    return {name: known[relative_name(name)] for name in episode.topics}
+
+
+def split_ticks(episode: Episode) -> list[LoggedTick]:
+    """Return the ticks of an episode in order; each begins with `/clock`.
+
+    Raises:
+        EpisodeReadError: If the task is unknown, or the messages do not begin with a clock.
+    """
+    specs = logged_topics(episode)
+    messages = sorted(
+        (
+            TickMessage(specs[name], message, number)
+            for name, logged in episode.topics.items()
+            for number, message in enumerate(logged.messages)
+        ),
+        key=lambda message: message.log_time_ns,
+    )
+    ticks: list[LoggedTick] = []
+    for message in messages:
+        if message.topic.name == _CLOCK:
+            ticks.append(LoggedTick(_stamp(episode, message)))
+        if not ticks:
+            raise EpisodeReadError(
+                f'{episode.path}: the first message is of {message.topic.name}, not {_CLOCK}'
+            )
+        is_published = message.topic.direction == 'published'
+        (ticks[-1].published if is_published else ticks[-1].received).append(message)
+    return ticks
+
+
+def _stamp(episode: Episode, clock: TickMessage) -> int:
+    try:
+        return message_stamp(deserialize(clock.topic.type_name, clock.data))
+    except ValueError as error:
+        raise EpisodeReadError(f'{episode.path}: unreadable clock ({one_line(error)})') from error

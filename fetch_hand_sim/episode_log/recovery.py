@@ -1,140 +1,173 @@
-"""Makes a valid bag of a cut-off episode: what reached the disk, marked as interrupted."""
+"""Find episodes that a killed process or a full disk cut off, and make valid bags of them.
+
+Every folder may contain anything. An entry that looks like a leftover but is none is reported with
+its problem; it is never followed, waited for or entered.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
+import shutil
+import stat
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
-from mcap import records
-from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from fetch_hand_sim.episode_log import durable
-from fetch_hand_sim.episode_log.bag_metadata import ChannelSpec
-from fetch_hand_sim.episode_log.episode_bag import (
+from fetch_hand_sim.episode_log import files
+from fetch_hand_sim.episode_log.bag import (
     EPISODE,
     EPISODE_RESULT,
-    begin_bag,
+    Attachment,
+    BagFile,
+    LogSettings,
     checked_strings,
-    end_bag,
-    store_bag,
 )
-from fetch_hand_sim.episode_log.episode_record import EpisodeOutcome
 from fetch_hand_sim.episode_log.errors import EpisodeInUseError, EpisodeLogError
-from fetch_hand_sim.episode_log.leftovers import inspect_leftover
-from fetch_hand_sim.episode_log.limits import ReceivedAllowance
-from fetch_hand_sim.episode_log.offered_qos import parse_offered_qos
-from fetch_hand_sim.episode_log.reader import DAMAGED, read_episode
-from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
-from fetch_hand_sim.episode_log.untrusted import RECOVERY_LIMITS, read_records
-from msgs_spec.schemas import deserialize
-from msgs_spec.tasks import TASKS
-from msgs_spec.text import one_line
-from msgs_spec.topics import relative_name, topics
-
-_RECEIVED = frozenset(
-    spec.name for task in TASKS.values() for spec in topics(task) if spec.direction == 'subscribed'
+from fetch_hand_sim.episode_log.indexes import require_one_meaning
+from fetch_hand_sim.episode_log.limits import MAX_FILE_BYTES
+from fetch_hand_sim.episode_log.metadata import EpisodeOutcome
+from fetch_hand_sim.episode_log.reader import contract_topics, read_file, require_contract
+from fetch_hand_sim.episode_log.records import (
+    RECORD,
+    RECOVERY_LIMITS,
+    Contents,
+    Fields,
+    TornError,
+    split_records,
 )
+from fetch_hand_sim.episode_log.writer import ReceivedAllowance
+from msgs_spec.cdr import TopicCodec
+from msgs_spec.text import one_line, printable
+from msgs_spec.topics import TopicSpec, relative_name
+
+# Bytes that may be lost without a copy: part of a record, but no message with a tick of data.
+_FEW_BYTES = 64
+# Records that a writer begins a file with; a kill may tear them.
+_AT_THE_START = frozenset({Opcode.METADATA, Opcode.ATTACHMENT})
+_COUNTED = ('reward', 'is_success', 'applied_command')
 
 
-@dataclass(slots=True)
-class _Remains:
-    """What can be read of a file, up to the first damage."""
+@dataclass(frozen=True, slots=True)
+class Leftover:
+    """An episode that was not completed.
 
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    attachments: list[Attachment] = field(default_factory=list)
-    schemas: dict[int, records.Schema] = field(default_factory=dict)
-    channels: dict[int, records.Channel] = field(default_factory=dict)
-    messages: list[records.Message] = field(default_factory=list)
-    is_torn: bool = False
-    is_whole: bool = False
-    has_chunk: bool = False
+    Attributes:
+        name: Name of the episode.
+        path: Its hidden directory.
+        size_bytes: Size of its files.
+        age_s: Seconds since the last write.
+        problem: Why no robot can have left it like this; '' if one may have.
+    """
 
-    def take(self, record: records.McapRecord) -> None:
-        match record:
-            case records.Message():
-                self.messages.append(record)
-            case records.Chunk():
-                self.has_chunk = True
-            case records.Channel():
-                self.channels[record.id] = record
-            case records.Schema():
-                self.schemas[record.id] = record
-            case records.Attachment():
-                self.attachments.append(Attachment(record.name, record.media_type, record.data))
-            case records.Metadata():
-                self.metadata[record.name] = dict(record.metadata)
-            case records.Footer():
-                self.is_whole = True
+    name: str
+    path: Path
+    size_bytes: int
+    age_s: float
+    problem: str = ''
 
-    @property
-    def was_killed_at_the_start(self) -> bool:
-        """Whether the file ends before its first whole chunk, and is not damaged so far."""
-        return self.is_torn and not self.has_chunk
-
-    @property
-    def result(self) -> dict[str, str]:
-        """How the episode ended; only a file that is whole knows."""
-        if self.is_whole and EPISODE_RESULT in self.metadata:
-            return self.metadata[EPISODE_RESULT]
-        return self._outcome().to_strings()
-
-    def _outcome(self) -> EpisodeOutcome:
-        """Steps, return and success up to the last whole tick."""
-        cut_off = EpisodeOutcome(is_complete=False, reason='cut off, recovered later')
-        # `applied_command` comes last among the topics with a number per tick.
-        steps = len(self._values('applied_command'))
-        rewards, successes = self._values('reward'), self._values('is_success')
-        if len(rewards) < steps or len(successes) <= steps:
-            return cut_off
-        return replace(
-            cut_off,
-            steps=steps,
-            episode_return=float(sum(rewards[:steps])),
-            is_success=bool(successes[steps]),
+    def __str__(self) -> str:
+        if self.problem:
+            return printable(f'no episode of a robot: {self.problem}')
+        return printable(
+            f'unfinished episode {self.name}: {self.size_bytes / 1024:.0f} KiB in {self.path}, '
+            f'last written {self.age_s:.0f} s ago'
         )
 
-    def _values(self, name: str) -> list[Any]:
-        """The `data` of all messages of a topic of std_msgs."""
-        types = {
-            id: self.schemas[channel.schema_id].name
-            for id, channel in self.channels.items()
-            if relative_name(channel.topic) == name
-        }
-        found = [m for m in self.messages if m.channel_id in types]
-        try:
-            return [deserialize(types[m.channel_id], m.data).data for m in found]
-        except ValueError:
-            return []
+
+def find_leftovers(directory: Path | str, now_s: float | None = None) -> list[Leftover]:
+    """Return the unfinished episodes in a directory by name, without those in progress.
+
+    Args:
+        directory: Where episodes are collected; may be missing.
+        now_s: Time since the epoch to measure age by; the system clock by default.
+
+    Raises:
+        EpisodeLogError: If the directory cannot be read.
+    """
+    now = time.time() if now_s is None else now_s
+    try:
+        found = [_inspect(path, now) for path in sorted(Path(directory).iterdir())]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise EpisodeLogError(
+            f'cannot read episodes: {error.filename}: {error.strerror}'
+        ) from error
+    return [leftover for leftover in found if leftover is not None]
+
+
+def _inspect(path: Path, now_s: float) -> Leftover | None:
+    """Return the leftover in a hidden directory, None if it is in progress or just completed."""
+    name = files.active_name(path)
+    if name is None:
+        return None
+    try:
+        found = _entries(path, name)
+        if any(files.is_locked(file) for file in found):
+            return None
+        statuses = [file.lstat() for file in found]
+        written = max(status.st_mtime for status in statuses or [path.lstat()])
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        problem = f'{error.filename or path}: {error.strerror}'
+        return Leftover(name, path, size_bytes=0, age_s=0.0, problem=problem)
+    size = sum(status.st_size for status in statuses)
+    return Leftover(name, path, size, age_s=max(0.0, now_s - written))
+
+
+def _entries(path: Path, name: str) -> list[Path]:
+    """Return the files of a hidden directory.
+
+    Raises:
+        OSError: If it is no directory, or contains anything that no writer puts there.
+    """
+    if not stat.S_ISDIR(path.lstat().st_mode):
+        raise NotADirectoryError(errno.ENOTDIR, 'is no directory', str(path))
+    file = files.bag_file(path, name)
+    known = {file, files.rewritten_file(file), files.metadata_file(path)}
+    found = sorted(path.iterdir())
+    for entry in found:
+        if entry not in known:
+            raise OSError(errno.EINVAL, 'is not of an episode', str(entry))
+        if not stat.S_ISREG(entry.lstat().st_mode):
+            raise OSError(errno.EINVAL, 'is no regular file', str(entry))
+    return found
 
 
 def recover_episode(leftover: Path | str) -> Path | None:
-    """Completes an episode that a crash cut off.
+    """Complete an episode that a crash cut off.
 
     All whole chunks become a bag under the name of the episode; at most the last quarter of a
-    second is missing. The torn file is replaced when the new one has been read back. A process that
-    was killed before it had written a first chunk leaves nothing to keep: that is cleared away.
+    second is missing. The new file replaces the torn one when it has been read back. A torn file
+    of which more than a few bytes are not read is kept beside it, in `.<name>.aside`.
+
+    An episode without messages is moved to `.<name>.aside`, or removed if its file is empty or has
+    no more than a few bytes beyond a good header.
 
     Args:
         leftover: Hidden directory of the episode, see `find_leftovers`.
 
     Returns:
-        The bag directory; None if there was nothing to keep.
+        The bag directory; None if the episode has no messages.
 
     Raises:
         EpisodeInUseError: If it is being written, or another process recovers it or has done so.
-        EpisodeLogError: If it is not what a robot leaves, or the disk refuses.
+        EpisodeLogError: If it is damaged, ambiguous or no leftover of a robot, or the disk fails.
+            The leftover stays as it is.
     """
     leftover = Path(leftover)
-    name = durable.active_name(leftover)
+    name = files.active_name(leftover)
     if name is None:
         raise EpisodeLogError(f'{leftover} is no unfinished episode')
-    found = inspect_leftover(leftover, now_s=0.0)
+    found = _inspect(leftover, now_s=0.0)
     if found is None:
         raise _in_use(leftover)
     if found.problem:
@@ -148,38 +181,38 @@ def recover_episode(leftover: Path | str) -> Path | None:
     except OSError as error:
         reason = error.strerror or error
         raise EpisodeLogError(f'cannot recover episode {leftover}: {reason}') from error
-    except DAMAGED as error:
+    except Exception as error:  # One bad leftover must not stop the recovery of the others.
         raise EpisodeLogError(f'cannot recover episode {leftover}: {one_line(error)}') from error
 
 
+def _in_use(leftover: Path) -> EpisodeInUseError:
+    return EpisodeInUseError(f'{leftover} is being written, or another process has recovered it')
+
+
 def _recover(leftover: Path, name: str) -> Path | None:
-    file, final = durable.bag_file(leftover, name), leftover.parent / name
+    file, final = files.bag_file(leftover, name), leftover.parent / name
     if not file.exists():
-        # A robot may begin its file right now: what it has just made stays, and so does the folder.
-        durable.rewritten_file(file).unlink(missing_ok=True)
-        durable.metadata_file(leftover).unlink(missing_ok=True)
+        # A robot may begin its file right now, so its new file and the folder stay.
+        files.rewritten_file(file).unlink(missing_ok=True)
+        files.metadata_file(leftover).unlink(missing_ok=True)
         _remove_empty(leftover)
         return None
-    with durable.open_regular(file) as torn:
-        # Whoever recovers it holds the file and its replacement; after that it is another one.
-        if not durable.try_lock(torn) or not os.fstat(torn.fileno()).st_nlink:
+    with files.open_regular(file) as torn:
+        # The process that recovers it locks the file and its replacement.
+        if not files.try_lock(torn) or not os.fstat(torn.fileno()).st_nlink:
             raise _in_use(leftover)
         remains = _read(torn)
-        if remains.was_killed_at_the_start:
-            _clear_away(leftover)
+        if not remains.contents.message_count:
+            _put_aside(leftover, name, remains)
             return None
         if final.exists():
             raise EpisodeLogError(
                 f'{final} exists and is never overwritten; if {leftover.name} is an older copy of '
                 'it, remove that'
             )
-        with _replaced(file, remains):
-            durable.publish(leftover, final)
+        with _replaced(file, remains, files.aside_path(leftover.parent, name)):
+            files.publish(leftover, final)
     return final
-
-
-def _in_use(leftover: Path) -> EpisodeInUseError:
-    return EpisodeInUseError(f'{leftover} is being written, or another process has recovered it')
 
 
 def _remove_empty(leftover: Path) -> None:
@@ -191,64 +224,147 @@ def _remove_empty(leftover: Path) -> None:
         raise
 
 
-def _clear_away(leftover: Path) -> None:
-    for entry in leftover.iterdir():
-        entry.unlink()
-    leftover.rmdir()
+def _put_aside(leftover: Path, name: str, remains: _Remains) -> None:
+    """Remove a leftover without messages if it is empty, else move it to `.<name>.aside`."""
+    if remains.is_empty:
+        for entry in leftover.iterdir():
+            entry.unlink()
+        leftover.rmdir()
+    elif remains.was_killed_at_the_start:
+        leftover.rename(files.aside_path(leftover.parent, name))
+    else:
+        raise EpisodeLogError(
+            f'{leftover} is damaged before its first message: nothing to recover '
+            f'({remains.damage}); it stays as it is'
+        )
+
+
+@dataclass(slots=True)
+class _Remains:
+    """The readable part of a file.
+
+    Attributes:
+        contents: Records up to the first damage.
+        is_whole: Whether the file has a footer.
+        is_empty: Whether the file has only a few bytes beyond a good header.
+        damage: Why reading stopped; '' at the end of the file.
+        unread_bytes: Bytes from there to the end of the file.
+        was_killed_at_the_start: Whether the file ends among the records that come before messages.
+    """
+
+    contents: Contents
+    is_whole: bool = False
+    is_empty: bool = False
+    damage: str = ''
+    unread_bytes: int = 0
+    was_killed_at_the_start: bool = True
 
 
 def _read(stream: BinaryIO) -> _Remains:
-    remains = _Remains()
+    data = stream.read(MAX_FILE_BYTES + 1)
+    if len(data) > MAX_FILE_BYTES:
+        raise ValueError(f'a file of more than {MAX_FILE_BYTES} bytes')
+    remains = _Remains(Contents(RECOVERY_LIMITS))
+    header_end = read = 0
+    is_data = True
     try:
-        for record in read_records(stream, RECOVERY_LIMITS):
-            remains.take(record)
-    except EndOfFile:
-        # Where the file ends as it should, the length of a record was damaged.
-        stream.seek(max(0, stream.seek(0, os.SEEK_END) - len(MCAP0_MAGIC)))
-        remains.is_torn = stream.read() != MCAP0_MAGIC
-    except DAMAGED:
-        pass
+        for opcode, position, end in split_records(data):
+            if opcode == Opcode.FOOTER:
+                remains.is_whole = True
+                read = len(data)
+                break
+            is_data = is_data and opcode != Opcode.DATA_END
+            if is_data and opcode != Opcode.HEADER:
+                remains.contents.take(opcode, data, position, end)
+            header_end = header_end or end
+            read = end
+    except TornError as error:
+        remains.damage = str(error)
+        # Where the file ends as it should, the length of a record is damaged.
+        is_cut = not data.endswith(MCAP0_MAGIC) or len(data) == len(MCAP0_MAGIC)
+        is_torn = error.bytes_left <= _FEW_BYTES or error.opcode in _AT_THE_START
+        is_torn |= error.opcode == Opcode.CHUNK and _has_length(data[read:], error.length)
+        remains.was_killed_at_the_start = is_cut and is_torn
+    except ValueError as error:
+        remains.damage = one_line(error)
+        remains.was_killed_at_the_start = False
+    remains.unread_bytes = len(data) - read
+    remains.is_empty = len(data) - header_end <= _FEW_BYTES
     return remains
 
 
+def _has_length(chunk: bytes, length: int) -> bool:
+    """Whether the fields of a torn chunk add up to its length; then no bit of it has flipped."""
+    fields = Fields(chunk[RECORD.size : RECORD.size + 64], 'chunk')
+    fields.bytes(28)
+    compression = fields.text()
+    return length == 28 + 4 + len(compression) + 8 + fields.number(8)
+
+
 @contextmanager
-def _replaced(file: Path, remains: _Remains) -> Iterator[None]:
-    """Writes the file anew and puts that in its place, locked until the end of the block."""
-    if not remains.messages or EPISODE not in remains.metadata:
-        raise EpisodeLogError(f'{file} is damaged before its first message: nothing to recover')
-    rewritten = durable.rewritten_file(file)
+def _replaced(file: Path, remains: _Remains, aside: Path) -> Iterator[None]:
+    """Write the file anew and put that in its place, locked until the end of the block."""
+    contents = remains.contents
+    records = {record.name: record.content for record in contents.metadata}
+    if EPISODE not in records:
+        raise EpisodeLogError(
+            f'{file} has no metadata record {EPISODE!r}: nothing to recover ({remains.damage})'
+        )
+    require_one_meaning(contents)
+    require_contract(records[EPISODE], contents)
+    rewritten = files.rewritten_file(file)
     try:
-        with durable.create(rewritten) as stream:
-            durable.lock(stream)
-            description = _write(stream, file, remains)
-            store_bag(stream, file.parent, description)
-            read_episode(rewritten)
+        with files.create(rewritten) as stream:
+            files.lock(stream)
+            description = _write(stream, file, remains, records)
+            files.store(stream, file.parent, description)
+            read_file(rewritten)
+            if remains.unread_bytes > _FEW_BYTES:
+                aside.mkdir(exist_ok=True)
+                shutil.copyfile(file, aside / file.name)
             rewritten.replace(file)
             yield
     finally:
         rewritten.unlink(missing_ok=True)
 
 
-def _write(stream: BinaryIO, file: Path, remains: _Remains) -> str:
-    """Writes the file anew, as far as a writer would have gone; returns its description."""
-    metadata = checked_strings(remains.metadata[EPISODE])
-    bag = begin_bag(stream, file.name, LogSettings(), metadata, remains.attachments)
-    specs = {id: _channel_spec(remains, channel) for id, channel in remains.channels.items()}
+def _write(
+    stream: BinaryIO, file: Path, remains: _Remains, records: dict[str, dict[str, str]]
+) -> str:
+    """Write the file anew, as far as a writer would have written; return its `metadata.yaml`."""
+    contents, metadata = remains.contents, checked_strings(records[EPISODE])
+    messages = contents.messages()
+    specs = contract_topics(metadata)
+    known = {
+        id: (channel.topic, specs[relative_name(channel.topic)])
+        for id, channel in contents.channels.items()
+    }
+    result = records.get(EPISODE_RESULT) if remains.is_whole else None
+    attachments = [Attachment(a.name, a.media_type, a.data) for a in contents.attachments]
+    bag = BagFile(stream, file.name, LogSettings(), metadata, attachments)
     received = ReceivedAllowance()
-    for message in remains.messages:
-        spec = specs[message.channel_id]
-        name = relative_name(spec.topic)
-        if name not in _RECEIVED or received.takes(name, len(message.data)):
-            bag.write(spec, message.data, message.log_time)
-    return end_bag(bag, stream, metadata, checked_strings(remains.result))
+    values: dict[str, list[bytes]] = {name: [] for name in _COUNTED}
+    for id, _, log_time, _, data in messages.rows():
+        name, topic = known[id]
+        if topic.direction == 'published' or received.accepts(topic.name, len(data)):
+            bag.write(name, topic, data, log_time)
+        if topic.name in values:
+            values[topic.name].append(data)
+    return bag.finish(checked_strings(result or _outcome(values, specs).to_strings()))
 
 
-def _channel_spec(remains: _Remains, channel: records.Channel) -> ChannelSpec:
-    schema = remains.schemas[channel.schema_id]
-    return ChannelSpec(
-        topic=channel.topic,
-        type_name=schema.name,
-        schema_text=schema.data.decode(),
-        qos=parse_offered_qos(channel.metadata['offered_qos_profiles']),
-        type_hash=channel.metadata['topic_type_hash'],
-    )
+def _outcome(values: dict[str, list[bytes]], specs: dict[str, TopicSpec]) -> EpisodeOutcome:
+    """Return steps, return and success up to the last whole tick."""
+    cut_off = EpisodeOutcome(is_complete=False, reason='cut off, recovered later')
+    rewards, successes, commands = values.values()
+    # `applied_command` comes last among the topics with a message per tick.
+    steps = len(commands)
+    if len(rewards) < steps or len(successes) <= steps:
+        return cut_off
+    decode = TopicCodec(specs['reward']).decode
+    try:
+        total = float(sum(float(decode(data)[1][0]) for data in rewards[:steps]))
+        is_success = bool(TopicCodec(specs['is_success']).decode(successes[steps])[1][0])
+    except ValueError:
+        return cut_off
+    return replace(cut_off, steps=steps, episode_return=total, is_success=is_success)

@@ -1,54 +1,104 @@
-"""Writes one episode: its messages, what they mean, and how it ended."""
+"""Write episodes: their messages, metadata, and how they ended.
+
+Log times are simulated time plus one nanosecond for each message of a tick. All messages of a tick
+have the same stamp, and a file needs an order. Message number r after the stamp s, counted from 0,
+is logged at s + r nanoseconds. The messages of the tick come first, in their order. Messages
+received before the next tick follow, in the order they arrive. So a command lies between the state
+it was computed from and the state it leads to, and times grow strictly.
+"""
 
 from __future__ import annotations
 
 import errno
 import json
+import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from fetch_hand_sim.episode_log import durable
-from fetch_hand_sim.episode_log.bag_metadata import ChannelSpec
-from fetch_hand_sim.episode_log.episode_bag import begin_bag, checked_strings, end_bag, store_bag
-from fetch_hand_sim.episode_log.errors import EpisodeLogError
+from fetch_hand_sim.episode_log import files
+from fetch_hand_sim.episode_log.bag import Attachment, BagFile, LogSettings, checked_strings
+from fetch_hand_sim.episode_log.errors import EpisodeExistsError, EpisodeLogError
 from fetch_hand_sim.episode_log.limits import (
     MAX_ATTACHMENT_BYTES,
     MAX_CHUNKS,
     MAX_MESSAGES,
+    MAX_RECEIVED_BYTES,
+    MAX_RECEIVED_MESSAGES,
     MAX_UNPACKED_BYTES,
-    ReceivedAllowance,
 )
-from fetch_hand_sim.episode_log.log_times import log_time
-from fetch_hand_sim.episode_log.offered_qos import offered_qos
-from fetch_hand_sim.episode_log.settings import Attachment, LogSettings
-from msgs_spec.schemas import schema_text, type_hash
+from msgs_spec.schemas import MAX_MESSAGE_BYTES
 from msgs_spec.topics import TopicSpec
 
 _TOO_LONG = (
     f'the episode is too long for a file of {MAX_MESSAGES} messages and '
     f'{MAX_UNPACKED_BYTES // 2**20} MiB of them'
 )
+_NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed(?P<seed>\d+)(\.active|\.aside)?')
 
 
-def _reason(error: OSError) -> str:
-    return error.strerror or str(error)
+def log_time(stamp_ns: int, rank: int) -> int:
+    """Return the log time in nanoseconds of message number `rank` of the tick stamped `stamp_ns`.
+
+    Raises:
+        ValueError: If one of them is negative; MCAP times are unsigned.
+    """
+    if stamp_ns < 0 or rank < 0:
+        raise ValueError(f'stamp {stamp_ns} ns and rank {rank} must not be negative')
+    return stamp_ns + rank
+
+
+class ReceivedAllowance:
+    """Decides which received messages of an episode are logged, and counts the others.
+
+    Attributes:
+        omitted: Number of messages that are not logged, by topic.
+    """
+
+    def __init__(self) -> None:
+        self.omitted: Counter[str] = Counter()
+        self._messages: Counter[str] = Counter()
+        self._bytes: Counter[str] = Counter()
+
+    def accepts(
+        self, topic: str, size: int, has_room: bool = True, *, is_refused: bool = False
+    ) -> bool:
+        """Return whether a message of `size` bytes is logged.
+
+        Args:
+            has_room: Whether the file has room for it.
+            is_refused: Whether the robot rejected it. Rejected messages get half of the allowance
+                at most, so that a flood of them leaves room for the messages that decide the
+                episode. They are counted as `<topic> (refused)`.
+        """
+        share = 2 if is_refused else 1
+        if (
+            not has_room
+            or size > MAX_MESSAGE_BYTES
+            or self._messages[topic] >= MAX_RECEIVED_MESSAGES // share
+            or self._bytes[topic] + size > MAX_RECEIVED_BYTES // share
+        ):
+            self.omitted[f'{topic} (refused)' if is_refused else topic] += 1
+            return False
+        self._messages[topic] += 1
+        self._bytes[topic] += size
+        return True
 
 
 class EpisodeWriter:
     """A rosbag2 bag that appears in a directory under its name when it is complete, and not before.
 
     It is written in the hidden directory `.<name>.active`, from which `finish` or `abort` makes a
-    valid bag. A process that is killed leaves the hidden directory behind, for `find_leftovers` to
-    report.
+    valid bag. A killed process leaves the hidden directory behind, see `find_leftovers`.
 
-    Whatever the disk does, the simulation can go on: an error is raised once, as one line; after it
-    `write` does nothing and returns False, and `finish` returns None. Not thread-safe, and not for
-    use in signal handlers.
+    The simulation can go on after every error of the disk. Such an error is raised once, as one
+    line; after it `write` does nothing and returns False, and `finish` returns None. Not
+    thread-safe, and not for use in signal handlers.
 
-    Nothing is written that a reader refuses, see `limits`. What comes from outside has an
-    allowance; the rest of it is not logged, and the record `episode_result` counts it.
+    Files stay within the limits of readers, see `limits`. Received messages have an allowance; the
+    record `episode_result` counts the messages beyond it.
 
     Args:
         directory: Where episodes are collected; created if missing.
@@ -61,8 +111,8 @@ class EpisodeWriter:
 
     Raises:
         EpisodeExistsError: If the name is taken; episodes are never overwritten.
-        EpisodeLogError: If the disk is too full or the file cannot be written; nothing is left
-            behind.
+        EpisodeLogError: If the disk is too full or the file cannot be written; then no file is
+            left behind.
         ValueError: If metadata are not strings, or these or the attachments are too long.
     """
 
@@ -75,7 +125,7 @@ class EpisodeWriter:
         settings: LogSettings | None = None,
         namespace: str = '/',
     ) -> None:
-        self._metadata = {'episode_id': name, **checked_strings(metadata)}
+        metadata = {'episode_id': name, **checked_strings(metadata)}
         attached = sum(len(each.data) for each in attachments)
         if attached > MAX_ATTACHMENT_BYTES:
             raise ValueError(f'{attached} bytes attached; allowed: {MAX_ATTACHMENT_BYTES}')
@@ -83,7 +133,6 @@ class EpisodeWriter:
         self._namespace = namespace.rstrip('/') + '/'
         directory = Path(directory)
         self._final = directory / name
-        self._channels: dict[str, ChannelSpec] = {}
         self._flushed_ns: int | None = None
         self._tick_ns: int | None = None
         self._rank = 0
@@ -92,82 +141,82 @@ class EpisodeWriter:
         self._completed: Path | None = None
         try:
             directory.mkdir(parents=True, exist_ok=True)
-            durable.require_free_space(directory, self._settings.minimum_free_bytes)
-            self._stream = durable.claim(directory, name)
+            files.require_free_space(directory, self._settings.minimum_free_bytes)
+            self._stream = files.claim(directory, name)
         except OSError as error:
             raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
-        self._active = durable.active_path(directory, name)
+        self._active = files.active_path(directory, name)
         self._is_open = True
         try:
             file_name = Path(self._stream.name).name
-            self._bag = begin_bag(
-                self._stream, file_name, self._settings, self._metadata, attachments
-            )
-        except OSError as error:
-            self._discard()
+            self._bag = BagFile(self._stream, file_name, self._settings, metadata, attachments)
+        except (OSError, ValueError) as error:
+            self.discard()
+            if isinstance(error, ValueError):
+                raise
             raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
 
     def write(self, topic: TopicSpec, data: bytes, log_time_ns: int) -> bool:
-        """Appends a message.
+        """Append a message.
 
         Args:
-            topic: What it is.
+            topic: Its topic.
             data: Its CDR bytes.
-            log_time_ns: Simulated time, later than that of the message before, see `log_times`.
+            log_time_ns: Simulated time, later than that of the message before.
 
         Returns:
-            True if the message was taken, False if the episode is completed or has failed.
+            True if the message was logged, False if the episode is completed or has failed.
 
         Raises:
             EpisodeLogError: At the first error of the disk.
-            ValueError: If the time does not grow, the topic had another type before, or no reader
-                would take a message more or as long.
+            ValueError: If the time does not grow, the topic had another type before, or readers
+                would reject the message.
         """
         if self._is_open and self._is_flush_due(log_time_ns):
             self._flush(log_time_ns)
         return self._append(topic, data, log_time_ns)
 
     def write_tick(self, stamp_ns: int, messages: Iterable[tuple[TopicSpec, bytes]]) -> bool:
-        """Appends all messages of the tick stamped `stamp_ns`, in their order; see `write`.
-
-        When it is due, they are handed to the operating system with it.
+        """Append all messages of the tick stamped `stamp_ns`, in their order; see `write`.
 
         Raises:
-            EpisodeLogError: At the first error of the disk, or where the episode has become longer
-                than readers take; what there is so far can be recovered.
+            EpisodeLogError: At the first error of the disk, or when the episode exceeds the limits
+                of readers; the part before can be recovered.
         """
         self._tick_ns, self._rank = stamp_ns, 0
         for topic, data in messages:
-            self._require_room(len(data))
+            if self._is_open and not self._bag.has_room(len(data)):
+                self.flush()
+                raise self._fail(OSError(errno.EFBIG, _TOO_LONG))
             self._append_next(topic, data)
         if self._is_open and self._is_flush_due(stamp_ns):
             self._flush(stamp_ns)
         return self._is_open
 
     def write_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> bool:
-        """Appends a message received since the last tick: it follows the messages of that tick.
+        """Append a message received since the last tick, after the messages of that tick.
 
         Args:
-            topic: Of the message.
+            topic: Its topic.
             data: CDR bytes.
-            is_refused: Whether it decided nothing; such a one may be left out sooner.
+            is_refused: Whether the robot rejected it; such messages have a smaller allowance.
 
         Returns:
-            False if it is not taken: the allowance of its topic is used up, or see `write`.
+            False if it is not logged: the allowance of its topic is used up, or see `write`.
 
         Raises:
-            ValueError: If there was no tick yet: earlier commands are not part of the episode.
+            ValueError: Before the first tick: earlier commands are not part of the episode.
         """
         if not self._is_open:
             return False
-        # While a robot is paused, what it receives is flushed without end.
-        has_room = self._bag.takes(len(data)) and self._bag.chunks <= MAX_CHUNKS // 2
-        if not self._received.takes(topic.name, len(data), has_room, is_refused=is_refused):
+        # A paused robot flushes what it receives again and again.
+        has_room = self._bag.has_room(len(data)) and self._bag.chunks <= MAX_CHUNKS // 2
+        if not self._received.accepts(topic.name, len(data), has_room, is_refused=is_refused):
             return False
         return self._append_next(topic, data)
 
     def flush(self) -> None:
-        """Hands what was written to the operating system, also if that is not due.
+        """Hand all messages to the operating system now.
 
         Raises:
             EpisodeLogError: At the first error of the disk.
@@ -177,54 +226,61 @@ class EpisodeWriter:
 
     @property
     def has_unflushed(self) -> bool:
-        """Whether something was written that the operating system does not have yet."""
+        """Whether there are messages that the operating system does not have yet."""
         return self._is_open and self._bag.has_unflushed
 
     def finish(self, result: Mapping[str, str]) -> Path | None:
-        """Completes the bag of an episode that ran to its end.
+        """Complete the bag of an episode that ran to its end.
 
         Args:
             result: Contents of the metadata record `episode_result`; `complete` is added.
 
         Returns:
-            The bag directory. None, and no bag, if writing had failed before or no message was
-            written.
+            The bag directory. None, and no bag, if writing failed before or there is no message.
 
         Raises:
             EpisodeLogError: If the bag cannot be completed; the hidden directory stays.
-            ValueError: If the result is not made of strings.
+            ValueError: If a key or value of the result is not a string.
         """
         self.end(result)
         return self.store()
 
     def abort(self, reason: str, result: Mapping[str, str] | None = None) -> Path | None:
-        """Completes the bag of an episode that was cut short, marked as such; see `finish`."""
+        """Complete the bag of an episode that was cut short, marked as such; see `finish`."""
         self.end(result or {}, reason)
         return self.store()
 
     def end(self, result: Mapping[str, str], reason: str | None = None) -> bool:
-        """Does the first half of `finish`, or with a reason of `abort`: writes all there is.
+        """Do the first half of `finish`, or with a reason of `abort`: write everything.
 
-        What a process that is killed now leaves behind is recovered whole.
+        If the process is killed after this, recovery finds the whole episode.
 
         Returns:
-            Whether there is something to `store`.
+            Whether there is a bag to `store`.
 
         Raises:
             EpisodeLogError, ValueError: As `finish` does.
         """
-        outcome = {'complete': 'true'}
+        record = {**result, 'complete': 'true' if reason is None else 'false'}
         if reason is not None:
-            outcome = {'complete': 'false', 'reason': reason}
-        return self._end({**result, **outcome})
-
-    def discard(self) -> None:
-        """Removes what there is of an episode that is not completed."""
-        if self._is_open:
-            self._discard()
+            record['reason'] = reason
+        if self._received.omitted:
+            record['received_not_logged'] = json.dumps(self._received.omitted)
+        record = checked_strings(record)
+        if not self._is_open:
+            return False
+        if self._bag.message_count == 0:
+            self.discard()
+            return False
+        self._is_open = False
+        try:
+            self._description = self._bag.finish(record)
+        except OSError as error:
+            raise self._fail(error) from error
+        return True
 
     def store(self) -> Path | None:
-        """Does the second half: waits for the disk several times, then shows the episode.
+        """Do the second half: wait for the disk several times, then show the episode.
 
         Raises:
             EpisodeLogError: If the bag cannot be completed; the hidden directory stays.
@@ -232,8 +288,8 @@ class EpisodeWriter:
         if self._description is None:
             return self._completed
         try:
-            store_bag(self._stream, self._active, self._description)
-            durable.publish(self._active, self._final)
+            files.store(self._stream, self._active, self._description)
+            files.publish(self._active, self._final)
         except OSError as error:
             raise self._fail(error) from error
         self._description = None
@@ -241,36 +297,21 @@ class EpisodeWriter:
         self._completed = self._final
         return self._completed
 
-    def _channel(self, topic: TopicSpec) -> ChannelSpec:
-        channel = self._channels.get(topic.name)
-        if channel is None:
-            channel = self._channels[topic.name] = ChannelSpec(
-                topic=topic.name if topic.name.startswith('/') else self._namespace + topic.name,
-                type_name=topic.type_name,
-                schema_text=schema_text(topic.type_name),
-                qos=offered_qos(topic.qos),
-                type_hash=type_hash(topic.type_name),
-            )
-        if channel.type_name != topic.type_name:
-            raise ValueError(
-                f'topic {topic.name} is {channel.type_name} in this episode, not {topic.type_name}'
-            )
-        return channel
+    def discard(self) -> None:
+        """Remove the files of an episode that is not completed."""
+        if self._is_open:
+            self._stop()
+            shutil.rmtree(self._active, ignore_errors=True)
 
     def _append(self, topic: TopicSpec, data: bytes, log_time_ns: int) -> bool:
         if not self._is_open:
             return False
+        name = topic.name if topic.name.startswith('/') else self._namespace + topic.name
         try:
-            self._bag.write(self._channel(topic), data, log_time_ns)
+            self._bag.write(name, topic, data, log_time_ns)
         except OSError as error:
             raise self._fail(error) from error
         return True
-
-    def _require_room(self, size: int) -> None:
-        """Ends the log of an episode that no reader would take with one message more."""
-        if self._is_open and not self._bag.takes(size):
-            self.flush()
-            raise self._fail(OSError(errno.EFBIG, _TOO_LONG))
 
     def _append_next(self, topic: TopicSpec, data: bytes) -> bool:
         if self._tick_ns is None:
@@ -291,34 +332,97 @@ class EpisodeWriter:
             self._flushed_ns = log_time_ns
         return log_time_ns - self._flushed_ns >= self._settings.flush_period_ns
 
-    def _end(self, result: dict[str, str]) -> bool:
-        if self._received.omitted:
-            result['received_not_logged'] = json.dumps(self._received.omitted)
-        record = checked_strings(result)
-        if not self._is_open:
-            return False
-        try:
-            if self._bag.info.message_count == 0:
-                self._discard()
-                return False
-            self._is_open = False
-            self._description = end_bag(self._bag, self._stream, self._metadata, record)
-        except OSError as error:
-            raise self._fail(error) from error
-        return True
-
     def _fail(self, error: OSError) -> EpisodeLogError:
         self._description = None
         self._stop()
         return EpisodeLogError(f'episode log stopped, {self._stream.name}: {_reason(error)}')
 
-    def _discard(self) -> None:
-        """Removes what this writer created."""
-        self._stop()
-        shutil.rmtree(self._active, ignore_errors=True)
-
     def _stop(self) -> None:
-        """Takes no more messages; the lock goes with the stream."""
+        """Accept no more messages; closing the stream releases the lock."""
         self._is_open = False
         with suppress(OSError):
             self._stream.close()
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error)
+
+
+# Directories of episodes
+
+
+def episode_name(task: str, index: int, seed: int) -> str:
+    """Return `<task>_<index>_seed<seed>`, with leading zeros so that names sort by number."""
+    return f'{task}_{index:06d}_seed{seed}'
+
+
+def next_index(directory: Path, task: str) -> int:
+    """Return the index after the largest of a task, including cut-off episodes; 0 at first."""
+    return max((int(name['index']) + 1 for name in _names(directory, task)), default=0)
+
+
+def named_seeds(directory: Path, task: str) -> set[int]:
+    """Return the seeds in the names of the episodes of a task in a directory."""
+    return {int(name['seed']) for name in _names(directory, task)}
+
+
+def _names(directory: Path, task: str) -> Iterator[re.Match[str]]:
+    if directory.is_dir():
+        for path in directory.iterdir():
+            if (name := _NAME.fullmatch(path.name)) and name['task'] == task:
+                yield name
+
+
+class EpisodeDirectory:
+    """Begins one episode after the other in a directory.
+
+    Numbers go on after those of existing episodes, so no run overwrites another. Several processes
+    may share the directory: the first one to create the hidden directory of a name owns it, the
+    others take the next number.
+
+    Args:
+        path: The directory; created with the first episode.
+        settings: How to write.
+        namespace: ROS namespace of relative topic names.
+    """
+
+    def __init__(
+        self, path: Path | str, settings: LogSettings | None = None, namespace: str = '/'
+    ) -> None:
+        self.path = Path(path)
+        self._settings = settings
+        self._namespace = namespace
+        self._next: dict[str, int] = {}
+
+    def begin(
+        self,
+        task: str,
+        seed: int,
+        metadata: Mapping[str, str],
+        attachments: Sequence[Attachment] = (),
+    ) -> EpisodeWriter:
+        """Return the writer of a new episode.
+
+        Raises:
+            EpisodeLogError: If it cannot be written, see `EpisodeWriter`.
+        """
+        index = self._next[task] if task in self._next else self._first_index(task)
+        while True:
+            name = episode_name(task, index, seed)
+            try:
+                writer = EpisodeWriter(
+                    self.path, name, metadata, attachments, self._settings, self._namespace
+                )
+            except EpisodeExistsError:
+                index += 1
+            else:
+                self._next[task] = index + 1
+                return writer
+
+    def _first_index(self, task: str) -> int:
+        try:
+            return next_index(self.path, task)
+        except OSError as error:
+            raise EpisodeLogError(
+                f'cannot log episodes in {self.path}: {error.strerror}'
+            ) from error

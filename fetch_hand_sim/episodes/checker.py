@@ -1,21 +1,28 @@
-"""Runs a logged episode again, from its seed, goals and commands, and compares every bit."""
+"""Simulate a logged episode again, from its seed, goals and commands, and compare every bit."""
 
 from __future__ import annotations
 
 import dataclasses
+from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fetch_hand_sim.episode_log import Episode, EpisodeReadError, episode_metadata, read_episode
-from fetch_hand_sim.episode_log.episode_record import EpisodeRecord
-from fetch_hand_sim.episode_log.model import former_model_sha256, model_sha256
-from fetch_hand_sim.episode_log.reader import DAMAGED
-from fetch_hand_sim.episode_log.ticks import LoggedTick, split_ticks
+from fetch_hand_sim.episode_log import (
+    Episode,
+    EpisodeReadError,
+    EpisodeRecord,
+    episode_metadata,
+    read_episode,
+)
+from fetch_hand_sim.episode_log.bag import offered_qos_text
+from fetch_hand_sim.episode_log.model import former_model_sha256, mjcf_attachment, model_sha256
+from fetch_hand_sim.episode_log.reader import LoggedTick, logged_topics, split_ticks
 from fetch_hand_sim.episodes.goals import accept_goal
 from fetch_hand_sim.episodes.perturbations import accept_perturbation
 from fetch_hand_sim.episodes.recorder import episode_result
@@ -23,11 +30,16 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode
-from msgs_spec.schemas import deserialize
-from msgs_spec.text import one_line, printable
+from msgs_spec.schemas import deserialize, type_hash
+from msgs_spec.text import one_line
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import TopicSpec
 from node_runtime.source_revision import source_revision
+
+# Characters of a value in a line.
+_LONGEST = 80
+# Keys of the record `episode` that name software; another value is a change, not a difference.
+_SOFTWARE = ('interface_version', 'model_sha256', 'source_revision')
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +49,9 @@ class Difference:
     Attributes:
         tick: Number of the tick, 0 for the reset.
         stamp_ns: Its recorded stamp.
-        field: Topic, and the field of its message if there is one.
-        recorded: What the file says.
-        simulated: What the simulation says.
+        field: Topic and field of its message, or another part of the file.
+        recorded: Recorded value, shortened.
+        simulated: Simulated value, shortened.
     """
 
     tick: int
@@ -55,17 +67,24 @@ class Difference:
         )
 
 
+def _difference(
+    tick: int, stamp_ns: int, field: str, recorded: object, simulated: object
+) -> Difference:
+    given, expected = (one_line(value, longest=_LONGEST) for value in (recorded, simulated))
+    return Difference(tick, stamp_ns, one_line(field), given, expected)
+
+
 @dataclass(slots=True)
 class CheckResult:
-    """What came out.
+    """Result of a check.
 
     Attributes:
         path: The MCAP file.
-        ticks: Ticks that are identical.
-        messages: Messages in them that are identical.
+        ticks: Number of identical ticks.
+        messages: Number of messages in them.
         unchecked: Messages of a last tick that was cut off before its command.
         difference: The first difference, None if there is none.
-        changed: What the file was written with and is different here: `name recorded -> here`.
+        changed: Software that is not the recorded one: `name recorded -> here`.
     """
 
     path: Path
@@ -84,81 +103,136 @@ class CheckResult:
         return f'{self.path}: identical, {counts}{rest}{changes}'
 
 
+class _Reference:
+    """A simulation with the fingerprints and the text of its model."""
+
+    def __init__(self, record: EpisodeRecord) -> None:
+        self.simulation = Simulation(
+            record.task.name,
+            num_threads=1,
+            reward_type=record.reward_type,
+            success_rule=record.success_rule,
+            control_hz=record.control_hz,
+            timing=record.timing,
+            disturbances=record.disturbances,
+        )
+        self.fingerprint = model_sha256(self.simulation.model)
+        self.former_fingerprint = former_model_sha256(self.simulation.model)
+
+    @cached_property
+    def mjcf(self) -> bytes:
+        return mjcf_attachment(self.simulation.asset).data
+
+
 class EpisodeChecker:
     """Checks one episode after the other; compiles a model only when the task changes."""
 
     def __init__(self) -> None:
         self._key: tuple[object, ...] = ()
-        self._simulation: Simulation | None = None
-        self._fingerprint = self._former_fingerprint = ''
+        self._reference: _Reference | None = None
 
     def check(self, path: Path) -> CheckResult:
-        """Checks one episode.
+        """Check one episode.
 
         Args:
             path: Bag directory or MCAP file.
 
         Raises:
-            EpisodeReadError: If the file is damaged, or does not say how to run the episode again.
+            EpisodeReadError: If the file is damaged or ambiguous, or the episode cannot be
+                simulated from its records.
         """
         episode = read_episode(path)
         ticks = split_ticks(episode)
         try:
             record = EpisodeRecord.parse(episode.metadata)
             _require_goals(episode)
+            reference = self._reference_of(record)
             runner = EpisodeRunner(
-                self._simulation_of(record),
+                reference.simulation,
                 first_seed=record.seed - record.episode,
                 first_episode=record.episode,
                 first_stamp_ns=ticks[0].stamp_ns,
                 joint_prefix=record.joint_prefix,
             )
-            result = CheckResult(episode.path, changed=self._changes(episode, runner))
-            _compare(runner, ticks, episode, record, result)
-        except DAMAGED as error:
+            result = CheckResult(episode.path)
+            start = _start_differences(episode, ticks, runner, reference, result)
+            result.difference = next(start, None)
+            if result.difference is None:
+                _compare(runner, ticks, episode, record, result)
+        except (ValueError, KeyError, OverflowError, RuntimeError) as error:
             raise EpisodeReadError(
-                f'{episode.path}: cannot be run again ({one_line(error)})'
+                f'{episode.path}: cannot be simulated again ({one_line(error)})'
             ) from error
         return result
 
-    def _simulation_of(self, record: EpisodeRecord) -> Simulation:
+    def _reference_of(self, record: EpisodeRecord) -> _Reference:
         rules = (record.reward_type, record.success_rule, record.timing, record.disturbances)
         key = (record.task.name, record.control_hz, *rules)
-        if self._simulation is None or key != self._key:
-            self._simulation = Simulation(
-                record.task.name,
-                num_threads=1,
-                reward_type=record.reward_type,
-                success_rule=record.success_rule,
-                control_hz=record.control_hz,
-                timing=record.timing,
-                disturbances=record.disturbances,
-            )
-            self._key = key
-            model = self._simulation.model
-            self._fingerprint = model_sha256(model)
-            self._former_fingerprint = former_model_sha256(model)
-        return self._simulation
+        if self._reference is None or key != self._key:
+            self._reference, self._key = _Reference(record), key
+        return self._reference
 
-    def _changes(self, episode: Episode, runner: EpisodeRunner) -> list[str]:
-        recorded = episode.metadata
-        is_former = recorded.get('model_sha256') == self._former_fingerprint
-        here = episode_metadata(
-            runner.spec,
-            episode=runner.episode,
-            seed=runner.seed,
-            reward_type=runner.simulation.metric.reward_type,
-            success_rule=runner.simulation.metric.success_rule,
-            control_hz=runner.simulation.control_hz,
-            timing=runner.simulation.timing,
-            model_sha256=self._former_fingerprint if is_former else self._fingerprint,
-            source_revision=source_revision(),
-        )
-        return [
-            f'{name.removesuffix("_version")} {printable(recorded[name])[:12]} -> {value[:12]}'
-            for name, value in here.items()
-            if recorded.get(name, value) != value
-        ]
+
+def _start_differences(
+    episode: Episode,
+    ticks: list[LoggedTick],
+    runner: EpisodeRunner,
+    reference: _Reference,
+    result: CheckResult,
+) -> Iterator[Difference]:
+    """Yield differences in parts that need no simulation; note changed software in `result`."""
+    recorded = episode.metadata
+    disturbances = runner.simulation.disturbances
+    is_former = recorded.get('model_sha256') == reference.former_fingerprint
+    here = episode_metadata(
+        runner.spec,
+        episode=runner.episode,
+        seed=runner.seed,
+        reward_type=runner.simulation.metric.reward_type,
+        success_rule=runner.simulation.metric.success_rule,
+        control_hz=runner.simulation.control_hz,
+        timing=runner.simulation.timing,
+        model_sha256=reference.former_fingerprint if is_former else reference.fingerprint,
+        source_revision=source_revision(),
+        disturbances='' if disturbances.is_off else disturbances.to_json(),
+    )
+    stamp_ns = ticks[0].stamp_ns
+    for name, value in here.items():
+        given = recorded.get(name, value)
+        if given != value and (name in _SOFTWARE or name.endswith('_version')):
+            short = one_line(given, longest=12)
+            result.changed.append(f'{name.removesuffix("_version")} {short} -> {value[:12]}')
+        elif given != value:
+            yield _difference(0, stamp_ns, f'metadata {name}', given, value)
+    model = episode.attachments.get('model.xml')
+    is_same = all(recorded.get(n) == here[n] for n in ('model_sha256', 'mujoco_version'))
+    if model is not None and is_same and model != reference.mjcf:
+        yield _difference(0, stamp_ns, 'attachment model.xml', 'another text', 'the model')
+    yield from _topic_differences(episode, ticks)
+
+
+def _topic_differences(episode: Episode, ticks: list[LoggedTick]) -> Iterator[Difference]:
+    """Yield differences of type hash, quality of service, publish times and sequence numbers."""
+    stamps = [tick.stamp_ns for tick in ticks]
+    for name, spec in logged_topics(episode).items():
+        logged = episode.topics[name]
+        for what, given, expected in (
+            ('type hash', logged.type_hash, type_hash(spec.type_name)),
+            ('quality of service', logged.qos_yaml, offered_qos_text(spec.qos)),
+        ):
+            # Other tools leave them out.
+            if given not in ('', '[]', expected):
+                yield _difference(0, stamps[0], f'{what} of {name}', given, expected)
+        # Other tools write no numbers.
+        has_numbers = any(message.sequence for message in logged.messages)
+        for number, message in enumerate(logged.messages):
+            tick = max(0, bisect_right(stamps, message.log_time_ns) - 1)
+            times = message.publish_time_ns, message.log_time_ns
+            if times[0] != times[1]:
+                yield _difference(tick, stamps[tick], f'publish time of {name}', *times)
+            if has_numbers and message.sequence != number:
+                where = f'sequence number of {name}'
+                yield _difference(tick, stamps[tick], where, message.sequence, number)
 
 
 def _compare(
@@ -168,7 +242,7 @@ def _compare(
     record: EpisodeRecord,
     result: CheckResult,
 ) -> None:
-    """Runs the episode and notes how far it is the recorded one."""
+    """Simulate the episode and note in `result` how far it equals the recorded one."""
     encoder = TickEncoder(runner.spec)
     for number, logged in enumerate(ticks):
         command = _applied_command(logged) if number else runner.resting_command()
@@ -178,11 +252,17 @@ def _compare(
             result.unchecked = len(logged.published)
             return
         if number and runner.is_between_episodes:
-            result.difference = Difference(
+            result.difference = _difference(
                 number, logged.stamp_ns, 'length', f'{len(ticks)} ticks', f'{number} ticks'
             )
             return
         tick = runner.advance(command)
+        drawn = episode.metadata.get('variation', '')
+        if drawn != tick.status.variation:
+            result.difference = _difference(
+                number, logged.stamp_ns, 'metadata variation', drawn, tick.status.variation
+            )
+            return
         if record.interface_version == 1 and 'fingertip_poses' in tick.readings:
             tick = _without_orientations(tick)
         has_status = logged.find('episode_status') is not None
@@ -198,14 +278,14 @@ def _compare(
 
 
 def _require_goals(episode: Episode) -> None:
-    """Raises `ValueError` if goals or pushes were received that the file could not take."""
-    for name, what in (('set_goal', 'goals were set'), ('perturb', 'pushes came')):
+    """Raise `ValueError` if goals or pushes were received that the file does not contain."""
+    for name in ('set_goal', 'perturb'):
         if name in episode.outcome.received_not_logged:
-            raise ValueError(f'more {what} than the file holds')
+            raise ValueError(f'the file lacks some of the received messages of {name}')
 
 
 def _without_orientations(tick: Tick) -> Tick:
-    """The tick as robots of interface version 1 told it: fingertips without orientation."""
+    """Return the tick of a robot of interface version 1: fingertips without orientation."""
     poses = tick.readings['fingertip_poses'].reshape(-1, 7).copy()
     poses[:, 3:] = [1.0, 0.0, 0.0, 0.0]
     return dataclasses.replace(tick, readings={**tick.readings, 'fingertip_poses': poses.ravel()})
@@ -214,7 +294,7 @@ def _without_orientations(tick: Tick) -> Tick:
 def _result_difference(
     last: LoggedTick, status: EpisodeStatus, runner: EpisodeRunner, episode: Episode
 ) -> Difference | None:
-    """Whether the record `episode_result` says something else than the last tick."""
+    """Compare the record `episode_result` with the last tick."""
     expected = episode_result(status)
     expected['complete'] = 'false'
     if runner.is_between_episodes:
@@ -225,9 +305,7 @@ def _result_difference(
         recorded = episode.result.get(name, simulated)
         if recorded != simulated:
             where = f'episode_result {name}'
-            return Difference(
-                status.tick, last.stamp_ns, where, printable(recorded)[:80], simulated
-            )
+            return _difference(status.tick, last.stamp_ns, where, recorded, simulated)
     return None
 
 
@@ -239,7 +317,7 @@ def _applied_command(logged: LoggedTick) -> Array | None:
 
 
 def _take_received(runner: EpisodeRunner, logged: LoggedTick, record: EpisodeRecord) -> None:
-    """Does what the node did with the goals and pushes it received."""
+    """Apply the received goals and pushes as the node did."""
     for message in logged.received:
         if message.topic.name == 'set_goal':
             with suppress(ValueError):
@@ -258,26 +336,25 @@ def _tick_difference(
     expected: list[tuple[TopicSpec, bytes]],
     may_be_cut: bool,
 ) -> Difference | None:
-    def difference(field: str, recorded: object, simulated: object) -> Difference:
-        return Difference(number, logged.stamp_ns, field, str(recorded), str(simulated))
-
+    stamp = logged.stamp_ns
     names = [message.topic.name for message in logged.published]
     wanted = [topic.name for topic, _ in expected]
     if may_be_cut:
         wanted = wanted[: len(names)]
     if names != wanted:
-        return difference('topics', ', '.join(names), ', '.join(wanted))
+        return _difference(number, stamp, 'topics', ', '.join(names), ', '.join(wanted))
     for rank, (message, (topic, data)) in enumerate(zip(logged.published, expected, strict=False)):
         if message.data != data:
             where, recorded, simulated = _field_difference(topic, message.data, data)
-            return difference(f'{topic.name}{where}', recorded, simulated)
+            return _difference(number, stamp, f'{topic.name}{where}', recorded, simulated)
         if message.log_time_ns != stamp_ns + rank:
-            return difference(f'log time of {topic.name}', message.log_time_ns, stamp_ns + rank)
+            times = message.log_time_ns, stamp_ns + rank
+            return _difference(number, stamp, f'log time of {topic.name}', *times)
     return None
 
 
 def _field_difference(topic: TopicSpec, recorded: bytes, simulated: bytes) -> tuple[str, str, str]:
-    """The first field in which two messages differ, and its two values."""
+    """Return the first field in which two messages differ, and its two values."""
     try:
         first, second = (deserialize(topic.type_name, data) for data in (recorded, simulated))
     except ValueError:
@@ -285,7 +362,7 @@ def _field_difference(topic: TopicSpec, recorded: bytes, simulated: bytes) -> tu
     for (where, one), (other_where, other) in zip(_leaves(first), _leaves(second), strict=False):
         # Text shows every bit of a float64, except those of NaN.
         if (where, repr(one)) != (other_where, repr(other)):
-            return where, printable(repr(one))[:80], repr(other)[:80]
+            return where, repr(one), repr(other)
     return '', f'{len(recorded)} bytes', f'{len(simulated)} bytes of other length or padding'
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode
-from fetch_hand_sim.episode_log.messages import MessageFile, read_messages
-from fetch_hand_sim.episode_log.summary import expand_episodes, holds_no_episode
+from fetch_hand_sim.episode_log.files import expand_episodes, holds_no_episode
+from fetch_hand_sim.episode_log.reader import EpisodeFile, read_file
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
 from msgs_spec.arrays import Array
@@ -64,7 +64,7 @@ def recording_of(arrays: EpisodeArrays) -> Recording:
     """
     ticks = len(arrays) + 1
     task = arrays.record.task
-    messages = read_messages(arrays.path)
+    messages = read_file(arrays.path)
     joints = _vectors(messages, arrays, 'joint_states')[:, : len(task.robot.joints)]
     poses = _vectors(messages, arrays, 'object_pose') if arrays.spec.has_object else None
     achieved, desired = arrays.observations['achieved_goal'], arrays.goals
@@ -82,13 +82,12 @@ def recording_of(arrays: EpisodeArrays) -> Recording:
     return Recording(arrays, frames, times, arrays.path.stem.removesuffix('_0'))
 
 
-def _vectors(messages: MessageFile, arrays: EpisodeArrays, name: str) -> Array:
+def _vectors(messages: EpisodeFile, arrays: EpisodeArrays, name: str) -> Array:
     """Return the vectors (N + 1, size) of a topic that has one message per tick."""
-    resolved = next((each for each in messages.offsets if each.rpartition('/')[2] == name), name)
     # An interrupted episode may contain a part of one more tick.
     stamps = arrays.stamps
     try:
-        rows = messages.rows(resolved).data[: len(stamps)]
+        rows = messages.rows(name).data[: len(stamps)]
         given, vectors = TopicCodec(topic(arrays.record.task, name)).decode_many(rows)
     except (ValueError, KeyError) as error:
         raise EpisodeReadError(f'{messages.path}: no readable {name}: {error}') from error

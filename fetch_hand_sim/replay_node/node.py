@@ -12,7 +12,7 @@ from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool
 
 from fetch_hand_sim.episode_log import EpisodeReadError
-from fetch_hand_sim.episode_log.summary import folders_below
+from fetch_hand_sim.episode_log.files import folders_below
 from fetch_hand_sim.replay_node import NODE_NAME
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplayMessage, ReplaySchedule
 from msgs_spec.parameters import REPLAY_NODE

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fetch_hand_sim.episode_log import Episode, EpisodeReadError, read_episode
-from fetch_hand_sim.episode_log.episode_record import parse_control_hz
-from fetch_hand_sim.episode_log.ticks import logged_topics
+from fetch_hand_sim.episode_log.metadata import parse_control_hz
+from fetch_hand_sim.episode_log.reader import logged_topics
 from msgs_spec.schemas import deserialize
 from msgs_spec.topics import TopicSpec, relative_name
 

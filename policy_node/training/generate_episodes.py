@@ -16,7 +16,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeLogError
-from fetch_hand_sim.episode_log.episodes import named_seeds
+from fetch_hand_sim.episode_log.writer import named_seeds
 from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.simulation import Observation, Simulation

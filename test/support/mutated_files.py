@@ -35,13 +35,13 @@ from fetch_hand_sim.commands import episodes_list
 from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeReadError,
+    EpisodeSummary,
     load_episodes,
     read_episode,
     read_summary,
     recover_episode,
 )
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays
-from fetch_hand_sim.episode_log.summary import EpisodeSummary
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
 from support import peak_memory
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
-from fetch_hand_sim.episode_log import EpisodeReadError
-from fetch_hand_sim.episode_log.summary import read_summary
+from fetch_hand_sim.episode_log import EpisodeReadError, read_summary
 from fetch_hand_sim.view.page.plots import draw_plots
 from fetch_hand_sim.view.page.robot_panel import RobotPanel
 from fetch_hand_sim.view.page.widgets import (

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fetch_hand_sim.episode_log import EpisodeArrays, load_episodes
-from fetch_hand_sim.episode_log.summary import holds_no_episode
+from fetch_hand_sim.episode_log.files import holds_no_episode
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec
 from policy_node.training.replay.episode_replay import Episodes
 

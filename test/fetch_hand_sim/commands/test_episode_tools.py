@@ -24,9 +24,9 @@ from fetch_hand_sim.episode_log import (
     read_summary,
     recover_episode,
 )
-from fetch_hand_sim.episode_log.episode_record import parse_task
+from fetch_hand_sim.episode_log.metadata import parse_task
 from fetch_hand_sim.episode_log.model import former_model_sha256, model_sha256
-from fetch_hand_sim.episode_log.ticks import split_ticks
+from fetch_hand_sim.episode_log.reader import split_ticks
 from fetch_hand_sim.episodes import checker
 from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.episodes.context import RecordingContext
@@ -540,13 +540,14 @@ def test_recover_makes_bags_of_leftovers_and_says_which_it_cannot(reach, tmp_pat
     assert episodes_recover.main([str(tmp_path)]) == 1
     output = capsys.readouterr()
     assert 'marked as interrupted' in output.out
-    (line,) = [line for line in output.out.splitlines() if 'cleared away' in line]
+    (line,) = [line for line in output.out.splitlines() if 'moved to' in line]
     assert sources[1].name in line and 'killed before its first messages' in line
     assert 'nothing to recover' in output.err and sources[2].name in output.err
-    assert [entry.name for entry in sorted(tmp_path.iterdir())] == [
-        damaged.parent.name,
-        sources[0].name,
-    ]
+    aside = [tmp_path / f'.{source.name}.aside' for source in sources[:2]]
+    assert sorted(tmp_path.iterdir()) == sorted(
+        [*aside, damaged.parent, tmp_path / sources[0].name]
+    )
+    assert len(find_episodes(tmp_path)) == 1
     result = EpisodeChecker().check(tmp_path / sources[0].name)
     assert result.difference is None and 10 < result.ticks < 51
     (arrays,) = load_episodes(tmp_path / sources[0].name)
@@ -585,7 +586,7 @@ def test_what_cannot_be_learnt_from_is_left_out_and_named(reach, tmp_path):
     generate(tmp_path / 'mixed', 'FetchReach', episodes=1, control_hz=50.0)
     experience, skipped = read_experience(tmp_path / 'mixed', TASKS['FetchReach'])
     assert len(experience) == 1 and len(skipped) == 4
-    reasons = ('19 of 50 steps', 'FetchPush, not FetchReach', '50.0 Hz', 'begin and end')
+    reasons = ('19 of 50 steps', 'FetchPush, not FetchReach', '50.0 Hz', 'no MCAP file')
     assert [sum(reason in line for line in skipped) for reason in reasons] == [1, 1, 1, 1]
     with pytest.raises(ValueError, match='holds no usable episode of HandReach'):
         read_experience(tmp_path / 'mixed', TASKS['HandReach'])

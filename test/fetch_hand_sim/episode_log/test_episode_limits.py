@@ -20,10 +20,10 @@ from fetch_hand_sim.episode_log import (
     read_summary,
     recover_episode,
 )
-from fetch_hand_sim.episode_log.offered_qos import offered_qos
+from fetch_hand_sim.episode_log.bag import offered_qos_text
 from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
-from msgs_spec.schemas import schema_text, type_hash
+from msgs_spec.schemas import MAX_MESSAGE_BYTES, schema_text, type_hash
 from msgs_spec.topics import topic, topics
 from support.episode_recorder import Recorder
 
@@ -32,11 +32,11 @@ MIB = 2**20
 FLOODS = {
     'one of 17.6 MB': [('commands', 17_610_916)],
     'eight of 10 MB': [('commands', 10_000_000)] * 8,
-    'many of the longest': [('commands', limits.MAX_MESSAGE_BYTES)] * 1000,
+    'many of the longest': [('commands', MAX_MESSAGE_BYTES)] * 1000,
     'very many empty': [('commands', 4)] * (limits.MAX_MESSAGES + 10),
     'all topics': [
         (name, size)
-        for size in (4, 1000, limits.MAX_MESSAGE_BYTES + 1)
+        for size in (4, 1000, MAX_MESSAGE_BYTES + 1)
         for name in ('commands', 'set_goal', 'policy_status')
         for _ in range(limits.MAX_RECEIVED_MESSAGES)
     ],
@@ -149,7 +149,7 @@ def test_what_a_program_gives_is_refused_at_once(tmp_path, recorder, ticks):
         LogSettings(chunk_size=limits.MAX_CHUNK_BYTES)
     writer = EpisodeWriter(tmp_path, 'episode', {})
     with pytest.raises(ValueError, match='no reader takes 65537 bytes in a message'):
-        writer.write(ticks[0].messages[0][0], bytes(limits.MAX_MESSAGE_BYTES + 1), 1)
+        writer.write(ticks[0].messages[0][0], bytes(MAX_MESSAGE_BYTES + 1), 1)
     with pytest.raises(ValueError, match='bytes of episode metadata'):
         writer.finish(long)
 
@@ -178,7 +178,7 @@ def write_as_before(stream, recorder, ticks, flood):
             spec.type_name, 'ros2msg', schema_text(spec.type_name).encode()
         )
         metadata = {
-            'offered_qos_profiles': offered_qos(spec.qos).text,
+            'offered_qos_profiles': offered_qos_text(spec.qos),
             'topic_type_hash': type_hash(spec.type_name),
         }
         name = '/' + spec.name.lstrip('/')
@@ -240,5 +240,5 @@ def test_limits_hold_together():
     """What one topic may take leaves room for the others and for the ticks."""
     assert 4 * limits.MAX_RECEIVED_MESSAGES < limits.MAX_MESSAGES
     assert 4 * limits.MAX_RECEIVED_BYTES < limits.MAX_UNPACKED_BYTES
-    assert limits.MAX_MESSAGE_BYTES < limits.MAX_RECEIVED_BYTES
+    assert MAX_MESSAGE_BYTES < limits.MAX_RECEIVED_BYTES
     assert limits.MAX_UNPACKED_BYTES + limits.MAX_ATTACHMENT_BYTES < limits.MAX_FILE_BYTES

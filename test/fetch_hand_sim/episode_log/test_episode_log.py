@@ -21,11 +21,12 @@ from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
     EpisodeWriter,
     LogSettings,
-    durable,
+    files,
     find_leftovers,
     log_time,
     read_episode,
 )
+from fetch_hand_sim.episode_log.bag import offered_qos_text
 from fetch_hand_sim.episode_log.model import (
     compiled_attachment,
     compiled_bytes,
@@ -35,7 +36,7 @@ from fetch_hand_sim.episode_log.model import (
 from fetch_hand_sim.simulation.models import asset_path
 from msgs_spec.codecs import decode
 from msgs_spec.schemas import deserialize, schema_text, type_hash
-from msgs_spec.topics import topics
+from msgs_spec.topics import LATCHED, topics
 from support.episode_recorder import Recorder
 
 TASKS = ('FetchReach', 'HandReach', 'HandManipulateBlockRotateZ')
@@ -474,7 +475,7 @@ def test_bad_settings_are_refused(bad):
 def test_numbers_go_on_whatever_a_task_is_called(tmp_path, task):
     for number, seed in enumerate((5, 0)):
         writer = EpisodeDirectory(tmp_path).begin(task, seed, {})
-        assert durable.active_path(tmp_path, f'{task}_{number:06d}_seed{seed}').is_dir()
+        assert files.active_path(tmp_path, f'{task}_{number:06d}_seed{seed}').is_dir()
         # What was cut off has its number too.
         writer._stream.close()
 
@@ -518,3 +519,23 @@ def test_two_recorders_in_one_directory_do_not_meet(tmp_path):
         'FetchReach_000002_seed1',
     ]
     assert all(read_episode(path).is_complete for path in paths)
+
+
+def test_quality_of_service_is_written_as_rosbag2_version_9():
+    assert offered_qos_text(LATCHED) == (
+        '- history: keep_last\n'
+        '  depth: 1\n'
+        '  reliability: reliable\n'
+        '  durability: transient_local\n'
+        '  deadline:\n'
+        '    sec: 9223372036\n'
+        '    nsec: 854775807\n'
+        '  lifespan:\n'
+        '    sec: 9223372036\n'
+        '    nsec: 854775807\n'
+        '  liveliness: automatic\n'
+        '  liveliness_lease_duration:\n'
+        '    sec: 9223372036\n'
+        '    nsec: 854775807\n'
+        '  avoid_ros_namespace_conventions: false\n'
+    )

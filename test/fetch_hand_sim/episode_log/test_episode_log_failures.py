@@ -28,7 +28,7 @@ from fetch_hand_sim.episode_log import (
     EpisodeReadError,
     EpisodeWriter,
     LogSettings,
-    durable,
+    files,
     find_leftovers,
     load_episodes,
     read_episode,
@@ -230,9 +230,9 @@ def test_recovery_refuses_what_it_cannot_recover(finished, recorder, ticks, tmp_
     writer.abort('test')
 
 
-@pytest.mark.parametrize('size', [None, 0, 5, 400, 3000])
-def test_what_was_killed_before_its_first_chunk_is_cleared_away(finished, tmp_path, size):
-    """An empty directory, an empty file, half a header, half a record: nothing to keep."""
+@pytest.mark.parametrize('size', [None, 0, 5, 70])
+def test_a_leftover_of_a_header_is_removed(finished, tmp_path, size):
+    """An empty directory, an empty file, half a header, a few bytes beyond it."""
     leftover = tmp_path / '.episode.active'
     leftover.mkdir()
     if size is not None:
@@ -240,6 +240,19 @@ def test_what_was_killed_before_its_first_chunk_is_cleared_away(finished, tmp_pa
         (leftover / 'episode_0.mcap').write_bytes(whole[:size])
     assert recover_episode(leftover) is None
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('size', [400, 3000])
+def test_a_leftover_without_messages_is_put_aside(finished, tmp_path, size):
+    """Half of the metadata, or of the first chunk."""
+    leftover = tmp_path / '.episode.active'
+    leftover.mkdir()
+    torn = (finished / f'{finished.name}_0.mcap').read_bytes()[:size]
+    (leftover / 'episode_0.mcap').write_bytes(torn)
+    assert recover_episode(leftover) is None
+    assert [path.name for path in tmp_path.iterdir()] == ['.episode.aside']
+    assert (tmp_path / '.episode.aside' / 'episode_0.mcap').read_bytes() == torn
+    assert find_leftovers(tmp_path) == []
 
 
 def test_a_damaged_length_is_not_taken_for_a_kill(finished, tmp_path):
@@ -261,7 +274,7 @@ def test_an_episode_whose_directory_is_cleared_away_while_it_begins_takes_the_ne
 ):
     """Recovery may meet a directory in the instant before its file is locked."""
     locks = []
-    lock = durable.lock
+    lock = files.lock
 
     def clear_away_once(stream):
         if not locks:
@@ -269,7 +282,7 @@ def test_an_episode_whose_directory_is_cleared_away_while_it_begins_takes_the_ne
         locks.append(stream.name)
         lock(stream)
 
-    monkeypatch.setattr(durable, 'lock', clear_away_once)
+    monkeypatch.setattr(files, 'lock', clear_away_once)
     path = recorder.record(EpisodeDirectory(tmp_path))
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     assert path.name.startswith('FetchReach_000001_')
@@ -285,7 +298,7 @@ def test_of_two_recoveries_at_once_one_makes_the_bag_and_the_other_says_so(
     directory = tmp_path / 'copy'
     shutil.copytree(killed[0], directory)
     (leftover,) = find_leftovers(directory)
-    do, calls = getattr(durable, step), []
+    do, calls = getattr(files, step), []
 
     def meanwhile(*arguments, **options):
         result = None if step == 'publish' else do(*arguments, **options)
@@ -294,7 +307,7 @@ def test_of_two_recoveries_at_once_one_makes_the_bag_and_the_other_says_so(
             assert episodes_recover.main([str(directory)]) == 0
         return do(*arguments, **options) if step == 'publish' else result
 
-    monkeypatch.setattr(durable, step, meanwhile)
+    monkeypatch.setattr(files, step, meanwhile)
     assert episodes_recover.main([str(directory)]) == 0
     said = capsys.readouterr().out
     assert said.count(f'\nrecovered {directory}') == 1, said
@@ -500,9 +513,9 @@ def test_writing_costs_little_of_a_tick(tmp_path, recorder, ticks):
 def test_a_robot_that_begins_its_file_while_the_rest_is_cleared_away_keeps_it(
     tmp_path, monkeypatch
 ):
-    leftover = durable.active_path(tmp_path, 'FetchReach_000000_seed0')
+    leftover = files.active_path(tmp_path, 'FetchReach_000000_seed0')
     leftover.mkdir()
-    file = durable.bag_file(leftover, 'FetchReach_000000_seed0')
+    file = files.bag_file(leftover, 'FetchReach_000000_seed0')
     remove = recovery._remove_empty
 
     def begins(path):

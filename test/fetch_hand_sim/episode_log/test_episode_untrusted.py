@@ -95,7 +95,8 @@ def test_a_message_shorter_than_its_header_is_one_line(tmp_path):
 
     short = record(Opcode.MESSAGE, struct.pack('<H', 1))
     sizes = struct.pack('<QQQIIQ', 0, 0, len(short), 0, 0, len(short))
-    body = record(Opcode.CHUNK, sizes + short) + record(Opcode.DATA_END, bytes(4))
+    body = record(Opcode.HEADER, bytes(8)) + record(Opcode.CHUNK, sizes + short)
+    body += record(Opcode.DATA_END, bytes(4))
     (tmp_path / 'short.mcap').write_bytes(MCAP0_MAGIC + body + MCAP0_MAGIC)
     with pytest.raises(EpisodeReadError, match='a message is shorter than its header'):
         load_episodes(tmp_path / 'short.mcap')

@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
 from fetch_hand_sim.episode_log import read_episode
-from fetch_hand_sim.episode_log.ticks import split_ticks
+from fetch_hand_sim.episode_log.reader import split_ticks
 from fetch_hand_sim.replay_node.schedule import Playhead, ReplaySchedule
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.schemas import deserialize, serialize

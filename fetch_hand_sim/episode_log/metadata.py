@@ -1,13 +1,17 @@
-"""What the two metadata records of an episode say, typed; nothing else reads their text.
+"""The two metadata records of an episode, `episode` and `episode_result`: written and parsed.
 
-The text may be anybody's: a number is a number within its bounds, a word one of those allowed.
+The text of a file may come from anyone: a number is parsed within its bounds, a word must be one of
+those allowed.
 """
 
 from __future__ import annotations
 
 import json
+import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from typing import TypeVar
 
 from msgs_spec.disturbances import Disturbances
@@ -15,6 +19,7 @@ from msgs_spec.parameters import LARGEST_PERTURBATION
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
+    PHYSICS_TIMESTEP,
     REWARD_TYPES,
     SUCCESS_RULES,
     TASKS,
@@ -38,7 +43,7 @@ _SHOWN = 40
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRecord:
-    """What an episode is: the record `episode`.
+    """The record `episode`, parsed.
 
     Attributes:
         task: The task, with the joint names that its messages have, `episode_ticks` at 25 Hz.
@@ -47,11 +52,11 @@ class EpisodeRecord:
         reward_type: 'sparse' or 'dense'.
         success_rule: 'gymnasium' or 'paper'.
         control_hz: Ticks per simulated second.
-        joint_prefix: What the names of joints begin with.
-        interface_version: What its messages mean, see `INTERFACE_VERSION`.
-        perturb_limit: Largest force of a push, N; 0 where none was taken.
-        timing: What stayed where the rate is not 25 Hz.
-        disturbances: What was disturbed.
+        joint_prefix: Beginning of the names of joints.
+        interface_version: Meaning of the messages, see `INTERFACE_VERSION`.
+        perturb_limit: Largest force of a push, N; 0 if pushes were off.
+        timing: Which of seconds and ticks stayed the same where the rate is not 25 Hz.
+        disturbances: Disturbances of the robot.
     """
 
     task: TaskSpec
@@ -68,10 +73,10 @@ class EpisodeRecord:
 
     @classmethod
     def parse(cls, metadata: Strings) -> EpisodeRecord:
-        """Reads the contents of the record.
+        """Parse the contents of the record.
 
         Raises:
-            ValueError: If something is missing or not allowed; one line that names it.
+            ValueError: If a value is missing or not allowed; the message names it.
         """
         return cls(
             task=parse_task(metadata),
@@ -89,24 +94,23 @@ class EpisodeRecord:
 
     @property
     def spec(self) -> TaskSpec:
-        """The task with its usual joint names, `episode_ticks` as many as the episode has."""
-        # Robots up to 1.0 took as many at every rate.
+        """The task with its usual joint names and the `episode_ticks` of the episode."""
+        # Robots up to 1.0 took the same number of ticks at every rate.
         rate = self.control_hz if self.timing == 'seconds' else DEFAULT_CONTROL_HZ
         return task_spec(self.task.name, control_hz=rate)
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeOutcome:
-    """How an episode ended: the record `episode_result`. What it does not say is None.
+    """The record `episode_result`, parsed. Missing values are None.
 
     Attributes:
         is_complete: Whether the episode ran to its end.
-        reason: Why it did not.
+        reason: Why it was cut short.
         steps: Steps taken.
         episode_return: Sum of rewards.
         is_success: Whether the goal was reached at the end.
-        received_not_logged: Topics on which the robot received more than its log takes, and how
-            many messages; empty if there were none.
+        received_not_logged: Number of received messages beyond the allowance, by topic.
     """
 
     is_complete: bool = True
@@ -118,7 +122,7 @@ class EpisodeOutcome:
 
     @classmethod
     def parse(cls, result: Strings) -> EpisodeOutcome:
-        """Reads the contents of the record."""
+        """Parse the contents of the record."""
         is_complete = _flag(result.get('complete', '')) is True
         return cls(
             is_complete=is_complete,
@@ -130,7 +134,7 @@ class EpisodeOutcome:
         )
 
     def to_strings(self) -> dict[str, str]:
-        """Returns the contents of the record."""
+        """Return the contents of the record."""
         known = {
             'steps': None if self.steps is None else str(self.steps),
             'return': None if self.episode_return is None else repr(self.episode_return),
@@ -145,7 +149,7 @@ class EpisodeOutcome:
 
 
 class HasOutcome:
-    """What is read of a file, with the text of its records; `outcome` is the second one, typed."""
+    """An episode with its record `episode_result`; `outcome` is that record, parsed."""
 
     __slots__ = ()
 
@@ -163,7 +167,7 @@ class HasOutcome:
 
 
 def parse_task(metadata: Strings) -> TaskSpec:
-    """Returns the task of an episode, with the joint names that its messages have.
+    """Return the task of an episode, with the joint names that its messages have.
 
     Raises:
         ValueError: If it is unknown.
@@ -173,10 +177,10 @@ def parse_task(metadata: Strings) -> TaskSpec:
 
 
 def parse_control_hz(metadata: Strings) -> float:
-    """Returns the ticks per simulated second of an episode.
+    """Return the ticks per simulated second of an episode.
 
     Raises:
-        ValueError: If it is no rate that the simulation has.
+        ValueError: If the simulation has no such rate.
     """
     text = _text(metadata, 'control_hz')
     try:
@@ -188,7 +192,7 @@ def parse_control_hz(metadata: Strings) -> float:
 
 
 def integer_or_none(metadata: Strings, name: str) -> int | None:
-    """Returns a number of the record `episode`, None if it is missing or not allowed."""
+    """Return a number of the record `episode`, None if it is missing or not allowed."""
     try:
         return _integer(metadata, name)
     except ValueError:
@@ -242,9 +246,91 @@ def _flag(text: str) -> bool | None:
 
 
 def _number_or_none(text: str, kind: type[Number]) -> Number | None:
-    """A finite number, and no larger than int64; None for everything else."""
+    """Return a finite number within int64; None for all other text."""
     try:
         value = kind(text)
     except ValueError:
         return None
     return value if abs(value) <= _LARGEST else None
+
+
+# What is written
+
+
+# Meaning of the messages of an episode. In version 1, which recorded no number, a robot ignored
+# frame and stamp of a goal, and the orientations of `fingertip_poses` were identity.
+INTERFACE_VERSION = 2
+
+_PACKAGES = ('fetch_hand_sim', 'mujoco', 'numpy', 'gymnasium-robotics', 'mcap')
+
+
+@cache
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return 'unknown'
+
+
+def episode_metadata(
+    task: TaskSpec,
+    *,
+    episode: int,
+    seed: int,
+    reward_type: str,
+    success_rule: str,
+    control_hz: float,
+    timing: str = 'seconds',
+    joint_prefix: str = JOINT_PREFIX,
+    model_sha256: str,
+    source_revision: str | None = None,
+    checkpoint_sha256: str | None = None,
+    perturb_limit: float = 0.0,
+    disturbances: str = '',
+    variation: str = '',
+    started: str | None = None,
+) -> dict[str, str]:
+    """Return the contents of the record `episode`.
+
+    Args:
+        episode: Number of the episode in this run, from 0; the number in the file name goes on over
+            runs.
+        control_hz: Ticks per simulated second.
+        timing: Recorded only as `seconds` at another rate than 25 Hz, because robots up to 1.0
+            recorded nothing and kept `ticks`.
+        joint_prefix: Recorded only if it is not the usual one.
+        model_sha256: Fingerprint of the compiled model, see `model_sha256`.
+        checkpoint_sha256: Fingerprint of the actor that gives the commands, if known.
+        perturb_limit: Largest force of a push, N; recorded only if pushes are on.
+        disturbances: Disturbances of the robot, JSON; '' for none.
+        variation: Values that the episode drew from them, JSON; '' for none.
+        started: Wall-clock time of the start, ISO 8601. The one value that differs between equal
+            runs; leave it out for files that are equal byte by byte.
+    """
+    in_seconds = timing == 'seconds' and control_hz != DEFAULT_CONTROL_HZ
+    known = {
+        'interface_version': str(INTERFACE_VERSION),
+        'task': task.name,
+        'episode': str(episode),
+        'seed': str(seed),
+        'reward_type': reward_type,
+        'success_rule': success_rule,
+        'control_hz': repr(float(control_hz)),
+        'timing': timing if in_seconds else None,
+        'physics_timestep_s': repr(PHYSICS_TIMESTEP),
+        'episode_ticks': str(task.episode_ticks),
+        'robot': task.robot.name,
+        'joint_order': json.dumps(task.robot.joints),
+        'joint_prefix': joint_prefix if joint_prefix != JOINT_PREFIX else None,
+        'command_order': json.dumps([part.name for part in task.robot.command]),
+        'model_sha256': model_sha256,
+        'source_revision': source_revision,
+        'checkpoint_sha256': checkpoint_sha256,
+        'perturb_limit': repr(float(perturb_limit)) if perturb_limit else None,
+        'disturbances': disturbances or None,
+        'variation': variation or None,
+        'started': started,
+        'python_version': platform.python_version(),
+        **{f'{package}_version': _version(package) for package in _PACKAGES},
+    }
+    return {key: value for key, value in known.items() if value is not None}

@@ -1,0 +1,377 @@
+"""Write MCAP files as rosbag2, rosbags and Foxglove expect them, and their `metadata.yaml`.
+
+Profile `ros2`, `ros2msg` schemas, `cdr` messages, quality of service and type hash per channel,
+chunks with CRC and message index, schemas and channels repeated in the summary, statistics, CRC of
+all data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, BinaryIO, Literal
+
+import yaml
+from mcap.writer import CompressionType, IndexType, Writer
+
+from fetch_hand_sim.episode_log.limits import (
+    MAX_ATTACHMENTS,
+    MAX_CHUNK_BYTES,
+    MAX_CHUNKS,
+    MAX_MAP_ENTRIES,
+    MAX_MESSAGES,
+    MAX_METADATA_BYTES,
+    MAX_TOPICS,
+    MAX_UNPACKED_BYTES,
+)
+from msgs_spec.schemas import MAX_MESSAGE_BYTES, schema_text, type_hash
+from msgs_spec.topics import QosSpec, TopicSpec
+
+# Names of the metadata records; of the two `rosbag2` ones readers take the last.
+EPISODE, EPISODE_RESULT, ROSBAG2 = 'episode', 'episode_result', 'rosbag2'
+
+Compression = Literal['none', 'lz4', 'zstd']
+_COMPRESSIONS = {
+    'none': CompressionType.NONE,
+    'lz4': CompressionType.LZ4,
+    'zstd': CompressionType.ZSTD,
+}
+_ALL_BUT_ATTACHMENTS = IndexType.ALL & ~IndexType.ATTACHMENT
+# Bytes in a chunk beside the data of a message, and at most for the first message of a topic.
+_MESSAGE_BYTES = 1 + 8 + 2 + 4 + 8 + 8
+_TOPIC_BYTES = 2**16
+# Version of rosbag2's `metadata.yaml` in ROS 2 Jazzy.
+_VERSION, _ROS_DISTRO = 9, 'jazzy'
+# Infinite duration of rmw: no limit is set.
+_UNSET = {'sec': 9223372036, 'nsec': 854775807}
+# libyaml takes 1 ms where pure Python takes 6 ms, a good part of a tick.
+_SafeDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A file stored with the episode.
+
+    Attributes:
+        name: File name.
+        media_type: MIME type.
+        data: Contents.
+    """
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class LogSettings:
+    """How episodes are written.
+
+    Attributes:
+        chunk_size: Bytes of messages per chunk, less than half of what readers accept; small chunks
+            keep the longest write short.
+        compression: Of the chunks: 'none', 'lz4' or 'zstd'.
+        flush_period_ns: Simulated time after which messages are handed to the operating system, in
+            nanoseconds. The first tick after it does that, so a killed process loses up to a tick
+            more: less than a quarter of a second at the lowest rate, 12.5 Hz.
+        minimum_free_bytes: No episode is begun with less than this left on the disk.
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+
+    chunk_size: int = 128 * 1024
+    compression: Compression = 'lz4'
+    flush_period_ns: int = 150_000_000
+    minimum_free_bytes: int = 64 * 1024 * 1024
+
+    def __post_init__(self) -> None:
+        if self.compression not in _COMPRESSIONS:
+            allowed = ', '.join(_COMPRESSIONS)
+            raise ValueError(f'unknown compression {self.compression!r}; allowed: {allowed}')
+        if not 1 <= self.chunk_size <= MAX_CHUNK_BYTES // 2:
+            raise ValueError(f'chunk_size {self.chunk_size}; allowed: 1 ... {MAX_CHUNK_BYTES // 2}')
+        if self.flush_period_ns < 1 or self.minimum_free_bytes < 0:
+            raise ValueError(
+                f'flush_period_ns {self.flush_period_ns} must be positive, minimum_free_bytes '
+                f'{self.minimum_free_bytes} not negative'
+            )
+
+
+@cache
+def offered_qos(spec: QosSpec) -> list[dict[str, Any]]:
+    """Return the quality of service of one publisher as rosbag2 writes it."""
+    return [
+        {
+            'history': 'keep_last',
+            'depth': spec.depth,
+            'reliability': spec.reliability,
+            'durability': spec.durability,
+            'deadline': dict(_UNSET),
+            'lifespan': dict(_UNSET),
+            'liveliness': 'automatic',
+            'liveliness_lease_duration': dict(_UNSET),
+            'avoid_ros_namespace_conventions': False,
+        }
+    ]
+
+
+@cache
+def offered_qos_text(spec: QosSpec) -> str:
+    """Return the same as YAML, for the channel of an MCAP file."""
+    return yaml.safe_dump(offered_qos(spec), sort_keys=False)
+
+
+def checked_strings(content: Mapping[str, str]) -> dict[str, str]:
+    """Return a copy of the contents of a metadata record.
+
+    Raises:
+        ValueError: If a key or value is not a string, or there are more than readers accept.
+    """
+    for key, value in content.items():
+        if not isinstance(key, str) or not isinstance(value, str):
+            raise ValueError(f'episode metadata are strings, not {key!r}: {value!r}')
+    size = sum(len(text.encode()) for item in content.items() for text in item)
+    if size > MAX_METADATA_BYTES:
+        raise ValueError(f'{size} bytes of episode metadata; allowed: {MAX_METADATA_BYTES}')
+    if len(content) > MAX_MAP_ENTRIES:
+        raise ValueError(f'{len(content)} entries of metadata; allowed: {MAX_MAP_ENTRIES}')
+    return dict(content)
+
+
+@dataclass(slots=True)
+class _Channel:
+    """A topic of a bag, by its resolved name."""
+
+    name: str
+    topic: TopicSpec
+    id: int
+    count: int = 0
+
+
+class BagFile:
+    """One episode as an MCAP file in an open stream.
+
+    `OSError`s of the stream come through and end the file. The records that identify the episode
+    are written at once, so that a cut-off file identifies it too.
+
+    Args:
+        stream: Where to write; the caller flushes and closes it.
+        file_name: Name of the file in its bag directory.
+        settings: How to write.
+        metadata: Contents of the record `episode`.
+        attachments: Files to store.
+
+    Attributes:
+        has_unflushed: Whether there are messages that the operating system does not have yet.
+        message_count: Number of messages so far.
+    """
+
+    def __init__(
+        self,
+        stream: BinaryIO,
+        file_name: str,
+        settings: LogSettings,
+        metadata: dict[str, str],
+        attachments: Sequence[Attachment],
+    ) -> None:
+        if len(attachments) > MAX_ATTACHMENTS:
+            raise ValueError(f'{len(attachments)} attachments; allowed: {MAX_ATTACHMENTS}')
+        self._stream = stream
+        self._file_name = file_name
+        self._metadata = metadata
+        self._chunk_size = settings.chunk_size
+        self._writer = Writer(
+            stream,
+            chunk_size=settings.chunk_size,
+            compression=_COMPRESSIONS[settings.compression],
+            # Validators reject an empty index of attachments.
+            index_types=IndexType.ALL if attachments else _ALL_BUT_ATTACHMENTS,
+            enable_data_crcs=True,
+        )
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, _Channel] = {}
+        self._start_ns = 0
+        self._end_ns = -1
+        self._bytes = self._chunks = self._chunk_bytes = 0
+        self.message_count = 0
+        self.has_unflushed = False
+        self._writer.start(profile='ros2')
+        self._writer.add_metadata(EPISODE, metadata)
+        self._writer.add_metadata(ROSBAG2, self._rosbag2_record(metadata))
+        for attachment in attachments:
+            # No time: an attachment holds for the whole file.
+            self._writer.add_attachment(
+                0, 0, attachment.name, attachment.media_type, attachment.data
+            )
+        self.flush()
+
+    def write(self, name: str, topic: TopicSpec, data: bytes, log_time_ns: int) -> None:
+        """Append a message; the first of a topic makes its channel, which may not be empty.
+
+        The sequence number counts the messages of the topic from 0, so a gap is visible.
+
+        Args:
+            name: Resolved name of the topic.
+            topic: The topic.
+            data: CDR bytes.
+            log_time_ns: Later than that of the message before.
+
+        Raises:
+            ValueError: If the time does not grow, the topic had another type before, or readers
+                would reject the file; nothing is written then.
+        """
+        if log_time_ns <= self._end_ns:
+            raise ValueError(
+                f'log time {log_time_ns} ns of {name} is not later than the one before it, '
+                f'{self._end_ns} ns'
+            )
+        if exceeded := self._exceeded(len(data)):
+            raise ValueError(f'{name}: no reader takes {exceeded}')
+        channel = self._channels.get(name) or self._add_channel(name, topic)
+        if channel.topic.type_name != topic.type_name:
+            raise ValueError(
+                f'topic {topic.name} is {channel.topic.type_name} in this episode, '
+                f'not {topic.type_name}'
+            )
+        self._writer.add_message(channel.id, log_time_ns, data, log_time_ns, channel.count)
+        if self._end_ns < 0:
+            self._start_ns = log_time_ns
+        self._end_ns = log_time_ns
+        channel.count += 1
+        self.message_count += 1
+        self.has_unflushed = True
+        self._count_bytes(_MESSAGE_BYTES + len(data))
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks so far, including the one in progress."""
+        return self._chunks + (self._chunk_bytes > 0)
+
+    def has_room(self, size: int) -> bool:
+        """Whether readers accept the file with one more message of `size` bytes."""
+        return not self._exceeded(size)
+
+    def flush(self) -> None:
+        """End the chunk in progress and hand everything to the operating system."""
+        self._end_chunk()
+        self.has_unflushed = False
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def finish(self, result: dict[str, str]) -> str:
+        """Write the last chunk, the record `episode_result` and the summary.
+
+        Returns:
+            The text of `metadata.yaml`.
+        """
+        self.flush()
+        custom_data = {**self._metadata, **result}
+        self._writer.add_metadata(EPISODE_RESULT, result)
+        self._writer.add_metadata(ROSBAG2, self._rosbag2_record(custom_data))
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+        return _dump({'rosbag2_bagfile_information': self._description(custom_data)})
+
+    def _exceeded(self, size: int) -> str:
+        """Return which limit one more message of `size` bytes exceeds; '' for none."""
+        total = self._bytes + _TOPIC_BYTES + _MESSAGE_BYTES + size
+        counts = (
+            (size, MAX_MESSAGE_BYTES, 'bytes in a message'),
+            (self.message_count + 1, MAX_MESSAGES, 'messages in a file'),
+            (total, MAX_UNPACKED_BYTES, 'bytes of messages in a file'),
+            (self.chunks + 1, MAX_CHUNKS, 'chunks in a file'),
+        )
+        for count, limit, what in counts:
+            if count > limit:
+                return f'{count} {what}; allowed: up to {limit}'
+        return ''
+
+    def _count_bytes(self, size: int) -> None:
+        self._bytes += size
+        self._chunk_bytes += size
+        if self._chunk_bytes > self._chunk_size:
+            self._end_chunk()
+
+    def _end_chunk(self) -> None:
+        self._chunks += self._chunk_bytes > 0
+        self._chunk_bytes = 0
+
+    def _add_channel(self, name: str, topic: TopicSpec) -> _Channel:
+        if len(self._channels) >= MAX_TOPICS:
+            raise ValueError(f'{name}: no reader takes more than {MAX_TOPICS} topics')
+        text, qos = schema_text(topic.type_name), offered_qos_text(topic.qos)
+        texts = (name, topic.type_name, text, qos, type_hash(topic.type_name))
+        size = 4 * 64 + sum(len(each.encode()) for each in texts)
+        if size > _TOPIC_BYTES:
+            raise ValueError(f'{name}: schema and channel of {size} bytes; allowed: {_TOPIC_BYTES}')
+        if topic.type_name not in self._schemas:
+            self._schemas[topic.type_name] = self._writer.register_schema(
+                topic.type_name, 'ros2msg', text.encode()
+            )
+        id = self._writer.register_channel(
+            name,
+            'cdr',
+            self._schemas[topic.type_name],
+            {'offered_qos_profiles': qos, 'topic_type_hash': type_hash(topic.type_name)},
+        )
+        channel = self._channels[name] = _Channel(name, topic, id)
+        self._count_bytes(size)
+        return channel
+
+    def _rosbag2_record(self, custom_data: Mapping[str, str]) -> dict[str, str]:
+        return {'serialized_metadata': _dump(self._description(custom_data))}
+
+    def _description(self, custom_data: Mapping[str, str]) -> dict[str, Any]:
+        """Return rosbag2's description of the bag; readers of version 9 need every key."""
+        span = {
+            'starting_time': {'nanoseconds_since_epoch': self._start_ns},
+            'duration': {'nanoseconds': max(self._end_ns, 0) - self._start_ns},
+            'message_count': self.message_count,
+        }
+        return {
+            'version': _VERSION,
+            'storage_identifier': 'mcap',
+            **span,
+            'topics_with_message_count': [_topic_entry(each) for each in self._channels.values()],
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [self._file_name],
+            'files': [{'path': self._file_name, **span}],
+            'custom_data': {key: _Quoted(value) for key, value in custom_data.items()},
+            'ros_distro': _ROS_DISTRO,
+        }
+
+
+def _topic_entry(channel: _Channel) -> dict[str, Any]:
+    return {
+        'topic_metadata': {
+            'name': channel.name,
+            'type': channel.topic.type_name,
+            'serialization_format': 'cdr',
+            'offered_qos_profiles': offered_qos(channel.topic.qos),
+            'type_description_hash': type_hash(channel.topic.type_name),
+        },
+        'message_count': channel.count,
+    }
+
+
+class _Quoted(str):
+    """Text that is always quoted: a revision such as 12e4567 is a number to YAML 1.2."""
+
+
+class _Dumper(_SafeDumper):  # type: ignore[misc]
+    """Writes repeated parts in full instead of as anchors."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+_Dumper.add_representer(
+    _Quoted,
+    lambda dumper, text: dumper.represent_scalar('tag:yaml.org,2002:str', str(text), style='"'),
+)
+
+
+def _dump(content: Mapping[str, Any]) -> str:
+    return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True))

@@ -1,0 +1,266 @@
+"""Find episodes, and the steps in which their files are claimed, written and shown.
+
+An episode is written in the hidden directory `.<name>.active`, which gets its name when it is
+complete. Recovery moves files without messages to `.<name>.aside`.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import stat
+from contextlib import suppress
+from io import BufferedWriter
+from pathlib import Path
+from typing import IO, BinaryIO
+
+from fetch_hand_sim.episode_log.errors import EpisodeExistsError, EpisodeReadError
+from msgs_spec.text import first_of, printable
+
+_PREFIX, _SUFFIX, _ASIDE = '.', '.active', '.aside'
+_MIB = 1024 * 1024
+# Number of folders that an error lists.
+_LISTED = 3
+
+
+# Names
+
+
+def active_path(directory: Path, name: str) -> Path:
+    """Return the directory in which the episode `name` is written."""
+    return directory / f'{_PREFIX}{name}{_SUFFIX}'
+
+
+def aside_path(directory: Path, name: str) -> Path:
+    """Return the directory to which recovery moves the episode `name` if it has no messages."""
+    return directory / f'{_PREFIX}{name}{_ASIDE}'
+
+
+def active_name(path: Path) -> str | None:
+    """Return the name of the episode that is written in `path`, None for other directories."""
+    if path.name.startswith(_PREFIX) and path.name.endswith(_SUFFIX):
+        return path.name[len(_PREFIX) : -len(_SUFFIX)]
+    return None
+
+
+def bag_file(directory: Path, name: str) -> Path:
+    """Return the MCAP file of the episode `name` in its directory, hidden or not."""
+    return directory / f'{name}_0.mcap'
+
+
+def rewritten_file(file: Path) -> Path:
+    """Return the file that recovery writes before it replaces `file`."""
+    return file.with_suffix('.recovered')
+
+
+def metadata_file(directory: Path) -> Path:
+    """Return rosbag2's description of the bag in a directory."""
+    return directory / 'metadata.yaml'
+
+
+def is_mcap(path: Path) -> bool:
+    """Whether a name ends as that of an MCAP file; macOS puts `._` files beside them."""
+    return path.suffix == '.mcap' and not path.name.startswith('._')
+
+
+# Finding
+
+
+def find_episodes(directory: Path | str) -> list[Path]:
+    """Return bag directories and MCAP files in a directory, by name, without opening them.
+
+    Hidden directories are left out: episodes that are being written or were cut off, see
+    `find_leftovers`.
+
+    Raises:
+        EpisodeReadError: If it is no directory or cannot be read.
+    """
+    try:
+        entries = sorted(Path(directory).iterdir())
+        return [path for path in entries if _is_bag(path)]
+    except OSError as error:
+        raise EpisodeReadError(f'{error.filename or directory}: {error.strerror}') from error
+
+
+def _is_bag(path: Path) -> bool:
+    if path.name.startswith(_PREFIX) and path.name.endswith((_SUFFIX, _ASIDE)):
+        return False
+    try:
+        if path.is_dir():
+            return metadata_file(path).exists() or any(map(is_mcap, path.glob('*.mcap')))
+    except OSError:
+        return True  # Reading it will report why it cannot be read.
+    return is_mcap(path)
+
+
+def folders_below(directory: Path) -> str:
+    """Return the names of the first folders in a directory that contain episodes."""
+    try:
+        folders = [path for path in sorted(directory.iterdir()) if path.is_dir()]
+        held = [path for path in folders if path.name[0] != '.' and find_episodes(path)]
+    except (OSError, EpisodeReadError):
+        return ''
+    return first_of([printable(str(path)) for path in held], _LISTED)
+
+
+def holds_no_episode(directory: Path) -> EpisodeReadError:
+    """Return the error for a folder without episodes; it names folders below that have some."""
+    below = folders_below(directory)
+    return EpisodeReadError(
+        f'{directory} holds no episode{f"; there are some in {below}" if below else ""}'
+    )
+
+
+def expand_episodes(path: Path | str) -> list[Path]:
+    """Return the path itself if it is an episode or no directory, else the episodes in it.
+
+    Raises:
+        EpisodeReadError: If it does not exist, or is a directory that cannot be read.
+    """
+    path = Path(path)
+    try:
+        if not path.exists():
+            raise EpisodeReadError(f'{path}: No such file or directory')
+        if not path.is_dir() or metadata_file(path).exists():
+            return [path]
+    except OSError as error:
+        raise EpisodeReadError(f'{path}: {error.strerror}') from error
+    return find_episodes(path)
+
+
+def mcap_file(path: Path) -> Path:
+    """Return the MCAP file of a bag directory, or the path itself if it is no directory.
+
+    Raises:
+        EpisodeReadError: If the directory does not hold exactly one, or cannot be read.
+    """
+    try:
+        if not path.is_dir():
+            if path.exists() and not path.is_file():
+                raise EpisodeReadError(f'{path} is no regular file')  # A pipe would never end.
+            return path
+        # `glob` finds nothing in a directory without permission.
+        found = sorted(file for file in path.iterdir() if is_mcap(file) and file.is_file())
+    except OSError as error:
+        raise EpisodeReadError(f'{path}: {error.strerror}') from error
+    if len(found) != 1:
+        raise EpisodeReadError(
+            f'{path} holds {len(found)} MCAP files; an episode is a directory of one'
+        )
+    return found[0]
+
+
+# Writing
+
+
+def claim(directory: Path, name: str) -> BufferedWriter:
+    """Create the hidden directory of an episode; of several processes one succeeds.
+
+    Returns:
+        Its MCAP file, empty, locked and open for writing.
+
+    Raises:
+        EpisodeExistsError: If an episode of this name is finished, being written or cut off.
+    """
+    active = active_path(directory, name)
+    try:
+        active.mkdir()
+    except FileExistsError:
+        raise EpisodeExistsError(
+            f'{active} exists: {name} is being written or was cut off'
+        ) from None
+    try:
+        # Checked after the claim: only the process with the claim may finish under this name.
+        if (directory / name).exists():
+            raise EpisodeExistsError(f'{directory / name} exists; episodes are never overwritten')
+        stream = bag_file(active, name).open('xb')
+    except FileNotFoundError:
+        raise EpisodeExistsError(f'{active} was cleared away as the rest of a kill') from None
+    except (OSError, EpisodeExistsError):
+        active.rmdir()
+        raise
+    lock(stream)
+    if os.fstat(stream.fileno()).st_nlink == 0:
+        stream.close()
+        raise EpisodeExistsError(f'{active} was cleared away as the rest of a kill')
+    return stream
+
+
+def require_free_space(directory: Path, minimum_bytes: int) -> None:
+    """Raise `OSError` if less than `minimum_bytes` can be written to the disk of `directory`."""
+    status = os.statvfs(directory)
+    free = status.f_bavail * status.f_frsize
+    if free < minimum_bytes:
+        raise OSError(
+            errno.ENOSPC,
+            f'{free / _MIB:.1f} MiB free on the disk, {minimum_bytes / _MIB:.1f} MiB wanted',
+        )
+
+
+def lock(stream: IO[bytes]) -> None:
+    """Mark a file as being written for as long as this process lives and keeps it open."""
+    # File systems without locks only lose the distinction between running and cut-off episodes.
+    with suppress(OSError):
+        fcntl.flock(stream, fcntl.LOCK_EX)
+
+
+def try_lock(stream: IO[bytes], shared: bool = False) -> bool:
+    """Lock a file without waiting; return False if another process holds the lock."""
+    try:
+        fcntl.flock(stream, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass  # No locks on this file system, see `lock`.
+    return True
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file for reading, without following links or waiting for pipes.
+
+    Raises:
+        OSError: If it is anything else; the reason names that.
+    """
+    if not stat.S_ISREG(path.lstat().st_mode):
+        raise OSError(errno.EINVAL, 'is no regular file', str(path))
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    return os.fdopen(os.open(path, flags), 'rb')
+
+
+def create(path: Path) -> BinaryIO:
+    """Open a new file for writing; an existing file or link of the name is removed."""
+    path.unlink(missing_ok=True)
+    return path.open('xb')
+
+
+def is_locked(path: Path) -> bool:
+    """Whether a process is writing the regular file."""
+    with open_regular(path) as stream:
+        return not try_lock(stream, shared=True)
+
+
+def sync_directory(path: Path) -> None:
+    """Bring the entries of a directory to the disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def store(stream: IO[bytes], directory: Path, description: str) -> None:
+    """Bring a finished MCAP file and its `metadata.yaml` to the disk."""
+    stream.flush()
+    os.fsync(stream.fileno())
+    with create(metadata_file(directory)) as text:
+        text.write(description.encode())
+        text.flush()
+        os.fsync(text.fileno())
+
+
+def publish(active: Path, final: Path) -> None:
+    """Give a complete episode its name, in one step that a crash leaves done or not done."""
+    sync_directory(active)
+    active.rename(final)
+    sync_directory(final.parent)

@@ -1,0 +1,272 @@
+"""Parse whole MCAP files, and refuse those whose indexes and contents disagree.
+
+Some readers of MCAP read a file from the beginning. Others start at the summary and follow its
+indexes. A file is ambiguous if these ways lead to different contents; `parse_file` raises
+`ValueError` then.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import Counter, defaultdict
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
+
+from fetch_hand_sim.episode_log.limits import MAX_SUMMARY_BYTES
+from fetch_hand_sim.episode_log.records import (
+    RECORD,
+    Contents,
+    Fields,
+    Messages,
+    shown,
+    split_records,
+)
+
+# CRC of the summary and magic, bytes.
+_FILE_END = 4 + len(MCAP0_MAGIC)
+_INDEX_OFFSET = struct.Struct('<HQ')
+_CHUNK_INDEX = struct.Struct('<QQQQI')
+_CHUNK_SIZES = struct.Struct('<QQ')
+_STATISTICS = struct.Struct('<QHIIIIQQI')
+# Bytes of a message index beside its entries.
+_INDEX_BYTES = RECORD.size + 2 + 4
+_KNOWN = frozenset(Opcode)
+_IN_SUMMARY = frozenset(
+    {
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.CHUNK_INDEX,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.METADATA_INDEX,
+        Opcode.STATISTICS,
+        Opcode.SUMMARY_OFFSET,
+        Opcode.FOOTER,
+    }
+)
+_SUMMARY_ONLY = _IN_SUMMARY - {Opcode.SCHEMA, Opcode.CHANNEL}
+
+Summary = dict[int, list[tuple[int, int]]]
+
+
+def parse_file(data: bytes) -> tuple[Contents, Messages]:
+    """Parse a whole file.
+
+    Raises:
+        ValueError: If it is damaged, larger than the limits, or ambiguous; one line says why.
+    """
+    if not data.endswith(MCAP0_MAGIC):
+        raise ValueError('truncated, damaged or no MCAP file: its last bytes are not those of one')
+    contents = Contents()
+    summary: Summary = defaultdict(list)
+    summary_start = 0
+    for opcode, position, end in split_records(data[: -len(MCAP0_MAGIC)]):
+        if summary_start:
+            if opcode in _KNOWN and opcode not in _IN_SUMMARY:
+                raise ValueError(f'ambiguous: {_name(opcode)} after the end of the data')
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                contents.define(opcode, data[position + RECORD.size : end])
+            summary[opcode].append((position, end))
+        elif opcode == Opcode.DATA_END:
+            _check_data_crc(data, position, end)
+            summary_start = end
+        elif opcode in _SUMMARY_ONLY or (opcode == Opcode.HEADER and position > len(MCAP0_MAGIC)):
+            raise ValueError(f'ambiguous: {_name(opcode)} before the end of the data')
+        else:
+            contents.take(opcode, data, position, end)
+    require_one_meaning(contents)
+    messages = contents.messages()
+    _check_footer(data, summary, summary_start)
+    _check_offsets(data, summary)
+    _check_record_indexes(data, summary, contents)
+    _check_chunk_indexes(data, summary, contents, messages)
+    _check_message_indexes(contents, messages)
+    _check_statistics(data, summary, contents, messages)
+    return contents, messages
+
+
+def require_one_meaning(contents: Contents) -> None:
+    """Refuse several episodes in a file, and two channels, metadata records or files of one name.
+
+    Raises:
+        ValueError: As it says.
+    """
+    for name, count in Counter(each.name for each in contents.metadata).items():
+        if count > 1 and name.startswith('episode'):
+            raise ValueError(
+                f'{count} metadata records {shown(name)}: a file of {count} episodes, or a changed '
+                'one; allowed: one episode'
+            )
+    for what, names in (
+        ('channels of topic', [channel.topic for channel in contents.channels.values()]),
+        ('attachments', [attachment.name for attachment in contents.attachments]),
+    ):
+        name, count = next(iter(Counter(names).most_common(1)), ('', 0))
+        if count > 1:
+            raise ValueError(f'ambiguous: {count} {what} {shown(name)}; allowed: one')
+
+
+def _name(opcode: int) -> str:
+    return f'a {Opcode(opcode).name.lower().replace("_", " ")} record'
+
+
+def _fields(data: bytes, position: int, end: int) -> Fields:
+    kind = Opcode(data[position]).name.lower().replace('_', ' ')
+    return Fields(data[position + RECORD.size : end], kind)
+
+
+def _check_data_crc(data: bytes, position: int, end: int) -> None:
+    if _fields(data, position, end).number(4) not in (0, zlib.crc32(memoryview(data)[:position])):
+        raise ValueError('damaged: the CRC of the data is wrong')
+
+
+def _check_footer(data: bytes, summary: Summary, summary_start: int) -> None:
+    """Check that readers which start at the footer find the summary that follows the data."""
+    footers = summary[Opcode.FOOTER]
+    if len(footers) != 1 or footers[0][1] != len(data) - len(MCAP0_MAGIC):
+        raise ValueError('truncated or damaged: the file does not end with one footer')
+    position, end = footers[0]
+    fields = _fields(data, position, end)
+    start, offsets_start, crc = fields.number(8), fields.number(8), fields.number(4)
+    is_empty = position == summary_start
+    if start != summary_start and not (is_empty and start == 0):
+        raise ValueError('ambiguous: the footer does not point at the summary')
+    if len(data) - summary_start > MAX_SUMMARY_BYTES:
+        raise ValueError(f'summary of more than {MAX_SUMMARY_BYTES} bytes')
+    if crc not in (0, zlib.crc32(memoryview(data)[summary_start:-_FILE_END])):
+        raise ValueError('damaged: the CRC of the summary is wrong')
+    groups = summary[Opcode.SUMMARY_OFFSET]
+    if offsets_start not in (0, groups[0][0] if groups else position):
+        raise ValueError('ambiguous: the footer does not point at the offsets of the summary')
+
+
+def _check_offsets(data: bytes, summary: Summary) -> None:
+    for position, end in summary[Opcode.SUMMARY_OFFSET]:
+        fields = _fields(data, position, end)
+        opcode, start, length = fields.number(1), fields.number(8), fields.number(8)
+        found = summary.get(opcode, [])
+        expected = (found[0][0], sum(b - a for a, b in found)) if found else (start, 0)
+        if (start, length) != expected:
+            raise ValueError('ambiguous: an offset of the summary does not point at its group')
+
+
+def _check_record_indexes(data: bytes, summary: Summary, contents: Contents) -> None:
+    """Check that the indexes of metadata and attachments contain all records, or none."""
+    indexed = Counter[tuple[int, int, str]]()
+    for position, end in summary[Opcode.METADATA_INDEX]:
+        fields = _fields(data, position, end)
+        indexed[fields.number(8), fields.number(8), fields.text()] += 1
+    found = Counter((each.position, each.length, each.name) for each in contents.metadata)
+    if indexed and indexed != found:
+        raise ValueError('ambiguous: the index of the metadata disagrees with the metadata')
+    indexed.clear()
+    for position, end in summary[Opcode.ATTACHMENT_INDEX]:
+        fields = _fields(data, position, end)
+        where = fields.number(8), fields.number(8)
+        fields.bytes(24)
+        indexed[*where, fields.text()] += 1
+    found = Counter((each.position, each.length, each.name) for each in contents.attachments)
+    if indexed and indexed != found:
+        raise ValueError('ambiguous: the index of the attachments disagrees with the attachments')
+
+
+def _check_chunk_indexes(
+    data: bytes, summary: Summary, contents: Contents, messages: Messages
+) -> None:
+    """Check that the chunk indexes contain all chunks, or none, as they are."""
+    _check_chunk_times(contents, messages)
+    if not summary[Opcode.CHUNK_INDEX]:
+        return
+    where: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    length: Counter[int] = Counter()
+    for index in contents.message_indexes:
+        where[index.chunk].append((index.channel, index.position))
+        length[index.chunk] += _INDEX_BYTES + len(index.entries)
+    chunks = {chunk.position: number for number, chunk in enumerate(contents.chunks)}
+    for position, end in summary[Opcode.CHUNK_INDEX]:
+        fields = _fields(data, position, end)
+        first, last, chunk_position, chunk_length, size = fields.numbers(_CHUNK_INDEX)
+        offsets = fields.bytes(size)
+        described = ((first, last), chunk_length, fields.number(8), fields.text())
+        number = chunks.pop(chunk_position, -1)
+        chunk = contents.chunks[number] if number >= 0 else None
+        if chunk is None or (*described, *fields.numbers(_CHUNK_SIZES)) != (
+            chunk.times,
+            chunk.length,
+            length[number],
+            chunk.compression,
+            chunk.packed_bytes,
+            chunk.unpacked_bytes,
+        ):
+            raise ValueError('ambiguous: a chunk index disagrees with its chunk')
+        if len(offsets) % _INDEX_OFFSET.size or sorted(where[number]) != sorted(
+            _INDEX_OFFSET.iter_unpack(offsets)
+        ):
+            raise ValueError('ambiguous: a chunk index disagrees with the message indexes')
+    if chunks or contents.messages_outside:
+        raise ValueError('ambiguous: messages that the chunk indexes leave out')
+
+
+def _check_chunk_times(contents: Contents, messages: Messages) -> None:
+    """Check the first and last log time of each chunk; readers skip chunks by them."""
+    order = np.argsort(messages.starts)
+    starts, times = messages.starts[order], messages.headers['log_time'][order]
+    for chunk in contents.chunks:
+        first, last = np.searchsorted(starts, (chunk.base, chunk.base + chunk.unpacked_bytes))
+        found = times[first:last]
+        if chunk.times != (0, 0) and found.size:
+            if chunk.times != (int(found.min()), int(found.max())):
+                raise ValueError('ambiguous: a chunk has other times than its messages')
+
+
+def _check_message_indexes(contents: Contents, messages: Messages) -> None:
+    """Check that the message indexes contain all messages, or none."""
+    if not contents.message_indexes:
+        return
+    found = contents.message_indexes
+    counts = [len(index.entries) // 16 for index in found]
+    bases = np.array([contents.chunks[index.chunk].base for index in found], np.uint64)
+    indexed = np.frombuffer(b''.join(index.entries for index in found), '<u8').reshape(-1, 2)
+    starts = np.repeat(bases, counts) + indexed[:, 1]
+    channels = np.repeat([index.channel for index in found], counts)
+    order = np.argsort(starts)
+    expected = np.argsort(messages.starts)
+    for given, known in (
+        (starts, messages.starts.astype(np.uint64)),
+        (indexed[:, 0], messages.headers['log_time']),
+        (channels, messages.headers['channel']),
+    ):
+        if not np.array_equal(given[order], known[expected]):
+            raise ValueError('ambiguous: the message indexes disagree with the messages')
+
+
+def _check_statistics(
+    data: bytes, summary: Summary, contents: Contents, messages: Messages
+) -> None:
+    """Check the statistics, where a count of 0 is unknown but for the number of messages."""
+    if len(summary[Opcode.STATISTICS]) > 1:
+        raise ValueError('ambiguous: two records of statistics')
+    for position, end in summary[Opcode.STATISTICS]:
+        fields = _fields(data, position, end)
+        message_count, *counts, first, last, size = fields.numbers(_STATISTICS)
+        per_channel = dict(_INDEX_OFFSET.iter_unpack(fields.bytes(size)))
+        found = messages.headers['log_time']
+        span = (int(found[0]), int(found[-1])) if found.size else (first, last)
+        known = (
+            len(contents.schemas),
+            len(contents.channels),
+            len(contents.attachments),
+            len(contents.metadata),
+            len(contents.chunks),
+        )
+        ids, numbers = np.unique(messages.headers['channel'], return_counts=True)
+        expected = dict(zip(ids.tolist(), numbers.tolist(), strict=True))
+        if (
+            message_count != found.size
+            or (first, last) != span
+            or any(given not in (0, count) for given, count in zip(counts, known, strict=True))
+            or (per_channel and {id: n for id, n in per_channel.items() if n} != expected)
+        ):
+            raise ValueError('ambiguous: the statistics disagree with the contents')

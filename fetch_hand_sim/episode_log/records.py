@@ -1,0 +1,493 @@
+"""Parse the data section of MCAP files within bounds of memory and CPU time.
+
+`Contents` takes the records one after the other, so recovery can keep what comes before a damage.
+`parse_file` takes whole files and checks them with `summary`.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
+
+from fetch_hand_sim.episode_log.limits import (
+    MAX_ATTACHMENT_BYTES,
+    MAX_ATTACHMENTS,
+    MAX_CHUNK_BYTES,
+    MAX_CHUNKS,
+    MAX_MAP_ENTRIES,
+    MAX_MESSAGES,
+    MAX_METADATA_RECORDS,
+    MAX_RECORD_BYTES,
+    MAX_RECORDS,
+    MAX_TOPICS,
+    MAX_UNPACKED_BYTES,
+)
+from msgs_spec.schemas import MAX_MESSAGE_BYTES
+from msgs_spec.text import one_line
+
+# Opcode and length of a record.
+RECORD = struct.Struct('<BQ')
+MESSAGE = np.dtype(
+    [
+        ('opcode', 'u1'),
+        ('size', '<u8'),
+        ('channel', '<u2'),
+        ('sequence', '<u4'),
+        ('log_time', '<u8'),
+        ('publish_time', '<u8'),
+    ]
+)
+_DEFINITIONS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL})
+# Times of a chunk, its unpacked size and CRC; channel and size of a message index.
+_CHUNK_HEADER = struct.Struct('<QQQI')
+_INDEX_HEADER = struct.Struct('<HI')
+_INDEX_ENTRY_BYTES = 16
+MESSAGE_FIELD_BYTES = MESSAGE.itemsize - RECORD.size
+_LATEST_NS = 2**63 - 1
+
+
+class TornError(ValueError):
+    """A file ends in the middle of a record.
+
+    Attributes:
+        opcode: Kind of that record; None if the file ends in its opcode and length.
+        length: Length that the record has according to itself.
+        bytes_left: Bytes of the file from the beginning of that record.
+    """
+
+    def __init__(self, opcode: int | None, length: int, bytes_left: int) -> None:
+        super().__init__('truncated or damaged: a record is longer than the rest of the file')
+        self.opcode = opcode
+        self.length = length
+        self.bytes_left = bytes_left
+
+
+class Fields:
+    """Cursor over the fields of one record.
+
+    Methods raise `ValueError` if the record is too short, and for text that is not UTF-8.
+    """
+
+    def __init__(self, data: bytes, kind: str) -> None:
+        self._data = data
+        self._position = 0
+        self._kind = kind
+
+    @property
+    def is_at_end(self) -> bool:
+        """Whether all fields are read."""
+        return self._position == len(self._data)
+
+    def number(self, size: int) -> int:
+        """Read an unsigned number of `size` bytes."""
+        return int.from_bytes(self.bytes(size), 'little')
+
+    def numbers(self, layout: struct.Struct) -> tuple[int, ...]:
+        """Read several numbers at once."""
+        return layout.unpack(self.bytes(layout.size))
+
+    def bytes(self, size: int) -> bytes:
+        """Read `size` bytes."""
+        start, self._position = self._position, self._position + size
+        if self._position > len(self._data):
+            raise ValueError(f'damaged: a {self._kind} record is shorter than its fields')
+        return self._data[start : self._position]
+
+    def text(self) -> str:
+        """Read a text, which follows its length."""
+        return self.bytes(self.number(4)).decode()
+
+    def strings(self) -> dict[str, str]:
+        """Read a map from text to text.
+
+        Raises:
+            ValueError: If it has more than `MAX_MAP_ENTRIES` entries, or one key twice.
+        """
+        fields = Fields(self.bytes(self.number(4)), self._kind)
+        found: dict[str, str] = {}
+        while not fields.is_at_end:
+            key, value = fields.text(), fields.text()
+            if key in found:
+                raise ValueError(f'a {self._kind} record has the key {shown(key)} twice')
+            if len(found) == MAX_MAP_ENTRIES:
+                raise ValueError(f'a {self._kind} record with more than {MAX_MAP_ENTRIES} entries')
+            found[key] = value
+        return found
+
+
+def shown(text: str) -> str:
+    """Return a text from a file in quotes, shortened so that it fits into a line."""
+    return f"'{one_line(text, longest=60)}'"
+
+
+@dataclass(frozen=True, slots=True)
+class ReadLimits:
+    """How much of a file is read.
+
+    Attributes:
+        chunk_bytes: Bytes of one chunk, unpacked.
+        unpacked_bytes: Bytes of all chunks together.
+        skips_long_messages: Whether messages above `MAX_MESSAGE_BYTES` are left out.
+    """
+
+    chunk_bytes: int = MAX_CHUNK_BYTES
+    unpacked_bytes: int = MAX_UNPACKED_BYTES
+    skips_long_messages: bool = False
+
+
+EPISODE_LIMITS = ReadLimits()
+# Version 0.1 logged every message that the robot received, in chunks larger than readers accept.
+RECOVERY_LIMITS = ReadLimits(64 * 2**20, 256 * 2**20, skips_long_messages=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """A type of messages."""
+
+    name: str
+    encoding: str
+    text: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A topic."""
+
+    schema_id: int
+    topic: str
+    encoding: str
+    metadata: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Where a chunk is, what its header contains, and where its contents are in `unpacked`."""
+
+    position: int
+    length: int
+    times: tuple[int, int]
+    compression: str
+    packed_bytes: int
+    unpacked_bytes: int
+    base: int
+
+
+@dataclass(frozen=True, slots=True)
+class MessageIndex:
+    """A message index, where it is, and the number of its chunk."""
+
+    chunk: int
+    position: int
+    channel: int
+    entries: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class MetadataRecord:
+    """A metadata record and where it is."""
+
+    position: int
+    length: int
+    name: str
+    content: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class AttachmentRecord:
+    """An attachment and where it is."""
+
+    position: int
+    length: int
+    name: str
+    media_type: str
+    data: bytes
+
+
+class Contents:
+    """The records of the data section of a file, in or outside of chunks.
+
+    `take` raises `ValueError` at damage, beyond the limits, and if an id is defined twice with
+    different contents; then it leaves out the record.
+
+    Attributes:
+        schemas: By id.
+        channels: By id.
+        metadata: All metadata records, in order.
+        attachments: All attachments, in order.
+        chunks: All chunks, in order.
+        message_indexes: All message indexes, in order.
+        messages_outside: Number of messages outside of chunks.
+    """
+
+    def __init__(self, limits: ReadLimits = EPISODE_LIMITS) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.metadata: list[MetadataRecord] = []
+        self.attachments: list[AttachmentRecord] = []
+        self.chunks: list[Chunk] = []
+        self.message_indexes: list[MessageIndex] = []
+        self.messages_outside = 0
+        self._limits = limits
+        self._definitions: dict[tuple[int, int], bytes] = {}
+        self._unpacked_bytes = 0
+        self._runs: list[bytes] = []
+        self._size = 0
+        self._starts: list[int] = []
+
+    def take(self, opcode: int, data: bytes, position: int, end: int) -> None:
+        """Take the record that begins at `position` and whose content ends at `end`."""
+        start = position + RECORD.size
+        if opcode == Opcode.CHUNK:
+            self._take_chunk(data[start:end], position, end - position)
+        elif opcode == Opcode.MESSAGE_INDEX:
+            self._take_message_index(data[start:end], position)
+        elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+            self._unpacked_bytes += end - position
+            self._require_room()
+            self._take_run(data[position:end])
+            self.messages_outside += opcode == Opcode.MESSAGE
+        elif opcode == Opcode.METADATA:
+            self._take_metadata(data[start:end], position, end - position)
+        elif opcode == Opcode.ATTACHMENT:
+            self._take_attachment(data[start:end], position, end - position)
+
+    def define(self, opcode: int, content: bytes) -> None:
+        """Take a schema or channel, which may be a repetition."""
+        id = int.from_bytes(content[:2], 'little')
+        known = self._definitions.get((opcode, id))
+        if known == content:
+            return
+        kind = 'schema' if opcode == Opcode.SCHEMA else 'channel'
+        if len(content) > MAX_RECORD_BYTES:
+            raise ValueError(f'record of {len(content)} bytes; allowed: up to {MAX_RECORD_BYTES}')
+        if known is not None:
+            raise ValueError(f'ambiguous: {kind} {id} is defined twice, with different contents')
+        if len(self._definitions) == 2 * MAX_TOPICS:
+            raise ValueError(f'more than {2 * MAX_TOPICS} schemas and channels')
+        self._definitions[opcode, id] = content
+        fields = Fields(content, kind)
+        fields.number(2)
+        if opcode == Opcode.SCHEMA:
+            name, encoding = fields.text(), fields.text()
+            self.schemas[id] = Schema(name, encoding, fields.bytes(fields.number(4)))
+        else:
+            schema_id, topic, encoding = fields.number(2), fields.text(), fields.text()
+            self.channels[id] = Channel(schema_id, topic, encoding, fields.strings())
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages so far."""
+        return len(self._starts)
+
+    def messages(self) -> Messages:
+        """Return all messages, sorted by log time.
+
+        Raises:
+            ValueError: If two have the same time, or one belongs to an undefined channel.
+        """
+        unpacked = b''.join(self._runs)
+        starts = np.array(self._starts, dtype=np.int64)
+        buffer = np.frombuffer(unpacked, np.uint8)
+        bytes_of_headers = buffer[starts[:, None] + np.arange(MESSAGE.itemsize)]
+        headers = np.ascontiguousarray(bytes_of_headers).view(MESSAGE)[:, 0]
+        times = headers['log_time']
+        if times.size and max(times.max(), headers['publish_time'].max()) > _LATEST_NS:
+            raise ValueError(f'a message with a time beyond {_LATEST_NS} ns')
+        undefined = set(np.unique(headers['channel']).tolist()) - self.channels.keys()
+        if undefined:
+            raise ValueError(f'messages of channel {min(undefined)}, which is not defined')
+        if (times[1:] > times[:-1]).all():
+            return Messages(unpacked, starts, headers)
+        order = np.argsort(times, kind='stable')
+        sorted_times = times[order]
+        (equal,) = np.nonzero(sorted_times[1:] == sorted_times[:-1])
+        if equal.size:
+            raise ValueError(
+                f'ambiguous: two messages have the log time {sorted_times[equal[0]]} ns; '
+                'are there several episodes in the file?'
+            )
+        return Messages(unpacked, starts[order], headers[order])
+
+    def _require_room(self) -> None:
+        if self._unpacked_bytes > self._limits.unpacked_bytes:
+            raise ValueError(f'more than {self._limits.unpacked_bytes} bytes of messages')
+
+    def _take_chunk(self, content: bytes, position: int, length: int) -> None:
+        if len(self.chunks) == MAX_CHUNKS:
+            raise ValueError(f'more than {MAX_CHUNKS} chunks')
+        fields = Fields(content, 'chunk')
+        first, last, size, crc = fields.numbers(_CHUNK_HEADER)
+        compression = fields.text()
+        packed = fields.bytes(fields.number(8))
+        if size > self._limits.chunk_bytes:
+            raise ValueError(f'chunk of {size} bytes; allowed: up to {self._limits.chunk_bytes}')
+        self._unpacked_bytes += size
+        self._require_room()
+        data = _unpack(packed, compression, size)
+        if crc not in (0, zlib.crc32(data)):
+            raise ValueError('damaged: the CRC of a chunk is wrong')
+        if self._limits.skips_long_messages:
+            data = _without_long_messages(data)
+        base = self._size
+        self._take_run(data)
+        self.chunks.append(
+            Chunk(position, length, (first, last), compression, len(packed), size, base)
+        )
+
+    def _take_run(self, data: bytes) -> None:
+        """Take records one after the other: schemas, channels and messages."""
+        starts: list[int] = []
+        position, end, base = 0, len(data), self._size
+        if base + end > MAX_UNPACKED_BYTES:
+            raise ValueError(f'more than {MAX_UNPACKED_BYTES} bytes of messages')
+        read, message = RECORD.unpack_from, int(Opcode.MESSAGE)
+        while position < end:
+            if end - position < RECORD.size:
+                raise ValueError('damaged: a record is longer than its chunk')
+            opcode, size = read(data, position)
+            following = position + RECORD.size + size
+            if following > end:
+                raise ValueError('damaged: a record is longer than its chunk')
+            if opcode == message:
+                if size < MESSAGE_FIELD_BYTES:
+                    raise ValueError('damaged: a message is shorter than its header')
+                starts.append(base + position)
+            elif opcode in _DEFINITIONS:
+                self.define(opcode, data[position + RECORD.size : following])
+            position = following
+        if len(self._starts) + len(starts) > MAX_MESSAGES:
+            raise ValueError(f'more than {MAX_MESSAGES} messages')
+        self._starts += starts
+        self._runs.append(data)
+        self._size += len(data)
+
+    def _take_message_index(self, content: bytes, position: int) -> None:
+        size = len(content) - _INDEX_HEADER.size
+        channel, expected = _INDEX_HEADER.unpack_from(content) if size >= 0 else (0, -1)
+        if size != expected or size % _INDEX_ENTRY_BYTES or not self.chunks:
+            raise ValueError('damaged: a message index of another size, or without a chunk')
+        entries = content[_INDEX_HEADER.size :]
+        self.message_indexes.append(MessageIndex(len(self.chunks) - 1, position, channel, entries))
+
+    def _take_metadata(self, content: bytes, position: int, length: int) -> None:
+        if length > MAX_RECORD_BYTES:
+            raise ValueError(f'record of {length} bytes; allowed: up to {MAX_RECORD_BYTES}')
+        if len(self.metadata) == MAX_METADATA_RECORDS:
+            raise ValueError(f'more than {MAX_METADATA_RECORDS} metadata records')
+        fields = Fields(content, 'metadata')
+        record = MetadataRecord(position, length, fields.text(), fields.strings())
+        self.metadata.append(record)
+
+    def _take_attachment(self, content: bytes, position: int, length: int) -> None:
+        if len(self.attachments) == MAX_ATTACHMENTS:
+            raise ValueError(f'more than {MAX_ATTACHMENTS} attachments')
+        fields = Fields(content, 'attachment')
+        fields.bytes(16)
+        name, media_type = fields.text(), fields.text()
+        data = fields.bytes(fields.number(8))
+        if fields.number(4) not in (0, zlib.crc32(memoryview(content)[:-4])):
+            raise ValueError(f'damaged: the CRC of the attachment {shown(name)} is wrong')
+        if sum(len(each.data) for each in self.attachments) + len(data) > MAX_ATTACHMENT_BYTES:
+            raise ValueError(f'more than {MAX_ATTACHMENT_BYTES} bytes attached')
+        self.attachments.append(AttachmentRecord(position, length, name, media_type, data))
+
+
+@dataclass(frozen=True, slots=True)
+class Messages:
+    """The messages of a file, sorted by log time.
+
+    Attributes:
+        unpacked: Contents of all chunks, and records outside of chunks, one after the other.
+        starts: (n,) where each message record begins in `unpacked`.
+        headers: (n,) of type `MESSAGE`.
+    """
+
+    unpacked: bytes
+    starts: NDArray[np.int64]
+    headers: NDArray[np.void]
+
+    def rows(self) -> Iterator[tuple[int, int, int, int, bytes]]:
+        """Yield channel, sequence, log time, publish time and data of each message."""
+        for start, header in zip(self.starts.tolist(), self.headers.tolist(), strict=True):
+            _, size, channel, sequence, log_time, publish_time = header
+            data = self.unpacked[start + MESSAGE.itemsize : start + RECORD.size + size]
+            yield channel, sequence, log_time, publish_time, data
+
+
+def split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, position and end of each record of a file, from its header on.
+
+    The magic at the end of a whole file is no record; the caller stops at the footer.
+
+    Raises:
+        TornError: If the file ends within a record.
+        ValueError: If it is no MCAP file, or has more than `MAX_RECORDS` records.
+    """
+    magic = len(MCAP0_MAGIC)
+    if data[:magic] != MCAP0_MAGIC:
+        raise ValueError('no MCAP file: its first bytes are not those of one')
+    position, size = magic, len(data)
+    for _ in range(MAX_RECORDS):
+        if position == size:
+            return
+        if size - position < RECORD.size:
+            raise TornError(None, 0, size - position)
+        opcode, length = RECORD.unpack_from(data, position)
+        end = position + RECORD.size + length
+        if end > size:
+            raise TornError(opcode, length, size - position)
+        if position == magic and opcode != Opcode.HEADER:
+            raise ValueError('damaged: the first record is no header')
+        yield opcode, position, end
+        position = end
+    raise ValueError(f'more than {MAX_RECORDS} records')
+
+
+def _unpack(packed: bytes, compression: str, size: int) -> bytes:
+    """Return the contents of a chunk, which must have `size` bytes."""
+    try:
+        data = _decompress(packed, compression, size)
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise ValueError(f'damaged: a chunk cannot be unpacked ({one_line(error)})') from None
+    if len(data) != size:
+        raise ValueError(f'damaged: a chunk of {len(data)} bytes records {size}')
+    return data
+
+
+def _decompress(packed: bytes, compression: str, size: int) -> bytes:
+    if compression == '':
+        return packed
+    if compression == 'zstd':
+        # The frame names a size of its own, which the library would allocate.
+        if zstandard.frame_content_size(packed) not in (-1, size):
+            raise ValueError('damaged: a chunk records two sizes')
+        unpacker = zstandard.ZstdDecompressor()
+        return unpacker.decompress(packed, max_output_size=size, allow_extra_data=False)
+    if compression == 'lz4':
+        frame = lz4.frame.LZ4FrameDecompressor()
+        data = bytes(frame.decompress(packed, max_length=size + 1))
+        if not frame.eof or frame.unused_data:
+            raise ValueError('damaged: a chunk is not one frame of lz4')
+        return data
+    raise ValueError(f'chunk compression {shown(compression)}; allowed: zstd, lz4, none')
+
+
+def _without_long_messages(data: bytes) -> bytes:
+    kept: list[bytes] = []
+    position, end = 0, len(data)
+    while position <= end - RECORD.size:
+        opcode, size = RECORD.unpack_from(data, position)
+        following = position + RECORD.size + size
+        if opcode != Opcode.MESSAGE or size - MESSAGE_FIELD_BYTES <= MAX_MESSAGE_BYTES:
+            kept.append(data[position:following])
+        position = following
+    return b''.join(kept)

@@ -1,0 +1,497 @@
+"""An episode file means one thing to all readers, or all of them reject it with the reason."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from fetch_hand_sim.episode_log import (
+    EpisodeDirectory,
+    EpisodeReadError,
+    LogSettings,
+    load_episodes,
+    read_episode,
+    read_summary,
+)
+from fetch_hand_sim.episode_log.reader import read_file
+from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.films.recording import load_recording
+from fetch_hand_sim.replay_node.schedule import ReplaySchedule
+from msgs_spec.schemas import schema_text
+from msgs_spec.tasks import TASKS
+from policy_node.training.replay.logged_episodes import read_experience
+from support.episode_recorder import Recorder
+
+PYMCAP_CLI = Path(sys.executable).with_name('pymcap-cli')
+ROSBAGS_CONVERT = Path(sys.executable).with_name('rosbags-convert')
+READERS = [
+    read_summary,
+    read_episode,
+    load_episodes,
+    load_recording,
+    ReplaySchedule,
+    EpisodeChecker().check,
+]
+
+
+@pytest.fixture(scope='module')
+def episodes(tmp_path_factory):
+    recorder, directory = Recorder('FetchReach'), tmp_path_factory.mktemp('episodes')
+    return [recorder.record(EpisodeDirectory(directory)) for _ in range(2)]
+
+
+@pytest.fixture(scope='module')
+def parts(episodes):
+    return Parts(episodes[0])
+
+
+def record(opcode, content):
+    return bytes([opcode]) + struct.pack('<Q', len(content)) + content
+
+
+def text(value):
+    return struct.pack('<I', len(value.encode())) + value.encode()
+
+
+def strings(content):
+    pairs = b''.join(text(key) + text(value) for key, value in content.items())
+    return struct.pack('<I', len(pairs)) + pairs
+
+
+def metadata(name, content):
+    return record(Opcode.METADATA, text(name) + strings(content))
+
+
+def chunk(*records, times=(0, 0)):
+    data = b''.join(records)
+    sizes = struct.pack('<QQQI', *times, len(data), 0) + text('') + struct.pack('<Q', len(data))
+    return record(Opcode.CHUNK, sizes + data)
+
+
+def schema(id, name, definition):
+    data = struct.pack('<I', len(definition)) + definition.encode()
+    return record(Opcode.SCHEMA, struct.pack('<H', id) + text(name) + text('ros2msg') + data)
+
+
+def channel(id, schema_id, topic, encoding='cdr'):
+    content = struct.pack('<HH', id, schema_id) + text(topic) + text(encoding) + strings({})
+    return record(Opcode.CHANNEL, content)
+
+
+def message(id, log_time, data, publish_time=None, sequence=0):
+    publish_time = log_time if publish_time is None else publish_time
+    return record(Opcode.MESSAGE, struct.pack('<HIQQ', id, sequence, log_time, publish_time) + data)
+
+
+def statistics(count, first, last):
+    return record(
+        Opcode.STATISTICS, struct.pack('<QHIIIIQQI', count, 0, 0, 0, 0, 0, first, last, 0)
+    )
+
+
+def whole(*data, summary=()):
+    """An MCAP file without CRCs."""
+    start = MCAP0_MAGIC + record(Opcode.HEADER, text('ros2') + text('test')) + b''.join(data)
+    start += record(Opcode.DATA_END, bytes(4))
+    summary_start = len(start) if summary else 0
+    footer = record(Opcode.FOOTER, struct.pack('<QQI', summary_start, 0, 0))
+    return start + b''.join(summary) + footer + MCAP0_MAGIC
+
+
+class Parts:
+    """The records of an episode, to be put together in other ways."""
+
+    def __init__(self, path):
+        self.episode = read_episode(path)
+        self.record = metadata('episode', self.episode.metadata)
+        self.result = metadata('episode_result', self.episode.result)
+        names = sorted({topic.type_name for topic in self.episode.topics.values()})
+        self.schema_ids = {name: id for id, name in enumerate(names, start=1)}
+        self.schemas = [schema(id, name, schema_text(name)) for name, id in self.schema_ids.items()]
+        self.channels, found = [], []
+        self.channel_ids = {}
+        for id, (name, topic) in enumerate(self.episode.topics.items(), start=1):
+            self.channel_ids[name] = id
+            self.channels.append(channel(id, self.schema_ids[topic.type_name], name))
+            found += [(m.log_time_ns, id, m.data) for m in topic.messages]
+        self.rows = sorted(found)
+        self.messages = [message(id, time, data) for time, id, data in self.rows]
+        self.last_ns = self.rows[-1][0]
+
+    def file(self, *extra, messages=None, schemas=None, channels=None, summary=(), times=(0, 0)):
+        definitions = [*(schemas or self.schemas), *(channels or self.channels)]
+        content = chunk(*definitions, *(messages or self.messages), times=times)
+        return whole(self.record, content, *extra, self.result, summary=summary)
+
+    @property
+    def last_reward(self):
+        return [data for _, id, data in self.rows if id == self.channel_ids['/reward']][-1]
+
+
+def second_channel(parts):
+    extra = channel(99, parts.schema_ids['std_msgs/msg/Float64'], '/reward')
+    return parts.file(chunk(extra, message(99, parts.last_ns + 1, parts.last_reward)))
+
+
+def redefined_channel(parts):
+    return parts.file(chunk(channel(1, 1, '/zzz')))
+
+
+def redefined_in_the_summary(parts):
+    return parts.file(summary=[channel(1, 1, '/zzz')])
+
+
+def redefined_schema(parts):
+    return parts.file(chunk(schema(1, 'std_msgs/msg/Bool', 'bool data')))
+
+
+def chunk_after_the_data(parts):
+    late = chunk(message(parts.channel_ids['/reward'], parts.last_ns + 1, parts.last_reward))
+    return parts.file(summary=[late])
+
+
+def metadata_after_the_data(parts):
+    return parts.file(summary=[parts.result])
+
+
+def two_results(parts):
+    return parts.file(metadata('episode_result', {'success': 'true', 'complete': 'true'}))
+
+
+def two_episodes(parts):
+    return parts.file(metadata('episode', {**parts.episode.metadata, 'seed': '1'}))
+
+
+def a_key_twice(parts):
+    pairs = text('return') + text('0.0')
+    content = text('episode_result') + struct.pack('<I', 2 * len(pairs)) + 2 * pairs
+    return whole(parts.record, chunk(*parts.channels), record(Opcode.METADATA, content))
+
+
+def index_of_a_decoy(parts):
+    index = struct.pack('<QQ', 30, 100) + text('episode_result')
+    return parts.file(summary=[record(Opcode.METADATA_INDEX, index)])
+
+
+def chunk_index_that_leaves_out(parts):
+    first = parts.file()
+    start = len(MCAP0_MAGIC) + len(record(Opcode.HEADER, text('ros2') + text('test')))
+    start += len(parts.record)
+    (length,) = struct.unpack_from('<Q', first, start + 1)
+    head = struct.unpack_from('<QQQ', first, start + 9)
+    sizes = struct.pack('<Q', 0) + text('') + struct.pack('<QQ', head[2], head[2])
+    index = struct.pack('<QQQQI', 0, 0, start, length + 9, 0) + sizes
+    extra = message(parts.channel_ids['/reward'], parts.last_ns + 1, parts.last_reward)
+    return parts.file(extra, summary=[record(Opcode.CHUNK_INDEX, index)])
+
+
+def message_index_that_leaves_out(parts):
+    entry = struct.pack('<QQ', parts.rows[0][0], 0)
+    index = struct.pack('<HI', parts.rows[0][1], len(entry)) + entry
+    return parts.file(record(Opcode.MESSAGE_INDEX, index))
+
+
+def wrong_times_of_a_chunk(parts):
+    return parts.file(times=(5, 6))
+
+
+def wrong_number_of_messages(parts):
+    return parts.file(summary=[statistics(3, parts.rows[0][0], parts.last_ns)])
+
+
+def wrong_end(parts):
+    return parts.file(summary=[statistics(len(parts.rows), parts.rows[0][0], 2 * parts.last_ns)])
+
+
+def two_statistics(parts):
+    right = statistics(len(parts.rows), parts.rows[0][0], parts.last_ns)
+    return parts.file(summary=[right, right])
+
+
+def equal_times(parts):
+    time, id, data = parts.rows[-1]
+    return parts.file(messages=[*parts.messages, message(id, time, data)])
+
+
+def undefined_channel(parts):
+    return parts.file(messages=[*parts.messages, message(77, parts.last_ns + 1, b'')])
+
+
+def changed_definition(parts):
+    schemas = [schema(id, name, 'string evil') for name, id in parts.schema_ids.items()]
+    return parts.file(schemas=schemas)
+
+
+def other_type(parts):
+    id = parts.channel_ids['/reward']
+    changed = channel(id, parts.schema_ids['std_msgs/msg/Bool'], '/reward')
+    return parts.file(channels=[*parts.channels[: id - 1], changed, *parts.channels[id:]])
+
+
+def other_encoding(parts):
+    id = parts.channel_ids['/reward']
+    changed = channel(id, parts.schema_ids['std_msgs/msg/Float64'], '/reward', 'json')
+    return parts.file(channels=[*parts.channels[: id - 1], changed, *parts.channels[id:]])
+
+
+def one_topic_in_a_namespace(parts):
+    id = parts.channel_ids['/reward']
+    changed = channel(id, parts.schema_ids['std_msgs/msg/Float64'], '/left/reward')
+    return parts.file(channels=[*parts.channels[: id - 1], changed, *parts.channels[id:]])
+
+
+def second_header(parts):
+    return parts.file(record(Opcode.HEADER, text('') + text('')))
+
+
+AMBIGUOUS = {
+    second_channel: "2 channels of topic '/reward'",
+    redefined_channel: 'channel 1 is defined twice',
+    redefined_in_the_summary: 'channel 1 is defined twice',
+    redefined_schema: 'schema 1 is defined twice',
+    chunk_after_the_data: 'chunk record after the end of the data',
+    metadata_after_the_data: 'metadata record after the end of the data',
+    two_results: "2 metadata records 'episode_result'",
+    two_episodes: "2 metadata records 'episode': a file of 2 episodes",
+    a_key_twice: "key 'return' twice",
+    index_of_a_decoy: 'index of the metadata disagrees',
+    chunk_index_that_leaves_out: 'messages that the chunk indexes leave out',
+    message_index_that_leaves_out: 'message indexes disagree',
+    wrong_times_of_a_chunk: 'other times than its messages',
+    wrong_number_of_messages: 'statistics disagree',
+    wrong_end: 'statistics disagree',
+    two_statistics: 'two records of statistics',
+    equal_times: 'two messages have the log time',
+    undefined_channel: 'channel 77, which is not defined',
+    changed_definition: 'another definition of',
+    other_type: "no topic '/reward' of type 'std_msgs/msg/Bool'",
+    other_encoding: "'json'",
+    one_topic_in_a_namespace: 'several namespaces',
+    second_header: 'header record before the end of the data',
+}
+
+
+@pytest.mark.parametrize('make', AMBIGUOUS)
+def test_an_ambiguous_file_is_rejected_by_all_readers(parts, tmp_path, make):
+    path = tmp_path / 'file.mcap'
+    path.write_bytes(make(parts))
+    for read in READERS:
+        with pytest.raises(EpisodeReadError) as caught:
+            read(path)
+        assert AMBIGUOUS[make] in str(caught.value)
+        assert len(str(caught.value)) < 500 and '\n' not in str(caught.value)
+    with pytest.raises(ValueError, match='no usable episode'):
+        read_experience(path, TASKS['FetchReach'])
+
+
+# Valid files of other tools
+
+
+def assert_same(path, original):
+    """The file has the messages of the original for all readers, and checks as identical."""
+    expected, found = read_file(original).messages, read_file(path).messages
+    assert [row[2:] for row in found.rows()] == [row[2:] for row in expected.rows()]
+    (one,), (other,) = load_episodes(original), load_episodes(path)
+    assert one.observations['observation'].tobytes() == other.observations['observation'].tobytes()
+    assert read_summary(path).message_count == read_summary(original).message_count == 509
+    assert len(load_recording(path).frames) == 51
+    assert len(ReplaySchedule(path).messages) == 459
+    result = EpisodeChecker().check(path)
+    assert (result.difference, result.ticks) == (None, 51)
+
+
+def loose(parts):
+    return whole(parts.record, *parts.schemas, *parts.channels, *parts.messages, parts.result)
+
+
+def definitions_outside(parts):
+    definitions = (*parts.schemas, *parts.channels)
+    return whole(parts.record, *definitions, chunk(*parts.messages), parts.result)
+
+
+def reordered_in_a_chunk(parts):
+    return parts.file(messages=parts.messages[::-1])
+
+
+def reordered_chunks(parts):
+    definitions = (*parts.schemas, *parts.channels)
+    halves = chunk(*parts.messages[300:]), chunk(*parts.messages[:300])
+    return whole(parts.result, *definitions, *halves, parts.record)
+
+
+def definitions_repeated(parts):
+    return parts.file(chunk(*parts.schemas, *parts.channels), summary=parts.channels)
+
+
+def right_statistics(parts):
+    return parts.file(summary=[statistics(len(parts.rows), parts.rows[0][0], parts.last_ns)])
+
+
+def definitions_with_comments(parts):
+    schemas = [
+        schema(id, name, '# As ROS has it.\n\n' + schema_text(name).replace('\n', '  # text\n', 1))
+        for name, id in parts.schema_ids.items()
+    ]
+    return parts.file(schemas=schemas)
+
+
+@pytest.mark.parametrize(
+    'make',
+    [
+        loose,
+        definitions_outside,
+        reordered_in_a_chunk,
+        reordered_chunks,
+        definitions_repeated,
+        right_statistics,
+        definitions_with_comments,
+    ],
+)
+def test_a_file_of_one_meaning_is_read_sorted_by_time(parts, episodes, tmp_path, make):
+    path = tmp_path / 'file.mcap'
+    path.write_bytes(make(parts))
+    assert_same(path, episodes[0])
+
+
+@pytest.mark.parametrize('compression', ['none', 'lz4', 'zstd'])
+def test_files_without_chunks_and_of_all_compressions_are_read(episodes, tmp_path, compression):
+    recorder = Recorder('FetchReach')
+    settings = LogSettings(compression=compression)
+    original = recorder.record(EpisodeDirectory(tmp_path, settings))
+    assert_same(original, episodes[0])
+    episode = read_episode(original)
+    with (tmp_path / 'loose.mcap').open('wb') as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start(profile='ros2')
+        writer.add_metadata('episode', episode.metadata)
+        for name, topic in episode.topics.items():
+            text = schema_text(topic.type_name).encode()
+            schema_id = writer.register_schema(topic.type_name, 'ros2msg', text)
+            id = writer.register_channel(name, 'cdr', schema_id)
+            for each in topic.messages:
+                writer.add_message(id, each.log_time_ns, each.data, each.publish_time_ns)
+        writer.add_metadata('episode_result', episode.result)
+        writer.finish()
+    assert_same(tmp_path / 'loose.mcap', original)
+
+
+TOOLS = {
+    'sort': ['sort', 'IN', '-o', 'OUT'],
+    'sort by topic': ['sort', 'IN', '-o', 'OUT', '--order', 'topic'],
+    'rechunk': ['rechunk', 'IN', 'OUT'],
+    'rechunk by pattern': ['rechunk', 'IN', 'OUT', '--strategy', 'pattern', '--pattern', 'joint'],
+    'filter': ['filter', 'IN', 'OUT'],
+    'compress': ['compress', 'IN', '-o', 'OUT'],
+    'decompress': ['decompress', 'IN', '-o', 'OUT'],
+}
+
+
+def run_tool(tool, arguments, paths):
+    """Runs a program under the GPL, which is never imported."""
+    if not tool.exists():
+        pytest.skip(f'{tool.name} is not installed')
+    command = [paths.get(each, each) for each in arguments]
+    run = subprocess.run([tool, *command], capture_output=True, text=True, timeout=60)
+    assert run.returncode == 0, run.stdout + run.stderr
+
+
+@pytest.mark.parametrize('tool', TOOLS)
+def test_files_that_pymcap_rewrote_are_read(episodes, tmp_path, tool):
+    source = episodes[0] / f'{episodes[0].name}_0.mcap'
+    run_tool(PYMCAP_CLI, TOOLS[tool], {'IN': source, 'OUT': tmp_path / 'out.mcap'})
+    assert_same(tmp_path / 'out.mcap', episodes[0])
+
+
+@pytest.mark.parametrize('number', [0, 1])
+def test_a_merged_file_is_rejected_as_two_episodes(episodes, tmp_path, number):
+    files = [path / f'{path.name}_0.mcap' for path in (episodes[0], episodes[number])]
+    run_tool(PYMCAP_CLI, ['merge', *files, '-o', 'OUT'], {'OUT': tmp_path / 'out.mcap'})
+    for read in READERS:
+        with pytest.raises(EpisodeReadError, match='a file of 2 episodes'):
+            read(tmp_path / 'out.mcap')
+
+
+def test_a_converted_bag_without_the_episode_record_is_rejected(episodes, tmp_path):
+    arguments = ['--src', episodes[0], '--dst', tmp_path / 'out', '--dst-storage', 'mcap']
+    run_tool(ROSBAGS_CONVERT, arguments, {})
+    for read in READERS:
+        with pytest.raises(EpisodeReadError, match="no metadata record 'episode'"):
+            read(tmp_path / 'out')
+
+
+# What the check compares
+
+
+def later_publish_time(parts):
+    time, id, data = parts.rows[100]
+    changed = message(id, time, data, publish_time=time + 1)
+    return parts.file(messages=[*parts.messages[:100], changed, *parts.messages[101:]])
+
+
+def other_sequence(parts):
+    time, id, data = parts.rows[100]
+    changed = message(id, time, data, sequence=7)
+    return parts.file(messages=[*parts.messages[:100], changed, *parts.messages[101:]])
+
+
+def other_record(parts):
+    changed = {**parts.episode.metadata, 'joint_order': json.dumps(['evil'])}
+    return parts.file().replace(parts.record, metadata('episode', changed))
+
+
+@pytest.mark.parametrize(
+    ('make', 'where'),
+    [
+        (later_publish_time, 'publish time of'),
+        (other_sequence, 'sequence number of'),
+        (other_record, 'metadata joint_order'),
+    ],
+)
+def test_the_check_compares_everything_that_a_reader_returns(parts, tmp_path, make, where):
+    path = tmp_path / 'file.mcap'
+    path.write_bytes(make(parts))
+    difference = EpisodeChecker().check(path).difference
+    assert difference is not None and where in difference.field
+
+
+# Costs
+
+
+def test_long_and_repeated_names_make_short_lines(parts, tmp_path):
+    path = tmp_path / 'file.mcap'
+    long_name = channel(99, 1, '/' + 'x' * 900_000)
+    path.write_bytes(parts.file(chunk(long_name)))
+    for read in READERS:
+        with pytest.raises(EpisodeReadError) as caught:
+            read(path)
+        assert len(str(caught.value)) < 500
+    clock = parts.rows[0]
+    times = range(parts.last_ns + 1, parts.last_ns + 40_001)
+    path.write_bytes(parts.file(chunk(*(message(clock[1], time, clock[2]) for time in times))))
+    try:
+        line = str(EpisodeChecker().check(path))
+    except EpisodeReadError as error:
+        line = str(error)
+    assert len(line) < 500
+
+
+def test_many_small_records_cost_little(parts, tmp_path):
+    path = tmp_path / 'file.mcap'
+    empty = record(Opcode.METADATA, text('x') + struct.pack('<I', 2**20 - 104) + bytes(2**20 - 104))
+    pairs = b''.join(text(str(number)) + text('') for number in range(60_000))
+    many = record(Opcode.METADATA, text('y') + struct.pack('<I', len(pairs)) + pairs)
+    headers = record(Opcode.HEADER, bytes(8)) * 250_000
+    for extra in ((empty,) * 12, (many,) * 12, (headers,)):
+        path.write_bytes(parts.file(*extra))
+        began = time.process_time()
+        with pytest.raises(EpisodeReadError):
+            read_summary(path)
+        assert time.process_time() - began < 2.0
