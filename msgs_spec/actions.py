@@ -1,4 +1,4 @@
-"""Normalised actions of the benchmark and commands in ROS units, and what makes a command valid."""
+"""Conversion between normalised actions and commands in ROS units, and command limits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from msgs_spec.robots import RobotSpec
 
 
 def command_limits(robot: RobotSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper limits of the command, (action_size,) each, in command units."""
+    """Return lower and upper limits of the command, (action_size,) each, in command units."""
     return (
         np.array([part.lower for part in robot.command]),
         np.array([part.upper for part in robot.command]),
@@ -19,18 +19,10 @@ def command_limits(robot: RobotSpec) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
-    """Maps actions in [-1, 1] to commands, clipping what lies outside.
+    """Map actions (..., action_size), clipped to [-1, 1], to commands of the same shape.
 
-    Fetch: the action itself; its floating type is kept, because Gymnasium-Robotics scales it in
-    that type. Hand, and every robot with other limits: through the middle and half width of each
-    range, for the hand absolute joint positions (`hand_env.py`).
-
-    Args:
-        robot: The robot.
-        action: (..., action_size), normalised.
-
-    Returns:
-        (..., action_size) in command units.
+    Fetch: the command is the action. Its floating type is kept, because Gymnasium-Robotics scales
+    it in that type. Other robots: -1 and 1 are the limits of the command, as in `hand_env.py`.
     """
     clipped = np.asarray(np.clip(np.asarray(action), -1.0, 1.0))
     if _is_normalised(robot):
@@ -41,7 +33,7 @@ def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
 
 
 def action_from_command(robot: RobotSpec, command: ArrayLike) -> NDArray[np.float64]:
-    """Maps commands (..., action_size) to the actions in [-1, 1] that give them, clipped."""
+    """Map commands (..., action_size) to actions, clipped to [-1, 1]."""
     values = np.asarray(command, dtype=np.float64)
     if not _is_normalised(robot):
         lower, upper = command_limits(robot)
@@ -50,16 +42,16 @@ def action_from_command(robot: RobotSpec, command: ArrayLike) -> NDArray[np.floa
 
 
 def _is_normalised(robot: RobotSpec) -> bool:
-    """Whether commands are actions."""
+    """Return whether commands equal actions."""
     return all(part.lower == -1.0 and part.upper == 1.0 for part in robot.command)
 
 
 def resting_command(robot: RobotSpec) -> NDArray[np.float64]:
-    """The command of the zero action: the gripper stays, each hand joint goes mid-range."""
+    """Return the command of the zero action: the gripper stays, hand joints go mid-range."""
     return np.asarray(command_from_action(robot, np.zeros(robot.action_size)), dtype=np.float64)
 
 
 def clip_command(robot: RobotSpec, command: ArrayLike) -> NDArray[np.float64]:
-    """Commands (..., action_size) within the limits of the robot."""
+    """Clip commands (..., action_size) to the limits of the robot."""
     lower, upper = command_limits(robot)
     return np.clip(np.asarray(command, dtype=np.float64), lower, upper)

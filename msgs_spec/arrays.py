@@ -1,15 +1,14 @@
-"""The arrays that nearly everything here computes with and draws."""
+"""Array types."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-# Positions, commands, rewards: float64 throughout, as MuJoCo computes.
+# Positions, commands, rewards: float64, as in MuJoCo.
 Array = NDArray[np.float64]
-# What replays and networks hold.
+# Replay buffers and networks.
 Array32 = NDArray[np.float32]
-# Whether, for each of many.
 Flags = NDArray[np.bool_]
-# Rows, columns, RGB.
+# (height, width, 3), RGB.
 Picture = NDArray[np.uint8]

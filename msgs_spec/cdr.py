@@ -1,10 +1,9 @@
 """CDR bytes of topics at the rate of the simulation.
 
-The bytes of a message with a fixed layout differ in the stamp and in the numbers only. So a message
-is serialised once, the places of its numbers are found, and from then on they are overwritten in a
-copy, or picked out of what arrives: 2 to 25 times as fast as filling a message and serialising it,
-and without the uninitialised bytes that `rclpy.serialization.serialize_message` leaves at the end.
-What comes out can be logged and given to `Publisher.publish` as it is.
+Messages with a fixed layout differ in the stamp and the numbers only. A template is serialised
+once and the places of its numbers are found. Encoding overwrites the numbers in a copy; decoding
+reads them from the received bytes. This is 2 to 25 times as fast as serialising a message. No bytes
+at the end stay uninitialised, as with `rclpy.serialization.serialize_message`.
 """
 
 from __future__ import annotations
@@ -19,29 +18,27 @@ from msgs_spec.arrays import Array
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.topics import TopicSpec
 
-# Alignment counts from the end of the encapsulation header. A stamp, if there is one, comes first.
+# Alignment counts from the end of the encapsulation header. The stamp, if any, comes first.
 _BODY = 4
 _STAMP = struct.Struct('<iI')
 _FLOAT = struct.Struct('<d')
 
 
 class LayoutError(ValueError):
-    """Messages of a topic are not laid out as this project writes them."""
+    """Messages of a topic have another layout than those of this project."""
 
 
 class TopicCodec:
     """Encodes and decodes the vectors of one topic.
 
-    Stamps are nanoseconds; of a type without a stamp they are 0.
+    Stamps are nanoseconds; types without a stamp have 0.
 
     Args:
-        topic: Any topic but those of type DiagnosticArray.
-        requires_frame: Whether `decode` refuses what is said in another frame than the topic's; an
-            empty `frame_id` is none.
+        topic: Any topic except those of type DiagnosticArray.
+        requires_frame: Whether `decode` rejects a `frame_id` that is neither empty nor the topic's.
 
     Attributes:
-        topic: The topic.
-        size: Bytes of a message as this class encodes it.
+        size: Bytes of an encoded message.
     """
 
     def __init__(self, topic: TopicSpec, *, requires_frame: bool = False) -> None:
@@ -60,7 +57,7 @@ class TopicCodec:
         self._fixed = [(run, self._template[run]) for run in self._fixed_runs()]
 
     def encode(self, stamp: int, values: ArrayLike) -> bytes:
-        """Returns the bytes of `codecs.build_message` with the same arguments."""
+        """Return the bytes of `codecs.build_message` for the same arguments."""
         vector = codecs.checked_size(self.topic, values)
         data = bytearray(self._template)
         if self._has_stamp:
@@ -72,12 +69,12 @@ class TopicCodec:
         return bytes(data)
 
     def decode(self, data: bytes) -> tuple[int, Array]:
-        """Returns the stamp and the vector (topic.size,) of a message, whoever wrote it.
+        """Return the stamp and the vector (topic.size,) of a message of any writer.
 
-        A message of this project's layout takes a tenth of the time of any other.
+        Messages with this project's layout take a tenth of the time.
 
         Raises:
-            ValueError: If the bytes are no such message, do not fit the topic, or are of another
+            ValueError: If the bytes are not such a message, do not fit the topic, or have another
                 frame where that counts.
         """
         if len(data) != self.size or any(data[run] != fixed for run, fixed in self._fixed):
@@ -93,17 +90,13 @@ class TopicCodec:
         return codecs.stamp_of(seconds, nanoseconds), floats[self._slots]
 
     def decode_many(self, messages: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array]:
-        """Decodes messages of this project's layout at array speed.
+        """Decode messages (n, size) with this project's layout at array speed.
 
-        Args:
-            messages: (n, size).
-
-        Returns:
-            Stamps (n,) and vectors (n, topic.size), equal to those of `codecs.decode`.
+        Returns stamps (n,) and vectors (n, topic.size), equal to those of `codecs.decode`.
 
         Raises:
-            LayoutError: If a message differs from the template in anything but stamp and numbers:
-                other names, frame or sizes. `decode` may still read it.
+            LayoutError: If a message has other names, another frame or size. `decode` may still
+                read it.
         """
         if messages.ndim != 2 or messages.shape[1] != self.size:
             raise LayoutError(f'{self.topic.name}: {messages.shape[-1]} bytes, not {self.size}')
@@ -119,7 +112,7 @@ class TopicCodec:
         return stamps, self._vectors(messages)
 
     def _vectors(self, messages: NDArray[np.uint8]) -> Array:
-        """The numbers (n, topic.size) of messages (n, size)."""
+        """Return the numbers (n, topic.size) of messages (n, size)."""
         if not self._slots.size:
             return np.zeros((len(messages), 0))
         first = int(self._slots.min())
@@ -129,7 +122,7 @@ class TopicCodec:
         return np.take(numbers, self._slots - first, axis=1).astype(np.float64, copy=False)
 
     def _fixed_runs(self) -> list[slice]:
-        """Runs of bytes that are the same in all messages."""
+        """Run of bytes that are the same in all messages."""
         varying = [(_BODY + _FLOAT.size * int(slot), _FLOAT.size) for slot in self._slots]
         if self._has_stamp:
             varying.append((_BODY, _STAMP.size))
@@ -143,7 +136,7 @@ class TopicCodec:
         return runs
 
     def _slot(self, marker: float) -> int:
-        """Index of a marker among the float64 places of the body."""
+        """Return the index of a marker among the float64 places of the body."""
         pattern = _FLOAT.pack(marker)
         offset = self._template.find(pattern) - _BODY
         if self._template.count(pattern) != 1 or offset % _FLOAT.size:

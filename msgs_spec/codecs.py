@@ -1,9 +1,9 @@
-"""Float64 vectors <-> message objects, topic by topic.
+"""Conversion between float64 vectors and message objects.
 
-Every topic but the key/value ones (DiagnosticArray) carries one float64 vector, empty for `/clock`,
-whose order is the topic's `layout`, quaternions wxyz. `build_message` makes the message, `decode`
-reads it back, also from the messages of rclpy, whose fields have the same names. Stamps are
-nanoseconds of simulated time.
+Every topic except those of type DiagnosticArray carries one float64 vector. Its order is the
+topic's `layout`; quaternions are wxyz; `/clock` has an empty vector. `build_message` creates the
+message. `decode` reads it, also from messages of rclpy, whose fields have the same names. Stamps
+are nanoseconds of simulated time.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ _NANOSECONDS = 10**9
 
 
 def message_stamp(message: Any) -> int:
-    """Returns the stamp of a message with a header, or of a Clock, in nanoseconds.
+    """Return the stamp of a message with a header, or of a Clock, in nanoseconds.
 
     Raises:
-        ValueError: If it has a second or more of nanoseconds.
+        ValueError: If its nanoseconds are a second or more.
     """
     stamp = message.header.stamp if hasattr(message, 'header') else message.clock
     return stamp_of(int(stamp.sec), int(stamp.nanosec))
 
 
 def stamp_of(seconds: int, nanoseconds: int) -> int:
-    """Returns a stamp in nanoseconds; with a second or more of these it could not be sent again.
+    """Return a stamp in nanoseconds.
 
     Raises:
-        ValueError: If there are as many.
+        ValueError: If the nanoseconds are a second or more, which rclpy cannot send.
     """
     if nanoseconds >= _NANOSECONDS:
         raise ValueError(f'stamp with nanosec {nanoseconds}; allowed: less than {_NANOSECONDS}')
@@ -44,15 +44,15 @@ def stamp_of(seconds: int, nanoseconds: int) -> int:
 
 
 def build_message(topic: TopicSpec, stamp: int, values: ArrayLike) -> Any:
-    """Returns the message that carries a vector, as an instance of `schemas.message_class`.
+    """Return the message that carries a vector, as an instance of `schemas.message_class`.
 
     Args:
-        topic: Any topic but those of type DiagnosticArray.
-        stamp: Nanoseconds; ignored where the type has no stamp.
+        topic: Any topic except those of type DiagnosticArray.
+        stamp: Nanoseconds; ignored by types without a stamp.
         values: (topic.size,) in the order of the layout.
 
     Raises:
-        ValueError: If there are too many or too few values.
+        ValueError: If the number of values is wrong.
     """
     vector = checked_size(topic, values)
     fields = _CODECS[topic.type_name][0](topic, vector)
@@ -60,9 +60,9 @@ def build_message(topic: TopicSpec, stamp: int, values: ArrayLike) -> Any:
 
 
 def decode(topic: TopicSpec, message: Any) -> Array:
-    """Returns the vector (topic.size,) that a message of rclpy or of `schemas` carries.
+    """Return the vector (topic.size,) of a message of rclpy or of `schemas`.
 
-    Joints are found by name in any order; joints that a JointState lacks are NaN.
+    Joints are found by name in any order; missing joints are NaN.
 
     Raises:
         ValueError: If the message has another number of values than the topic.
@@ -80,7 +80,7 @@ def build_status(
     message: str = '',
     hardware_id: str = '',
 ) -> Any:
-    """Returns a DiagnosticArray of one status that holds key/value pairs."""
+    """Return a DiagnosticArray of one status with key/value pairs."""
     pair = message_class('diagnostic_msgs/msg/KeyValue')
     status = message_class('diagnostic_msgs/msg/DiagnosticStatus')(
         level=level,
@@ -93,22 +93,18 @@ def build_status(
 
 
 def decode_status(message: Any) -> dict[str, str]:
-    """Returns the key/value pairs of a DiagnosticArray; of equal keys the last counts."""
+    """Return the key/value pairs of a DiagnosticArray; the last of equal keys counts."""
     return {pair.key: pair.value for status in message.status for pair in status.values}
 
 
 def check_frame(topic: TopicSpec, frame: str) -> None:
-    """Refuses a `frame_id` that is neither the topic's nor empty.
-
-    Raises:
-        ValueError: One line says which is allowed.
-    """
+    """Raise ValueError for a `frame_id` that is neither empty nor the topic's."""
     if frame not in ('', topic.frame):
         raise ValueError(f'frame_id {frame[:40]!r} given; allowed: {topic.frame!r} or empty')
 
 
 def checked_size(topic: TopicSpec, values: ArrayLike) -> Array:
-    """Returns `values` as float64, or raises ValueError if they do not fit the topic."""
+    """Return `values` as float64; raise ValueError if their number does not fit the topic."""
     vector = np.asarray(values, dtype=np.float64)
     if vector.shape != (topic.size,):
         given = f'shape {vector.shape}' if vector.ndim != 1 else f'{vector.size} values'
@@ -207,7 +203,7 @@ def _read_free_joint(topic: TopicSpec, message: Any) -> Array:
 
 def _build_pose_array(topic: TopicSpec, values: Array) -> dict[str, Any]:
     rows = values.reshape(len(topic.layout), -1)
-    # Goals are positions alone.
+    # Goals have no orientation.
     return {'poses': [_pose(row[:3], row[3:] if row.size == 7 else IDENTITY) for row in rows]}
 
 

@@ -1,7 +1,7 @@
-"""What nodes say about themselves on `/diagnostics`, and the statistics behind it.
+"""Reports of the nodes on `/diagnostics`, and their statistics.
 
-Wall-clock content: it is never logged with an episode, whose bytes depend on seed and commands
-only.
+They depend on wall time and are never logged with an episode, whose bytes depend on seed and
+commands only.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from msgs_spec.schemas import serialize
 from msgs_spec.topics import DIAGNOSTICS
 
 REPORT_PERIOD = 1.0
-# Keys of what a robot reports that pages, policies and benchmarks read.
+# Keys of the simulator node that pages, policies and benchmarks read.
 MODE = 'mode'
 PAUSED = 'paused'
 RATE = 'rate (Hz)'
@@ -27,14 +27,14 @@ ASKED_RATE = 'rate asked (Hz)'
 MISSED_TICKS = 'missed ticks'
 PERTURB_LIMIT = 'perturb limit (N)'
 COMMANDERS = 'commanders'
-# What a stamp can say, whose seconds are an int32: a machine may believe that it is 2038.
+# The latest stamp, whose seconds are an int32. Clocks of machines may be later.
 _LATEST = (2**31 - 1) * 10**9
 
 
 def next_report(due: float, now: float) -> float:
-    """When the report after one that was due, and is made now, is due: seconds of a steady clock.
+    """Return when the next report is due, s of a steady clock; `due` is that of this one.
 
-    Periods keep their beat unless one was missed: then the next one is whole, too.
+    The period stays regular. After a missed report, the next period is whole.
     """
     return due + REPORT_PERIOD if due + REPORT_PERIOD > now else now + REPORT_PERIOD
 
@@ -49,14 +49,12 @@ class Level(IntEnum):
 
 @dataclass(slots=True)
 class Report:
-    """One status: facts as key/value pairs, and what is wrong among them.
+    """One status: facts as key/value pairs, and problems.
 
     Attributes:
-        name: Who reports, fully qualified.
-        hardware_id: What is reported on.
-        values: The facts.
-        summary: The message where nothing is wrong.
-        problems: What is wrong, each with its level.
+        name: Fully qualified name of the node.
+        hardware_id: Task of the robot.
+        summary: The message of a report without problems.
     """
 
     name: str
@@ -66,30 +64,30 @@ class Report:
     problems: list[tuple[Level, str]] = field(default_factory=list)
 
     def warn(self, problem: str) -> None:
-        """Adds what hinders but does not stop."""
+        """Add a problem that hinders but does not stop."""
         self.problems.append((Level.WARN, problem))
 
     def fail(self, problem: str) -> None:
-        """Adds what makes the results wrong or lost."""
+        """Add a problem that makes results wrong or loses them."""
         self.problems.append((Level.ERROR, problem))
 
     @property
     def level(self) -> Level:
-        """The worst of the problems."""
+        """Level of the worst problem."""
         return max((level for level, _ in self.problems), default=Level.OK)
 
     @property
     def message(self) -> str:
-        """All problems, the worst first, or the summary."""
+        """All problems, the worst first; without problems the summary."""
         ranked = sorted(self.problems, key=lambda problem: -problem[0])
         return '; '.join(text for _, text in ranked) or self.summary
 
 
 def encode_reports(*reports: Report) -> bytes:
-    """Returns the CDR bytes of a DiagnosticArray with these statuses, one or more.
+    """Return the CDR bytes of a DiagnosticArray with one or more statuses.
 
-    It is stamped with wall time, as REP 107 has it, whatever clock the node follows: what it says
-    is of that time, and the reports of several nodes can be put in order.
+    The stamp is wall time, as in REP 107, also under simulated time, so that the reports of several
+    nodes can be put in order.
     """
     stamp_ns = min(time.time_ns(), _LATEST)
     message, *others = (
@@ -109,13 +107,13 @@ def encode_reports(*reports: Report) -> bytes:
 
 
 class Durations:
-    """The latest thousand durations of something that happens again and again."""
+    """The last thousand durations of a repeated event."""
 
     def __init__(self) -> None:
         self._values: deque[float] = deque(maxlen=1000)
 
     def add(self, seconds: float) -> None:
-        """Notes one."""
+        """Add a duration."""
         self._values.append(seconds)
 
     def median(self) -> float:
@@ -123,7 +121,7 @@ class Durations:
         return float(np.median(self._values)) if self._values else 0.0
 
     def milliseconds(self) -> dict[str, str]:
-        """Returns median, 99th percentile and maximum as text; `-` while there are none."""
+        """Return median, 99th percentile and maximum as text; `-` before the first duration."""
         names = ('p50', 'p99', 'max')
         if not self._values:
             return dict.fromkeys(names, '-')
@@ -132,12 +130,12 @@ class Durations:
 
 
 class Increase:
-    """How much a counter has grown between two looks; it starts at zero."""
+    """Growth of a counter between two calls; the counter starts at zero."""
 
     def __init__(self) -> None:
         self._before = 0.0
 
     def since(self, value: float) -> float:
-        """Returns the growth since the last call."""
+        """Return the growth since the last call."""
         grown, self._before = value - self._before, value
         return grown

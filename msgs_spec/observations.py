@@ -1,8 +1,8 @@
-"""The observation vectors of the benchmark: the one place of their formulas.
+"""Formulas of the observation vectors.
 
-The simulation and the policy call the same functions, so an actor sees on ROS what it was trained
-on, bit for bit. The functions take any leading batch shape, work element by element and return
-fresh float64 arrays.
+Simulation and policies call the same functions, so observations on ROS equal those of the training,
+bit for bit. The functions accept any leading batch shape, work element by element and return new
+float64 arrays.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from msgs_spec.tasks import PHYSICS_TIMESTEP, GoalKind, TaskSpec, substeps_per_t
 from msgs_spec.text import first_of
 from msgs_spec.topics import topic
 
-# Joints without a value that are named in an error.
+# Maximum number of joints that an error names.
 _NAMED = 4
 
-# What sensors say: vectors (..., topic.size) by name of the topic.
+# Sensor readings: vectors (..., topic.size) by name of the topic.
 Readings = Mapping[str, Array]
 
 
 def observed_topics(task: TaskSpec) -> tuple[str, ...]:
-    """Names of the topics from which the observation of a task is made."""
+    """Return the names of the topics that the observation of a task depends on."""
     if task.formulas is not None:
         return task.formulas.topics
     if task.goal is GoalKind.FINGERTIPS:
@@ -38,21 +38,18 @@ def observed_topics(task: TaskSpec) -> tuple[str, ...]:
 
 
 def observation(task: TaskSpec, readings: Readings, tick_duration: float) -> Array:
-    """Observation vectors from what the sensors say; `task.observation` names their parts.
+    """Return observation vectors (..., task.observation_size); `task.observation` names the parts.
 
     Args:
         task: The task.
         readings: At least its `observed_topics`; quaternions of unit length.
         tick_duration: Seconds of one control period.
-
-    Returns:
-        (..., task.observation_size).
     """
     if task.formulas is not None:
         return task.formulas.observation(readings, tick_duration)
     if task.robot.has_gripper_command:
         return np.concatenate(_fetch_parts(task, readings, tick_duration), axis=-1)
-    # Positions and velocities; efforts follow them.
+    # Positions and velocities, without the efforts.
     joints = readings['joint_states'][..., : 2 * len(task.robot.joints)]
     if task.goal is GoalKind.FINGERTIPS:
         # `shadow_dexterous_hand/reach.py` of Gymnasium-Robotics.
@@ -63,9 +60,9 @@ def observation(task: TaskSpec, readings: Readings, tick_duration: float) -> Arr
 
 
 def _fetch_parts(task: TaskSpec, readings: Readings, tick_duration: float) -> list[Array]:
-    """What `generate_mujoco_observations` of `fetch_env.py` puts together.
+    """Return the parts of `generate_mujoco_observations` in `fetch_env.py`.
 
-    Velocities are per tick there, hence `tick_duration`.
+    Its velocities are per tick, hence `tick_duration`.
     """
     count, joints = len(task.robot.joints), readings['joint_states']
     fingers = joints[..., count - 2 : count]
@@ -90,14 +87,14 @@ def _fetch_parts(task: TaskSpec, readings: Readings, tick_duration: float) -> li
 
 
 def _fingertip_positions(readings: Readings) -> Array:
-    """Fingertip positions (..., 15), m, a fresh array."""
+    """Return fingertip positions (..., 15), m, in a new array."""
     poses = readings['fingertip_poses']
     positions = poses.reshape(*poses.shape[:-1], len(FINGERTIPS), 7)[..., :3]
     return positions.reshape(*poses.shape[:-1], 3 * len(FINGERTIPS))
 
 
 def achieved_goal(task: TaskSpec, readings: Readings) -> Array:
-    """Achieved goals (..., task.goal.size) from what the sensors say, a fresh array."""
+    """Return achieved goals (..., task.goal.size) in a new array."""
     if task.formulas is not None:
         return task.formulas.achieved_goal(readings)
     if task.goal is GoalKind.FINGERTIPS:
@@ -109,14 +106,14 @@ def achieved_goal(task: TaskSpec, readings: Readings) -> Array:
 
 
 class ObservationAssembler:
-    """Rebuilds the dict observation of a task from its topics of one stamp.
+    """Computes the dict observation of a task from its topics of one stamp.
 
     Args:
         task: The task.
-        control_hz: Ticks per simulated second, as `episode_status` says.
+        control_hz: Ticks per simulated second, from `episode_status`.
 
     Attributes:
-        topics: The topics that are needed.
+        topics: The needed topics.
 
     Raises:
         ValueError: If the rate is not allowed.
@@ -129,15 +126,15 @@ class ObservationAssembler:
         self.topics = tuple(topic(task, name) for name in names)
 
     def assemble(self, vectors: Readings) -> dict[str, Array]:
-        """Returns `observation`, `achieved_goal` and `desired_goal`, float64.
+        """Return `observation`, `achieved_goal` and `desired_goal`, float64.
 
         Args:
-            vectors: What `codecs.decode` made of each topic, by name, (..., topic.size) with any
-                leading axes, such as ticks; others are ignored.
+            vectors: Vectors (..., topic.size) by topic, with any leading axes, such as ticks; other
+                topics are ignored.
 
         Raises:
-            ValueError: If a topic is missing, or a value that is needed is not finite. Others need
-                not be there, such as the efforts of a robot that measures none.
+            ValueError: If a topic is missing or a needed value is not finite. Efforts are not
+                needed.
         """
         for name in (spec.name for spec in self.topics):
             if name not in vectors:
@@ -153,13 +150,11 @@ class ObservationAssembler:
         for spec in self.topics:
             strange = ~np.isfinite(vectors[spec.name].reshape(-1, spec.size)).all(axis=0)
             if spec.name == 'joint_states':
-                # Parts one after the other, each with a value for every joint.
                 labels = [f'{part.name} of {name}' for part in spec.layout for name in spec.names]
                 found = [labels[place] for place in np.flatnonzero(strange).tolist()]
-                # No observation is made of efforts.
                 found = [label for label in found if not label.startswith('effort')]
                 if found:
                     return f'{spec.name}: no finite {first_of(found, _NAMED)}'
             elif strange.any():
                 return f'{spec.name}: not every value is finite'
-        return 'too large a value for an observation'
+        return 'a value is too large for an observation'

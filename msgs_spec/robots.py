@@ -1,11 +1,11 @@
-"""Robots, and the two of this project: joints in order, normalised action, command in ROS units."""
+"""Robot specifications: joints in order, and commands in ROS units."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-# Metres a gripper action of 1 puts the mocap target ahead of the gripper at 25 Hz (Plappert et al.
-# 2018, section 1.1; Gymnasium-Robotics `fetch_env.py`).
+# Metres at 25 Hz by which a gripper action of 1 moves the mocap target ahead of the gripper:
+# Plappert et al. 2018, section 1.1, and `fetch_env.py` of Gymnasium-Robotics.
 GRIPPER_STEP = 0.05
 # Prefix of the joint names in the MJCF, and on the network by default.
 JOINT_PREFIX = 'robot0:'
@@ -20,10 +20,10 @@ class CommandPart:
     """One number of the command vector.
 
     Attributes:
-        name: What it moves: an axis, or the joint the actuator drives.
-        lower: Smallest value that is applied; smaller ones are clipped.
-        upper: Largest value that is applied; larger ones are clipped.
-        unit: SI unit, or 'x 0.05 m' for the dimensionless Fetch axes.
+        name: The axis or joint to move.
+        lower: Smallest value after clipping.
+        upper: Largest value after clipping.
+        unit: SI unit, or 'x 0.05 m' for the dimensionless axes of Fetch.
     """
 
     name: str
@@ -34,16 +34,15 @@ class CommandPart:
 
 @dataclass(frozen=True, slots=True)
 class RobotSpec:
-    """A robot as the network sees it.
+    """A robot on the network.
 
     Attributes:
-        name: `fetch`, `shadow_hand`, or that of a robot of somebody else's.
-        joints: Scalar joints in the order of `joint_states`, by their names there.
+        name: `fetch`, `shadow_hand`, or the name of a third-party robot.
+        joints: Scalar joints in the order and by the names of `joint_states`.
         joint_units: 'm' or 'rad' for each joint.
-        command: The parts of the command vector, in order. The normalised action has the same
-            length and order.
-        has_gripper_command: True where commands are dimensionless and move a gripper, as the four
-            of Fetch do; False where they are absolute joint positions.
+        command: Parts of the command vector. The normalised action has the same length and order.
+        has_gripper_command: Whether commands are dimensionless and move a gripper, as those of
+            Fetch do. Otherwise they are absolute joint positions.
     """
 
     name: str
@@ -54,11 +53,11 @@ class RobotSpec:
 
     @property
     def action_size(self) -> int:
-        """Length of the action and of the command vector: 4 of Fetch, 20 of the hand."""
+        """Length of action and command: 4 for Fetch, 20 for the hand."""
         return len(self.command)
 
     def with_joint_prefix(self, prefix: str) -> RobotSpec:
-        """Returns the robot with joints whose names begin with another prefix, such as `rh_`."""
+        """Return the robot with another prefix of its joint names, such as `rh_`."""
 
         def renamed(name: str) -> str:
             is_joint = name.startswith(JOINT_PREFIX)
@@ -107,8 +106,8 @@ FETCH = RobotSpec(
     has_gripper_command=True,
 )
 
-# Control ranges of the actuators in `hand/shared.xml`, radians; a test holds them equal to the
-# compiled model.
+# Control ranges of the actuators in `hand/shared.xml`, rad; a test compares them with the compiled
+# model.
 _HAND_COMMAND_RANGES = (
     ('robot0:WRJ1', -0.489, 0.14),
     ('robot0:WRJ0', -0.698, 0.489),

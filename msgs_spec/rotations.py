@@ -1,9 +1,8 @@
-"""Quaternions, matrices and Euler angles of any batch shape; the one place of wxyz and xyzw.
+"""Quaternions, matrices and Euler angles of any batch shape.
 
-MuJoCo writes quaternions wxyz, ROS messages xyzw. Everything in this project is wxyz except inside
-a message. All functions work on fresh contiguous arrays and element by element, so a batch gives
-the same bits as one call per row. Euler angles are Gymnasium-Robotics' relative xyz convention
-(`gymnasium_robotics.utils.rotations`).
+Quaternions are wxyz as in MuJoCo, except inside ROS messages, which have xyzw. All functions work
+on new contiguous arrays and element by element, so that a batch has the same bits as one call per
+row. Euler angles follow the relative xyz convention of `gymnasium_robotics.utils.rotations`.
 """
 
 from __future__ import annotations
@@ -15,30 +14,29 @@ from numpy.typing import ArrayLike
 
 from msgs_spec.arrays import Array
 
-# The quaternion of no rotation.
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 IDENTITY.flags.writeable = False
 _SINGULAR = 4.0 * np.finfo(np.float64).eps
 
 
 def wxyz_to_xyzw(quaternion: ArrayLike) -> Array:
-    """Returns MuJoCo quaternions (..., 4) in the order of ROS messages."""
+    """Return MuJoCo quaternions (..., 4) in the order of ROS messages."""
     return np.ascontiguousarray(np.roll(np.asarray(quaternion, dtype=np.float64), -1, axis=-1))
 
 
 def xyzw_to_wxyz(quaternion: ArrayLike) -> Array:
-    """Returns quaternions (..., 4) from ROS messages in MuJoCo's order."""
+    """Return quaternions (..., 4) from ROS messages in MuJoCo's order."""
     return np.ascontiguousarray(np.roll(np.asarray(quaternion, dtype=np.float64), 1, axis=-1))
 
 
 def _parts(array: ArrayLike) -> list[Any]:
-    """The components along the last axis, each a contiguous array."""
+    """Return the components along the last axis, each a contiguous array."""
     values = np.asarray(array, dtype=np.float64)
     return [np.array(values[..., index], order='C') for index in range(values.shape[-1])]
 
 
 def quaternion_multiply(first: ArrayLike, second: ArrayLike) -> Array:
-    """Hamilton product of wxyz quaternions, (..., 4) each."""
+    """Return the Hamilton product of wxyz quaternions, (..., 4) each."""
     w0, x0, y0, z0 = _parts(first)
     w1, x1, y1, z1 = _parts(second)
     return np.stack(
@@ -53,13 +51,13 @@ def quaternion_multiply(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 def quaternion_conjugate(quaternion: ArrayLike) -> Array:
-    """Inverse of unit quaternions wxyz, (..., 4)."""
+    """Return the inverse of unit quaternions wxyz, (..., 4)."""
     values = np.asarray(quaternion, dtype=np.float64)
     return np.asarray(values * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
-    """Unit quaternions wxyz from axes (..., 3) of any length and angles (...) in radians."""
+    """Return unit quaternions wxyz of axes (..., 3) of any length and angles (...), rad."""
     direction = np.array(axis, dtype=np.float64)
     direction = direction / _length(direction)
     half = np.asarray(angle, dtype=np.float64)[..., None] / 2.0
@@ -68,10 +66,10 @@ def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
 
 
 def _length(vectors: Array) -> Array:
-    """Lengths (..., 1) of vectors (..., n), each taken alone as `np.linalg.norm` does.
+    """Return lengths (..., 1) of vectors (..., n), one `np.linalg.norm` per vector.
 
-    That is BLAS, which on many processors rounds once less than a sum along an axis: one start in
-    eight would otherwise differ from Gymnasium-Robotics in its last bit, and soon in all.
+    It calls BLAS, which on many processors rounds once less than a sum along an axis. With a sum,
+    one start state in eight would differ from Gymnasium-Robotics in its last bit.
     """
     rows = vectors.reshape(-1, vectors.shape[-1])
     lengths = np.array([np.linalg.norm(row) for row in rows])
@@ -79,9 +77,9 @@ def _length(vectors: Array) -> Array:
 
 
 def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of unit quaternions wxyz.
+    """Return rotation matrices (..., 3, 3) of unit quaternions wxyz.
 
-    The order of the sums is that of MuJoCo 4 (`mju_quat2Mat`), whose bits it gives.
+    Equal to MuJoCo 4 (`mju_quat2Mat`) bit for bit, because the order of the sums is the same.
     """
     w, x, y, z = _parts(quaternion)
     ww, wx, wy, wz = w * w, w * x, w * y, w * z
@@ -108,7 +106,7 @@ def matrix_to_euler(matrix: ArrayLike) -> Array:
 
 
 def euler_to_matrix(euler: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of Euler angles xyz (..., 3) in radians."""
+    """Return rotation matrices (..., 3, 3) of Euler angles xyz (..., 3), rad."""
     x, y, z = _parts(euler)
     si, sj, sk = np.sin(-z), np.sin(-y), np.sin(-x)
     ci, cj, ck = np.cos(-z), np.cos(-y), np.cos(-x)
@@ -122,7 +120,7 @@ def euler_to_matrix(euler: ArrayLike) -> Array:
 
 
 def euler_to_quaternion(euler: ArrayLike) -> Array:
-    """Quaternions wxyz (..., 4) of Euler angles xyz (..., 3) in radians."""
+    """Return quaternions wxyz (..., 4) of Euler angles xyz (..., 3), rad."""
     x, y, z = _parts(euler)
     ai, aj, ak = z / 2, -y / 2, x / 2
     si, sj, sk = np.sin(ai), np.sin(aj), np.sin(ak)
@@ -134,7 +132,7 @@ def euler_to_quaternion(euler: ArrayLike) -> Array:
 
 
 def quaternion_to_euler(quaternion: ArrayLike) -> Array:
-    """Euler angles xyz (..., 3), radians, of quaternions wxyz (..., 4) of any norm."""
+    """Return Euler angles xyz (..., 3), rad, of quaternions wxyz (..., 4) of any norm."""
     w, x, y, z = _parts(quaternion)
     norm = w * w + x * x + y * y + z * z
     scale = 2.0 / np.where(norm > 0.0, norm, 1.0)
@@ -153,13 +151,13 @@ def quaternion_to_euler(quaternion: ArrayLike) -> Array:
 
 
 def rotation_angle(first: ArrayLike, second: ArrayLike, antipodal: bool) -> Array:
-    """Angle between unit quaternions wxyz (..., 4), radians.
+    """Return the angle between unit quaternions wxyz (..., 4), rad.
 
     Args:
         first: Quaternions.
         second: Quaternions.
-        antipodal: True measures the rotation, in [0, pi]: q and -q are the same. False compares the
-            raw quaternions as Gymnasium-Robotics does, in [0, 2 pi]: q and -q are 2 pi apart.
+        antipodal: Whether q and -q are equal: angles are in [0, pi]. Otherwise they are 2 pi apart
+            and angles in [0, 2 pi], as in Gymnasium-Robotics.
     """
     real = _parts(quaternion_multiply(first, quaternion_conjugate(second)))[0]
     return np.asarray(2.0 * np.arccos(np.clip(np.abs(real) if antipodal else real, -1.0, 1.0)))

@@ -1,8 +1,7 @@
-"""Message definitions by type name: schema text, type hash, CDR bytes.
+"""Message definitions by ROS type name: schema text, type hash, CDR bytes.
 
-The definitions are those of ROS 2 Jazzy as the `rosbags` package carries them, so logs can be
-written and read without a ROS installation. Types are named as ROS names them:
-`sensor_msgs/msg/JointState`.
+The definitions of ROS 2 Jazzy come from the `rosbags` package, so logs can be written and read
+without ROS.
 """
 
 from __future__ import annotations
@@ -15,10 +14,9 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-# The longest message that a robot sends or understands has 3 KB; what is longer than this is
-# dropped before it is decoded or logged.
+# Longer messages are dropped before they are decoded or logged. The longest valid one has 3 KB.
 MAX_MESSAGE_BYTES = 64 * 2**10
-# What the type store raises for bytes that are not such a message; asserts find bytes left over.
+# Errors of the type store for invalid bytes; its assertions detect surplus bytes.
 _UNREADABLE = (AssertionError, IndexError, MemoryError, SerdeError, struct.error)
 
 
@@ -28,7 +26,7 @@ def _store() -> Typestore:
 
 
 def message_class(type_name: str) -> Any:
-    """Returns the dataclass that stands for messages of a type outside of rclpy.
+    """Return the dataclass for messages of a type, without rclpy.
 
     Raises:
         ValueError: If the type is not part of ROS 2 Jazzy.
@@ -44,43 +42,34 @@ def message_class(type_name: str) -> Any:
 
 @cache
 def schema_text(type_name: str) -> str:
-    """Returns the `ros2msg` text of a type and of all types it is made of, as MCAP wants it."""
+    """Return the `ros2msg` text of a type and its nested types, for MCAP."""
     message_class(type_name)
     return _store().generate_msgdef(type_name, ros_version=2)[0]
 
 
 @cache
 def type_hash(type_name: str) -> str:
-    """Returns the type hash of REP 2016, `RIHS01_` and 64 hexadecimal digits."""
+    """Return the type hash of REP 2016, `RIHS01_` and 64 hexadecimal digits."""
     message_class(type_name)
     return _store().hash_rihs01(type_name)
 
 
 def require_short(data: bytes) -> None:
-    """Refuses what takes longer to read than a tick lasts.
-
-    Raises:
-        ValueError: If there are more than `MAX_MESSAGE_BYTES`.
-    """
+    """Raise ValueError for more than `MAX_MESSAGE_BYTES`, which take longer than a tick to read."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise ValueError(f'{len(data)} bytes given; allowed: up to {MAX_MESSAGE_BYTES}')
 
 
 def serialize(type_name: str, message: object) -> bytes:
-    """Returns the CDR bytes (little endian, with encapsulation header) of a message.
-
-    Args:
-        type_name: Type of the message.
-        message: An instance of `message_class(type_name)`.
-    """
+    """Return the CDR bytes (little endian, with header) of an instance of `message_class`."""
     return bytes(_store().serialize_cdr(message, type_name, little_endian=True))
 
 
 def deserialize(type_name: str, data: bytes) -> Any:
-    """Returns the message in `data` as an instance of `message_class(type_name)`.
+    """Return the message in `data` as an instance of `message_class(type_name)`.
 
     Raises:
-        ValueError: If the bytes are not such a message, or there is no such type.
+        ValueError: If the bytes are not such a message, or the type is unknown.
     """
     message_class(type_name)
     try:

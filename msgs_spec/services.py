@@ -1,4 +1,4 @@
-"""Every service of the nodes as data."""
+"""Services of the nodes as data."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ class ServiceSpec:
     Attributes:
         name: `~/` stands for the node's own name.
         type_name: ROS name of the service type.
-        description: What a call does.
-        node: The node that offers it.
+        description: Effect of a call.
     """
 
     name: str
@@ -22,7 +21,7 @@ class ServiceSpec:
     node: str = 'sim_node'
 
 
-# A call that steps blocks the robot; this many ticks take the slowest task a few seconds.
+# A call blocks the robot while it steps; the slowest task needs a few seconds for this many ticks.
 MAX_STEPS = 1000
 
 RESET = ServiceSpec(
@@ -43,7 +42,7 @@ def _interface(name: str, type_name: str, description: str) -> ServiceSpec:
     return ServiceSpec(name, f'simulation_interfaces/srv/{type_name}', description)
 
 
-# Offered where the package simulation_interfaces is installed; PyPI does not have it.
+# Only where the package simulation_interfaces is installed, which is not on PyPI.
 GET_FEATURES = _interface(
     '~/get_simulator_features', 'GetSimulatorFeatures', 'Lists the features below.'
 )

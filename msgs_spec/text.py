@@ -7,17 +7,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeVar
 
 Name = TypeVar('Name', bound=str)
-# Characters of a name from anywhere that are shown.
+# Maximum number of characters of a received name in an error.
 _SHOWN = 40
 
 
 def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
-    """Ends a line that refuses a name: `; did you mean 'task'?`, or nothing.
+    """Return `; did you mean 'task'?` for a misspelt name, or ''.
 
     Args:
-        given: The name.
-        allowed: Those that there are; of a mapping, its keys are what may be typed, and its values
-            what is said instead.
+        given: The misspelt name.
+        allowed: Known names. A mapping leads from accepted names to the names to suggest.
     """
     meanings = allowed if isinstance(allowed, Mapping) else {name: name for name in allowed}
     by_lower = {name.lower(): meant for name, meant in meanings.items() if name}
@@ -26,15 +25,12 @@ def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
 
 
 def one_of(given: str, allowed: Sequence[Name], meaning: str) -> Name:
-    """Returns the name that was given, as one of those that there are.
+    """Return `given` if it is allowed; raise ValueError otherwise.
 
     Args:
-        given: The name, from anywhere.
-        allowed: Those that there are.
-        meaning: What it names, for the error.
-
-    Raises:
-        ValueError: If it is none of them, in one line.
+        given: A name from an untrusted source.
+        allowed: Known names.
+        meaning: Kind of the name, for the error.
     """
     for name in allowed:
         if given == name:
@@ -43,7 +39,7 @@ def one_of(given: str, allowed: Sequence[Name], meaning: str) -> Name:
 
 
 def first_of(names: Sequence[str], most: int) -> str:
-    """Returns the first of many names and how many are left out: `a, b and 3 more`."""
+    """Return the first of many names and the number of the others: `a, b and 3 more`."""
     rest = f' and {len(names) - most} more' if len(names) > most else ''
     return f'{", ".join(names[:most])}{rest}'
 

@@ -28,33 +28,29 @@ from msgs_spec.text import one_of
 from msgs_spec.topics import GROUND_TRUTH, LATEST_TICK, TopicSpec, ground_truth_topics, topics
 
 Phase = Literal['waiting', 'reset', 'running', 'finished']
-# What each says of the tick it comes with. An episode that is given up ends without `finished`.
+# The tick of each phase. An episode that a reset ends has no `finished`.
 PHASES: dict[Phase, str] = {
     'waiting': 'before the first episode',
     'reset': 'at tick 0 of an episode',
     'running': 'at the ticks between, in `latest_tick` alone',
-    'finished': 'at the last tick of an episode that was not given up',
+    'finished': 'at the last tick of an episode that no reset ended',
 }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeStatus:
-    """What `episode_status` says.
+    """Contents of `episode_status`.
 
     Attributes:
         task: Name of the task.
         episode: Index of the episode since the node started, from 0.
-        seed: Seed of the episode.
         tick: Steps of the episode so far; 0 is the state after the reset.
-        phase: Where the episode is, see `PHASES`.
+        phase: See `PHASES`.
         control_hz: Ticks per second of simulated time; observations depend on it.
-        reward_type: `sparse` or `dense`.
-        success_rule: `gymnasium` or `paper`.
         episode_return: Sum of rewards so far.
-        is_success: Whether the goal is reached now.
-        joint_prefix: What the names of joints begin with; told where it is not the usual one.
-        disturbances: What is disturbed, JSON; told where something is.
-        variation: What the episode drew from it, JSON.
+        joint_prefix: Prefix of the joint names; left out of the message if it is the default.
+        disturbances: Disturbances, JSON; left out if there are none.
+        variation: Values drawn for the episode, JSON.
     """
 
     task: str
@@ -72,30 +68,30 @@ class EpisodeStatus:
     variation: str = ''
 
     def is_of_same_robot(self, other: EpisodeStatus) -> bool:
-        """Whether the messages of both mean the same: who follows one can follow the other."""
+        """Return whether the topics of both have the same layout."""
         return all(
             getattr(self, name) == getattr(other, name)
             for name in ('task', 'control_hz', 'joint_prefix')
         )
 
     def to_values(self) -> dict[str, str]:
-        """Returns the key/value pairs of the message."""
+        """Return the key/value pairs of the message."""
         values = {key: str(value) for key, value in dataclasses.asdict(self).items()}
         usual = {'joint_prefix': JOINT_PREFIX, 'disturbances': '', 'variation': ''}
         return {key: text for key, text in values.items() if usual.get(key) != text}
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> EpisodeStatus:
-        """Reads the key/value pairs of a message; other keys than the attributes are ignored.
+        """Read the key/value pairs of a message; unknown keys are ignored.
 
         Raises:
-            ValueError: If a pair is missing or cannot be read, or nothing can run at the rate.
+            ValueError: If a pair is missing or invalid.
         """
         values = {'joint_prefix': JOINT_PREFIX, 'disturbances': '', 'variation': '', **values}
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
         if missing:
             raise ValueError(f'episode_status without {", ".join(missing)}')
-        # As Python writes them, and as C++ and YAML do.
+        # As Python, C++ and YAML write them.
         flags = {'True': True, 'true': True, '1': True, 'False': False, 'false': False, '0': False}
         said = 'episode_status with'
         phase = one_of(values['phase'], tuple(PHASES), f'{said} phase')
@@ -123,7 +119,7 @@ class EpisodeStatus:
         return status
 
     def _require_known(self) -> None:
-        """Refuses what nobody could go by."""
+        """Raise ValueError for values that no node can follow."""
         try:
             substeps_per_tick(self.control_hz)
         except ValueError as error:
@@ -143,17 +139,14 @@ class Tick:
 
     Attributes:
         stamp_ns: Simulated time, nanoseconds.
-        readings: What the sensors say: the vector (topic.size,) of each topic that reports one.
+        readings: Sensor readings, (topic.size,) for each topic.
         desired_goal: (goal,).
         achieved_goal: (goal,).
-        reward: Reward of the step that led here.
-        is_success: Whether the goal is reached now.
+        reward: Reward of the last step.
         applied_command: (action,), command units, after clipping.
-        status: Of the episode.
-        true_readings: What the sensors would measure without disturbances; None where there are
-            none.
-        has_diverged: Whether MuJoCo gave up in the step that led here, which ends the episode;
-            state, goal and reward are of what it was set back to.
+        true_readings: Sensor readings without disturbances; None if there are none.
+        has_diverged: Whether the simulation diverged in the last step, which ends the episode;
+            state, goal and reward are those after MuJoCo's reset.
     """
 
     stamp_ns: int
@@ -169,7 +162,7 @@ class Tick:
 
 
 def _vectors(tick: Tick) -> dict[str, ArrayLike | None]:
-    """The vector of each topic; None leaves the topic out of this tick."""
+    """Return the vector of each topic; None leaves the topic out of this tick."""
     return {
         **tick.readings,
         '/clock': [],
@@ -182,11 +175,7 @@ def _vectors(tick: Tick) -> dict[str, ArrayLike | None]:
 
 
 class TickEncoder:
-    """Turns ticks of one task into messages.
-
-    Args:
-        task: The task.
-    """
+    """Turns ticks of one task into messages."""
 
     def __init__(self, task: TaskSpec) -> None:
         published = [spec for spec in topics(task) if spec.direction == 'published']
@@ -195,15 +184,14 @@ class TickEncoder:
         self._true_codecs = [TopicCodec(spec) for spec in ground_truth_topics(task)]
 
     def encode(self, tick: Tick, latched: bool = False) -> list[tuple[TopicSpec, bytes]]:
-        """Returns the messages of a tick with their CDR bytes, in the order of `topics`.
+        """Return the messages of a tick with their CDR bytes, in the order of `topics`.
 
-        `desired_goal` is latched for late subscribers and yet part of every tick: a policy that
-        joins topics by stamp must never meet the state of a new episode with the goal of the last.
+        `desired_goal` is latched and still part of every tick. So a policy that joins topics by
+        stamp never combines the state of an episode with the goal of the last one.
 
         Args:
             tick: The tick.
-            latched: Whether to send `episode_status` too: at the reset, and when the episode is
-                finished.
+            latched: Whether to add `episode_status`: at the reset and the end of an episode.
 
         Raises:
             ValueError: If a vector is missing or has a wrong size.
@@ -225,12 +213,12 @@ class TickEncoder:
         return messages
 
     def encode_clock(self, stamp_ns: int) -> tuple[TopicSpec, bytes]:
-        """Returns `/clock` alone, for a simulation that stands still."""
+        """Return `/clock` alone, for a simulation that stands still."""
         clock = self._codecs[0]
         return clock.topic, clock.encode(stamp_ns, [])
 
     def encode_status(self, stamp_ns: int, status: EpisodeStatus) -> tuple[TopicSpec, bytes]:
-        """Returns `episode_status` alone, for a simulation that has not started."""
+        """Return `episode_status` alone, for a simulation that has not started."""
         message = build_status(self._status, stamp_ns, 'episode', status.to_values())
         return self._status, serialize(self._status.type_name, message)
 

@@ -1,4 +1,4 @@
-"""Every topic of every task as data: name, type, quality of service, units, frame, order."""
+"""Topics of every task as data: name, type, quality of service, units, frame, order."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from msgs_spec.tasks import GoalKind, TaskSpec, VectorPart
 
 @dataclass(frozen=True, slots=True)
 class QosSpec:
-    """What a publisher offers; history is always keep_last.
+    """Quality of service; history is always keep_last.
 
     Attributes:
         depth: Messages kept.
-        reliability: Whether lost messages are sent again.
         durability: `transient_local` topics are latched: late subscribers get the last messages.
     """
 
@@ -25,11 +24,10 @@ class QosSpec:
     durability: Literal['volatile', 'transient_local']
 
 
-# All offers are reliable: a best-effort publisher silently starves reliable subscribers, while a
-# reliable one serves both kinds.
+# All publishers are reliable, because reliable subscribers receive nothing from best-effort ones.
 STATE = QosSpec(depth=10, reliability='reliable', durability='volatile')
 LATCHED = QosSpec(depth=1, reliability='reliable', durability='transient_local')
-# Named joint commands add up, and a rejected one is to be counted, so none may push another out.
+# Named joint commands add up, and rejected ones are counted, so none may be overwritten.
 COMMAND = QosSpec(depth=10, reliability='reliable', durability='volatile')
 CLOCK = QosSpec(depth=1, reliability='reliable', durability='volatile')
 
@@ -64,14 +62,11 @@ class TopicSpec:
 
     Attributes:
         name: Relative to the node's namespace, except `/clock`.
-        type_name: ROS name of the message type.
-        description: What the topic says.
-        layout: Parts of the float64 vector that `codecs` makes of the message, in order.
-            Quaternions are wxyz there and xyzw in the message.
-        frame: `header.frame_id`, empty where a frame has no meaning.
-        names: Joint names inside of the message, in order.
-        qos: What the publisher offers, or what the subscriber asks for.
-        direction: As `sim_node` sees it.
+        layout: Parts of the float64 vector of the message. Quaternions are wxyz in the vector and
+            xyzw in the message.
+        frame: `header.frame_id`; empty for topics without a frame.
+        names: Joint names in the message.
+        direction: Seen from `sim_node`.
     """
 
     name: str
@@ -120,7 +115,7 @@ def _joint_topic(task: TaskSpec) -> TopicSpec:
 
 
 def _body_topics(task: TaskSpec) -> list[TopicSpec]:
-    """End effector or fingertips, then the object."""
+    """Return the topics of the end effector or fingertips, then of the object."""
     pose, twist = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/TwistStamped'
     if task.robot.has_gripper_command:
         specs = [
@@ -145,7 +140,7 @@ def _body_topics(task: TaskSpec) -> list[TopicSpec]:
 
 
 def _reads_object_joint(task: TaskSpec) -> bool:
-    """Whether observations are made from it: those of a hand that turns an object, and others'."""
+    """Return whether the observation depends on `object_joint`."""
     if task.formulas is not None:
         return 'object_joint' in task.formulas.topics
     return task.goal is GoalKind.POSE
@@ -153,7 +148,7 @@ def _reads_object_joint(task: TaskSpec) -> bool:
 
 def _goal_topics(task: TaskSpec) -> list[TopicSpec]:
     type_name, layout = _GOAL_TYPES[task.goal]
-    desired, achieved = 'Goal of the episode.', 'What the goal is compared with, as it is now.'
+    desired, achieved = 'Goal of the episode.', 'Present value that the goal is compared with.'
     return [
         TopicSpec('desired_goal', type_name, desired, layout, frame=WORLD, qos=LATCHED),
         TopicSpec('achieved_goal', type_name, achieved, layout, frame=WORLD),
@@ -209,7 +204,7 @@ def _command_topics(task: TaskSpec) -> list[TopicSpec]:
         'body, force and torque are along the axes of the world, at its centre of mass.'
     )
     specs.append(_subscribed('perturb', wrench, text, _WRENCH))
-    text = 'Who commands: checkpoint and its SHA-256 as key/value pairs, for the log.'
+    text = 'Checkpoint of the policy and its SHA-256 as key/value pairs, for the log.'
     status = 'diagnostic_msgs/msg/DiagnosticArray'
     specs.append(_subscribed('policy_status', status, text, (), qos=LATCHED))
     return specs
@@ -231,29 +226,29 @@ LATEST_TICKS_PER_SECOND = 30
 LATEST_TICK = TopicSpec(
     'latest_tick',
     'std_msgs/msg/UInt8MultiArray',
-    'All messages of a tick in one, for those who only look: `layout` names topics and their '
-    f'bytes. The latest tick, at most {LATEST_TICKS_PER_SECOND} Hz wall time, while somebody '
-    'subscribes; not logged.',
+    'All messages of the latest tick in one, for viewers: `layout` contains the topics and their '
+    f'numbers of bytes. At most {LATEST_TICKS_PER_SECOND} Hz wall time, while it has subscribers; '
+    'not logged.',
 )
 MONITORING = (DIAGNOSTICS, REAL_TIME_FACTOR, LATEST_TICK)
 
 
 def sensor_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
-    """Returns the topics of what sensors of a task say; observations are made of them."""
+    """Return the topics of the sensors, from which observations are computed."""
     return (_joint_topic(task), *_body_topics(task))
 
 
-# Namespace of what the sensors would measure without disturbances.
+# Namespace of the sensor readings without disturbances.
 GROUND_TRUTH = 'ground_truth'
 
 
 def ground_truth_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
-    """Return the topics of the true state, which a disturbed robot publishes besides."""
+    """Return the additional topics of a disturbed robot: its true state."""
     return tuple(
         replace(
             spec,
             name=f'{GROUND_TRUTH}/{spec.name}',
-            description=f'`{spec.name}` without disturbances; only where there are some.',
+            description=f'`{spec.name}` without disturbances; only from a disturbed robot.',
         )
         for spec in sensor_topics(task)
     )
@@ -268,10 +263,10 @@ def relative_name(resolved: str) -> str:
 
 @lru_cache(maxsize=_TASKS)
 def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
-    """Returns all topics of a task.
+    """Return all topics of a task.
 
-    The order is part of the contract: published topics come first, as a tick publishes and logs
-    them, then the subscribed ones.
+    The order is part of the contract: first the published topics in the order of a tick, then the
+    subscribed ones.
     """
     clock = TopicSpec(
         '/clock', 'rosgraph_msgs/msg/Clock', 'Simulated time, once per tick.', qos=CLOCK
@@ -286,10 +281,10 @@ def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
 
 
 def topic(task: TaskSpec, name: str) -> TopicSpec:
-    """Returns the topic of a task by name.
+    """Return the topic of a task by name.
 
     Raises:
-        ValueError: If the task has no such topic; the message lists those it has.
+        ValueError: If the topic is unknown; the message lists the known ones.
     """
     found = {spec.name: spec for spec in topics(task)}
     if name not in found:

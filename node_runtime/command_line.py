@@ -34,7 +34,7 @@ from node_runtime.signals import (
 EXIT_SUCCESS, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
 # 128 + SIGPIPE, as in shells.
 EXIT_CLOSED_PIPE = 141
-# Errors of an output stream that takes no more data.
+# Errors of a full output.
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 # Modules that show whether an extra of this package is installed; ROS installs its own by apt.
@@ -113,7 +113,7 @@ def whole_number(lower: int, upper: int | None = None) -> Callable[[str], int]:
 
 
 class FormerOption(argparse.Action):
-    """An option under its former name, accepted with a line that tells the new name."""
+    """An option under its former name: accepted, with a line about the new name."""
 
     def __call__(
         self,
@@ -172,7 +172,7 @@ def run_command(name: str, run: Callable[[], int]) -> int:
 
     with on_stop_signals(_unclaimed_signals(), stop) as received:
         code = _exit_code(name, run, received)
-        # A command may run another one, which knows nothing of the signal.
+        # A command may run another one, which does not see the signal.
         return 128 + received[0] if received and code == EXIT_INTERRUPTED else code
 
 
@@ -263,7 +263,7 @@ def require_extra(extra: str, *needed: str) -> None:
         needed: Modules of the extra that must exist; default all.
 
     Raises:
-        UsageError: If a package is missing; the message tells what to install.
+        UsageError: If a package is missing; the message names what to install.
     """
     missing = [module for module in needed or EXTRAS[extra] if find_spec(module) is None]
     if missing:

@@ -65,7 +65,7 @@ class StopSignals:
             signal.signal(number, self._handle)
 
     def __bool__(self) -> bool:
-        """Whether to stop."""
+        """Return whether a signal was received."""
         return self.received is not None
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
@@ -78,7 +78,7 @@ class StopSignals:
         self._received_at = time.monotonic()
 
     def watch(self) -> Callable[[], bool]:
-        """Return a function that tells whether another signal came, a second or more from now.
+        """Return a function that returns whether a signal came a second or more from now.
 
         Shells and supervisors may send several signals at once.
         """

@@ -75,7 +75,7 @@ def rclpy_profile(spec: QosSpec) -> QoSProfile:
 def full_name(namespace: str, name: str) -> str:
     """Return the full name of a node in a namespace, such as `/left/sim_node`.
 
-    rmw knows a participant before the names of its nodes.
+    Discovery finds a participant before the names of its nodes.
     """
     if name == _UNKNOWN:
         return '(a node without a name yet)'

@@ -1,8 +1,8 @@
 """`replay_node`: publishes a logged episode on its topics with its timing.
 
-Whatever listens to a robot can listen to the replay, `policy_node` too. What the robot had received
-is not published, unless asked for: the commands of the log would mix with those of a policy.
-`schedule.py` says what to publish when, without ROS; `node.py` is the node.
+Every subscriber of a robot can subscribe to the replay, including `policy_node`. Recorded commands
+are published on request only, because they would mix with those of a policy. `schedule.py` contains
+the messages and their times, without ROS; `node.py` is the node.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ SUMMARY = 'A recorded episode, published once more.'
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs `replay_node`; returns the exit code."""
+    """Run `replay_node` and return the exit code."""
 
     def load() -> Callable[[], RunnableNode]:
         from fetch_hand_sim.replay_node.node import ReplayNode

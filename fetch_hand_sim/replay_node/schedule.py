@@ -152,33 +152,33 @@ class Playhead:
         self.is_paused = is_paused
 
     def position_ns(self, now: float) -> int:
-        """Log time to be published up to."""
+        """Return the log time up to which messages are due."""
         if self.is_paused:
             return self._position_ns
         return self._position_ns + int((now - self._since) * self._rate * 1e9)
 
     def remaining(self, time_ns: int, now: float) -> float:
-        """Seconds until a log time is due; infinite while paused."""
+        """Return the seconds until a log time is due; infinity while paused."""
         if self.is_paused:
             return math.inf
         return (time_ns - self._position_ns) / 1e9 / self._rate - (now - self._since)
 
     def pause(self, now: float) -> None:
-        """Stands still."""
+        """Pause."""
         self._position_ns, self._since = self.position_ns(now), now
         self.is_paused = True
 
     def resume(self, now: float) -> None:
-        """Goes on."""
+        """Resume."""
         if self.is_paused:
             self._since = now
         self.is_paused = False
 
     def set_rate(self, rate: float, now: float) -> None:
-        """Changes the rate from now on."""
+        """Change the rate from now on."""
         self._position_ns, self._since = self.position_ns(now), now
         self._rate = rate
 
     def jump(self, position_ns: int, now: float) -> None:
-        """Goes to a position."""
+        """Go to a position."""
         self._position_ns, self._since = position_ns, now

@@ -64,7 +64,7 @@ class CommandBuffer:
 
     @property
     def has_command(self) -> bool:
-        """Whether a valid command came in this episode."""
+        """True if a valid command came in this episode."""
         return self._command is not None
 
     def age(self) -> float | None:

@@ -102,7 +102,7 @@ class InputWatch:
 
 
 class GraphWatch:
-    """What the graph contained at the last `update`.
+    """The state of the graph at the last `update`.
 
     Args:
         node: The simulator node.

@@ -72,11 +72,9 @@ class Surroundings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Situation:
-    """What the conditions depend on.
+    """The input of the conditions.
 
     Attributes:
-        robot: The robot.
-        around: Its surroundings.
         grown: Increase of each counter since the last report.
         rate: Ticks per second since then.
         shortfall: Whether that is less than requested, over a whole period of one pace.
@@ -108,7 +106,7 @@ class Situation:
 
     @property
     def fallback(self) -> str:
-        """What a robot does whose commands have stopped."""
+        """The reaction of the robot to missing commands."""
         buffer = self.robot.buffer
         return 'repeats the last one' if buffer.has_command and not buffer.timeout else 'holds'
 
@@ -118,9 +116,9 @@ class Condition:
     """Something wrong with a robot.
 
     Attributes:
-        applies: Whether it is so.
+        applies: The predicate.
         sentence: Cause and remedy.
-        lasts: Whether it stays until somebody acts; such conditions are logged when they begin.
+        lasts: Whether it stays until the user acts; such conditions are logged when they begin.
     """
 
     name: str

@@ -13,7 +13,7 @@ from msgs_spec.topics import TopicSpec
 
 
 class ReceivedLog(Protocol):
-    """The recorder, as far as received messages are concerned."""
+    """The recorder's method for received messages."""
 
     def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool) -> None:
         """Record the CDR bytes of one message, and whether the robot rejected it."""

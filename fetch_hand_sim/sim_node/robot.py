@@ -102,18 +102,18 @@ class Robot:
 
     @property
     def stands_still(self) -> bool:
-        """Whether the next tick needs a command or a service call."""
+        """True if the next tick needs a command or a service call."""
         waits = self.schedule.waits_for_commands and self.runner.has_started
         return self.schedule.is_paused or waits
 
     @property
     def is_reset_due(self) -> bool:
-        """Whether a requested reset is due as a tick of its own."""
+        """True if a requested reset is due as a tick of its own."""
         return self._reset_due is not None and self._reset_due <= self._clock()
 
     @property
     def misses_commands(self) -> bool:
-        """Whether an expected command is a second or more late, pauses left out.
+        """True if an expected command is a second or more late, pauses left out.
 
         In lockstep every tick expects one. In real time commands are expected after the first; the
         limit is longer where `command_timeout` or two ticks in slow motion are longer.

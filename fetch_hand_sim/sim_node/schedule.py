@@ -42,7 +42,7 @@ class TickSchedule:
 
     @property
     def waits_for_commands(self) -> bool:
-        """Whether the next tick needs a command."""
+        """True if the next tick needs a command."""
         return self.mode == 'lockstep' and not self.is_paused
 
     @property

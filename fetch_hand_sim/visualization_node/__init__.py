@@ -1,7 +1,7 @@
 """`visualization_node`: a robot for rviz2, Foxglove and other standard tools.
 
-`transforms.py` says where every frame is, `messages.py` makes messages of it, `camera.py` draws
-pictures; `node.py` is the node, a subscriber of its own beside the robot.
+`transforms.py` computes the frames, `messages.py` the messages, `camera.py` the pictures. `node.py`
+is the node, a process beside the robot.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ SUMMARY = 'URDF, transforms, markers and a camera of a running robot, for standa
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs `visualization_node`; returns the exit code."""
+    """Run `visualization_node` and return the exit code."""
 
     def load() -> Callable[[], RunnableNode]:
         from fetch_hand_sim.visualization_node.node import VisualizationNode

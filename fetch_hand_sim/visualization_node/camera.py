@@ -38,7 +38,7 @@ class Camera:
 
     @property
     def is_due(self) -> bool:
-        """Whether it is time for the next picture."""
+        """True if it is time for the next picture."""
         return np.isfinite(self._period) and self._clock() >= self._due
 
     def render(self, scene: Scene, frame: Frame) -> Picture:

@@ -1,4 +1,4 @@
-"""Messages of standard tools: transforms, markers, pictures with their camera."""
+"""Messages for standard tools: transforms, markers, pictures and camera calibration."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ _SHAPES = {
     _GEOM.mjGEOM_ELLIPSOID.value: Marker.SPHERE,
     _GEOM.mjGEOM_BOX.value: Marker.CUBE,
     _GEOM.mjGEOM_CYLINDER.value: Marker.CYLINDER,
-    # There is no capsule.
+    # ROS has no capsule.
     _GEOM.mjGEOM_CAPSULE.value: Marker.CYLINDER,
 }
-# Their sizes are a radius and half a length.
+# Shapes whose size is a radius and half a length.
 _ROUND_RODS = (_GEOM.mjGEOM_CYLINDER.value, _GEOM.mjGEOM_CAPSULE.value)
 
 _JPEG_QUALITY = 85
-# As `compressed_image_transport` has it: encoding of the raw picture; that of the decoded one.
+# As in `compressed_image_transport`: encodings of the raw and of the decoded picture.
 _JPEG_FORMAT = 'rgb8; jpeg compressed bgr8'
 
 
 def stamp(nanoseconds: int) -> Time:
-    """Returns a time."""
+    """Return a time message."""
     seconds, rest = divmod(nanoseconds, 10**9)
     return Time(sec=seconds, nanosec=rest)
 
 
 def transform_messages(transforms: Iterable[Transform], stamp_ns: int) -> list[TransformStamped]:
-    """Returns the messages of transforms, all of one stamp."""
+    """Return the messages of transforms, with the same stamp."""
     time = stamp(stamp_ns)
     messages = []
     for each in transforms:
@@ -58,12 +58,11 @@ def transform_messages(transforms: Iterable[Transform], stamp_ns: int) -> list[T
 
 
 def marker_array(shapes: Mapping[str, Sequence[Shape]], stamp_ns: int) -> MarkerArray:
-    """Returns shapes as markers; those of earlier messages are removed.
+    """Return shapes as markers, which replace those of earlier messages.
 
     Args:
-        shapes: By the namespace of their markers. What ROS has no shape for, such as a mesh, is
-            left out.
-        stamp_ns: Of the tick.
+        shapes: Shapes by the namespace of their markers. Meshes are left out.
+        stamp_ns: Stamp of the tick.
     """
     header = Header(stamp=stamp(stamp_ns), frame_id=ROOT)
     first = Marker(header=header, action=Marker.DELETEALL)
@@ -82,7 +81,7 @@ def marker_array(shapes: Mapping[str, Sequence[Shape]], stamp_ns: int) -> Marker
 
 
 def image_message(picture: Picture, frame_id: str, stamp_ns: int) -> Image:
-    """Returns a picture (height, width, 3), red first."""
+    """Return a picture (height, width, 3), red first."""
     height, width = picture.shape[:2]
     message = Image(
         header=Header(stamp=stamp(stamp_ns), frame_id=frame_id),
@@ -96,7 +95,7 @@ def image_message(picture: Picture, frame_id: str, stamp_ns: int) -> Image:
 
 
 def compressed_message(picture: Picture, frame_id: str, stamp_ns: int) -> CompressedImage:
-    """Returns a picture (height, width, 3), red first, as JPEG."""
+    """Return a picture (height, width, 3), red first, as JPEG."""
     file = BytesIO()
     PIL.Image.fromarray(picture).save(file, 'JPEG', quality=_JPEG_QUALITY)
     message = CompressedImage(
@@ -107,14 +106,14 @@ def compressed_message(picture: Picture, frame_id: str, stamp_ns: int) -> Compre
 
 
 def camera_info(width: int, height: int, fovy: float, frame_id: str, stamp_ns: int) -> CameraInfo:
-    """Returns the calibration of a camera without distortion.
+    """Return the calibration of a camera without distortion.
 
     Args:
         width: Pixels.
         height: Pixels.
         fovy: Vertical field of view, degrees.
-        frame_id: Its optical frame.
-        stamp_ns: Of its picture.
+        frame_id: Optical frame of the camera.
+        stamp_ns: Stamp of the picture.
     """
     focal = height / 2.0 / np.tan(np.radians(fovy) / 2.0)
     x, y = width / 2.0, height / 2.0
@@ -136,7 +135,7 @@ def _quaternion(wxyz: Array) -> Quaternion:
 
 
 def _scale(shape: Shape) -> Vector3:
-    """Full lengths, where MuJoCo has radii and half lengths."""
+    """Return full lengths; MuJoCo has radii and half lengths."""
     size = shape.size
     if shape.shape in _ROUND_RODS:
         size = np.array([size[0], size[0], size[1]])

@@ -1,4 +1,4 @@
-"""The ROS node: follows a robot and says the same for standard tools."""
+"""The ROS node: follows a robot and publishes its state for standard tools."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ _PICTURES: dict[str, Callable[[Picture, str, int], Any]] = {
     'camera/image_raw': image_message,
     'camera/image_raw/compressed': compressed_message,
 }
-# Seconds without a tick after which a robot counts as one that stands still.
+# Seconds without a tick after which a robot counts as standing still.
 _STILL = 0.5
-# Callbacks served before a picture is drawn, which takes as long as some ticks do.
+# Callbacks before each picture, which takes as long as several ticks.
 _SERVED_FIRST = 200
 
 
 class VisualizationNode(Node):
-    """Publishes the topics of `msgs_spec.topics`.
+    """Publishes `msgs_spec.topics.view_topics`.
 
     Raises:
-        UsageError: If a parameter is not allowed.
+        ValueError: If a parameter is not allowed.
     """
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class VisualizationNode(Node):
         self._scalars: Scalars | None = None
         self._success_rule = ''
         self._latest: SeenTick | None = None
-        # The same, until it has been sent as markers and as a picture.
+        # The same tick until it is sent as markers and as a picture.
         self._unmarked: SeenTick | None = None
         self._undrawn: SeenTick | None = None
         self._ticked_at = 0.0
@@ -98,7 +98,7 @@ class VisualizationNode(Node):
         self.get_logger().info(f'waiting for a robot on {status_name}')
 
     def run(self, stop: StopSignals) -> None:
-        """Serves until told to stop."""
+        """Serve until a signal."""
         loop = EventLoop(self)
         try:
             while not stop:
@@ -112,7 +112,7 @@ class VisualizationNode(Node):
             loop.close()
 
     def _open(self, source: TopicSpec) -> None:
-        """Opens a topic, unless its messages are missing, as those of tf2 are on PyPI."""
+        """Open a topic unless its message type is missing; PyPI lacks tf2_msgs."""
         try:
             message_class = ros_message_class(source.type_name)
         except ImportError:
@@ -131,7 +131,7 @@ class VisualizationNode(Node):
     def _on_status(self, status: EpisodeStatus) -> None:
         spec = self._watch.spec
         assert spec is not None
-        # The description names the joints.
+        # The URDF contains the names of the joints.
         robot = status.task, status.joint_prefix
         if robot != self._robot:
             self._robot = robot
@@ -141,14 +141,14 @@ class VisualizationNode(Node):
             self._scalars = Scalars(spec, status.success_rule)
 
     def _begin(self, spec: TaskSpec) -> None:
-        """Takes another robot."""
+        """Follow another robot."""
         self._camera.close()
         self._latest = self._unmarked = self._undrawn = self._scalars = None
         try:
             self._scene = Scene(spec.name)
             self._transforms = Transforms(spec.name, self._prefix)
         except ValueError as error:
-            # Of a task that is described here and simulated elsewhere.
+            # The task is installed without its simulation.
             raise NodeFailure(str(error)) from None
         for source in scalar_topics(spec):
             if source.name not in self._outputs:
@@ -178,7 +178,7 @@ class VisualizationNode(Node):
             output.publish(output.msg_type(transforms=transform_messages(transforms, stamp_ns)))
 
     def _show_latest(self) -> None:
-        """Sends what need not come with every tick: markers and pictures."""
+        """Send markers and pictures, which need not come with every tick."""
         scene = self._scene
         if scene is None:
             return
@@ -200,13 +200,13 @@ class VisualizationNode(Node):
             self._take_photo(scene, tick, wanted)
 
     def _repeat_for_newcomers(self) -> None:
-        """Says the last tick again to those who come while the robot stands still."""
+        """Repeat the last tick for new subscribers while the robot stands still."""
         if self._latest is None or time.monotonic() - self._ticked_at < _STILL:
             return
         self._has_newcomer |= self._listeners.update()
         if self._has_newcomer and self._listeners.are_connected():
             self._has_newcomer = False
-            # Nothing is said in the name of a robot that is gone.
+            # A robot that has terminated is not repeated.
             if count_publishers(self, 'joint_states'):
                 self._on_tick(self._latest)
 

@@ -1,4 +1,4 @@
-"""Numbers of a tick that are worth a plot."""
+"""Numbers of a tick for plots."""
 
 from __future__ import annotations
 
@@ -10,19 +10,14 @@ from msgs_spec.topics import scalar_topics
 
 
 class Scalars:
-    """Makes the messages of `scalars/*` for one task.
-
-    Args:
-        spec: The task.
-        success_rule: `gymnasium` or `paper`.
-    """
+    """Encodes the topics `scalars/*` of one task."""
 
     def __init__(self, spec: TaskSpec, success_rule: SuccessRule) -> None:
         self._metric = GoalMetric(spec, success_rule=success_rule)
         self._codecs = {source.name: TopicCodec(source) for source in scalar_topics(spec)}
 
     def messages(self, tick: SeenTick) -> dict[str, bytes]:
-        """Returns the CDR bytes of each topic; a reset has no reward."""
+        """Return the CDR bytes of each topic; a reset has no reward."""
         frame = tick.frame
         distance, rotation = self._metric.distances(frame.achieved_goal, frame.desired_goal)
         numbers = {

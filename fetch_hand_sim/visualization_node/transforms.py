@@ -1,4 +1,4 @@
-"""Where every frame of a robot is: links of its URDF, its object, its goal."""
+"""Frames of a robot: links of its URDF, its object, its goal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from msgs_spec.tasks import GoalKind, task_spec
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """Where a frame is in its parent."""
+    """Pose of a frame in its parent."""
 
     parent: str
     child: str
@@ -29,10 +29,10 @@ class Transforms:
 
     Args:
         task: Name of the task.
-        prefix: Before all frames but `world`, such as `left/`.
+        prefix: Prefix of all frames except `world`, such as `left/`.
 
     Raises:
-        ValueError: If there is no such task.
+        ValueError: If the task is unknown.
     """
 
     def __init__(self, task: str, prefix: str = '') -> None:
@@ -42,12 +42,12 @@ class Transforms:
         self._index = {name: number for number, name in enumerate(self._spec.robot.joints)}
 
     def fixed(self) -> list[Transform]:
-        """The transforms that never change."""
+        """Return the transforms that never change."""
         joints = (joint for joint in self.description.joints if joint.kind == 'fixed')
         return [self._between(joint.parent, joint.child, joint.pose()) for joint in joints]
 
     def moving(self, frame: Frame) -> list[Transform]:
-        """The transforms of one tick: joints, object, goal."""
+        """Return the transforms of one tick: joints, object, goal."""
         found = [
             self._between(
                 joint.parent,
@@ -62,7 +62,7 @@ class Transforms:
         return [*found, *self._goal(frame.desired_goal)]
 
     def _position(self, joint: str, frame: Frame) -> float:
-        """Of a joint; one that the robot does not report stays where it is drawn without it."""
+        """Return the position of a joint; 0 if the robot does not publish it."""
         index = self._index.get(joint)
         return 0.0 if index is None else float(frame.joint_position[index])
 
@@ -83,13 +83,13 @@ class Transforms:
 
 
 def frame_prefix(namespace: str) -> str:
-    """The prefix of the frames of a robot in a namespace: `left/` for `/left`, empty for `/`."""
+    """Return the frame prefix of a namespace: `left/` for `/left`, empty for `/`."""
     name = namespace.strip('/')
     return f'{name}/' if name else ''
 
 
 def view_transform(view: View, name: str) -> Transform:
-    """The optical frame of a camera: z ahead, x to the right, y down."""
+    """Return the optical frame of a camera: z ahead, x to the right, y down."""
     azimuth, elevation = np.radians(view.azimuth), np.radians(view.elevation)
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     ahead = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
