@@ -204,7 +204,8 @@ POLICY_NODE = (
         'policy',
         'string',
         '',
-        'Shipped actor, file (.safetensors, .onnx, .zip), module:function, random or resting; '
+        'Shipped actor, file (.safetensors, .onnx, .zip), module:function, random, resting or '
+        'robust; '
         'empty selects the shipped actor of the task.',
         read_only=False,
         former='checkpoint',

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,7 +40,12 @@ class Commander:
         self.spec = task_spec(loaded.task)
         self.description = loaded.description
         self.sha256 = loaded.sha256
-        self._policy = loaded.policy
+        self._loaded = loaded
+        self._state: Any = None
+
+    def start_episode(self) -> None:
+        """Forget the episode before; a policy without memory has nothing to forget."""
+        self._state = None
 
     def command(self, observation: Observation) -> NDArray[np.float64]:
         """Returns the command (action size,), command units, for one observation.
@@ -48,7 +55,7 @@ class Commander:
                 as an action has.
         """
         try:
-            action, _ = self._policy.predict(observation, deterministic=True)
+            action, state = self._loaded.predict(observation, self._state)
             action = np.asarray(action, dtype=np.float64)
         except Exception as error:
             # Libraries raise types of their own, one observation in a thousand may be the cause.
@@ -60,4 +67,5 @@ class Commander:
                 f'{self.description} gives shape {action.shape}; '
                 f'allowed: ({self.spec.robot.action_size},)'
             )
+        self._state = state
         return np.asarray(command_from_action(self.spec.robot, action), dtype=np.float64)

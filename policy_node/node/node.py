@@ -310,6 +310,8 @@ class PolicyNode(Node):
         ):
             self._responder.forget()
         self._status, self._status_stamp = status, stamp
+        if self._responder is not None:
+            self._responder.note_phase(status.phase, stamp)
 
     def _may_follow(self, status: EpisodeStatus) -> bool:
         """Whether who speaks is the robot that is known, its successor, or one the policy fits.

@@ -14,7 +14,7 @@ from msgs_spec.diagnostics import Durations
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import task_spec
 from msgs_spec.text import one_line
-from msgs_spec.tick import EpisodeStatus
+from msgs_spec.tick import EpisodeStatus, Phase
 from msgs_spec.topics import topic
 from policy_node.node.commander import Commander
 from policy_node.node.stamp_join import StampJoin, Vectors
@@ -67,7 +67,12 @@ class Responder:
             for source in self._assembler.topics
         }
         self._due: Vectors | None = None
+        self._due_stamp = 0
         self._asked: dict[str, NDArray[np.float64]] | None = None
+        # The last answered tick, whether it was the first of an episode, and episode borders.
+        self._answered: tuple[int, dict[str, NDArray[np.float64]]] | None = None
+        self._is_first = True
+        self._starts_at = self._ends_at = -1
         self._ask_again_at = 0.0
         self._unsent: bytes | None = None
         self.topics = self._assembler.topics
@@ -99,7 +104,23 @@ class Responder:
         vectors = self.join.add(name, stamp, vector)
         if vectors is not None:
             self.overtaken += self.is_due
-            self._due = vectors
+            self._due, self._due_stamp = vectors, stamp
+
+    def note_phase(self, phase: Phase, stamp: int) -> None:
+        """Note the borders of episodes, at which the policy forgets.
+
+        Args:
+            phase: Of `episode_status`.
+            stamp: Its stamp, nanoseconds.
+        """
+        if phase == 'finished':
+            self._ends_at = stamp
+        elif phase == 'reset':
+            self._starts_at = stamp
+            # Topics are not ordered: the first tick may have been answered before its status came.
+            if self._answered is not None and self._answered[0] == stamp and not self._is_first:
+                self.commander.start_episode()
+                self.commander.command(self._answered[1])
 
     @property
     def is_due(self) -> bool:
@@ -121,8 +142,9 @@ class Responder:
             self._note_arrival()
         elif self._asked is None or self._clock() < self._ask_again_at:
             return
+        self._forget_last_episode()
         self._answer(self._asked)
-        self._asked = None
+        self._answered, self._asked = (self._due_stamp, self._asked), None
 
     def send_unsent(self) -> None:
         """Sends the last command if nobody has heard it yet."""
@@ -133,7 +155,15 @@ class Responder:
     def forget(self) -> None:
         """Starts anew with a robot that did: its stamps begin again."""
         self.join.forget()
-        self._due = self._asked = self._unsent = None
+        self._due = self._asked = self._unsent = self._answered = None
+        self._starts_at = self._ends_at = -1
+
+    def _forget_last_episode(self) -> None:
+        """Let the policy forget if an episode began since the last answered tick."""
+        before, now = self._answered[0] if self._answered else -1, self._due_stamp
+        self._is_first = before < self._starts_at <= now or before <= self._ends_at < now
+        if self._is_first or self._answered is None:
+            self.commander.start_episode()
 
     def _observed(self, vectors: Vectors) -> dict[str, NDArray[np.float64]]:
         try:

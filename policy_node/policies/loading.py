@@ -16,12 +16,13 @@ from policy_node.policies.shipped import actor_path, shipped_actors
 if TYPE_CHECKING:
     from policy_node.policies.actor import Actor
 
-RANDOM, RESTING = 'random', 'resting'
+RANDOM, RESTING, ROBUST = 'random', 'resting', 'robust'
 _WARM_UP_CALLS = 20
 # For help texts and descriptions of parameters.
 POLICY_NAMES = (
     'a shipped actor (FetchReach), a file (.safetensors, .onnx; .zip of Stable-Baselines3 if you '
-    'trust it), a function of yours (module:function, if you trust it), random or resting; '
+    'trust it), a function of yours (module:function, if you trust it), random, resting, or robust '
+    '(the shipped actor for disturbed robots); '
     'default: the shipped actor of the task'
 )
 
@@ -53,7 +54,7 @@ def load_policy(
     Args:
         name: Task name of a shipped actor; file of an actor of this project, as checkpoint or ONNX;
             .zip of Stable-Baselines3; `module:function` of somebody's code (`python_policy.py`);
-            `random`, `resting`; or '' for the shipped actor of `task`.
+            `random`, `resting`; '' for the shipped actor of `task`, `robust` for its robust one.
         task: Refuse a policy of any other task. Needed where the name does not tell.
         trust: Whether code may be run: a .zip of Stable-Baselines3 holds some, a function is some.
 
@@ -67,7 +68,10 @@ def load_policy(
     if is_python_name(name) and not Path(name).exists():
         loaded = _made_by(name, task, trust)
     else:
-        path = actor_path(name, (RANDOM, RESTING)) if name else _shipped(task)
+        if name in ('', ROBUST):
+            path = _shipped(task, name)
+        else:
+            path = actor_path(name, (RANDOM, RESTING, ROBUST))
         loaded = _read(path, task, trust)
     _try_out(loaded, task_spec(loaded.task))
     return loaded
@@ -79,15 +83,17 @@ def _untrained(name: str, task: str | None) -> LoadedPolicy:
     return LoadedPolicy(policy, _require_task(name, task), f'a {name} policy')
 
 
-def _shipped(task: str | None) -> Path:
-    shipped = shipped_actors()
-    task = _require_task('the shipped actor', task)
-    if task not in shipped:
+def _shipped(task: str | None, kind: str) -> Path:
+    """Return the shipped policy of a task: the usual one (kind ''), or the robust one."""
+    what, ending = (f'{kind} actor', f'_{kind}') if kind else ('actor', '')
+    task, shipped = _require_task(f'the shipped {what}', task), shipped_actors()
+    if f'{task}{ending}' not in shipped:
+        names = [name for name in shipped if name.endswith(ending)]
         raise ValueError(
-            f'no actor is shipped for {task} (shipped: {", ".join(shipped) or "none"}); '
+            f'no {what} is shipped for {task} (shipped: {", ".join(names) or "none"}); '
             f'give a policy: a file, {RANDOM!r} or {RESTING!r}'
         )
-    return shipped[task]
+    return shipped[f'{task}{ending}']
 
 
 def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:

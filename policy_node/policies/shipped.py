@@ -48,7 +48,7 @@ def actor_path(name_or_path: str | Path, besides: Sequence[str] = ()) -> Path:
     if path.suffix in _ENDINGS:
         raise ValueError(f'no actor {str(path)!r}: there is no such file{reason}')
     names = ', '.join(shipped) or 'none'
-    others = f', {" or ".join(map(repr, besides))}' if besides else ''
+    others = f', {", ".join(map(repr, besides[:-1]))} or {besides[-1]!r}' if besides else ''
     hint = did_you_mean(str(name_or_path), [*shipped, *besides])
     raise ValueError(
         f'no actor {str(name_or_path)!r}{reason}; shipped: {names}; '

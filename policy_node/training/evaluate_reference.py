@@ -71,8 +71,9 @@ def success_in_reference(
             env = gymnasium.make(reference_id)
         observation, _ = env.reset(seed=seed)
         info: dict[str, Any] = {}
+        state = None
         for _ in range(ticks):
-            action, _ = policy.predict(observation, deterministic=True)
+            action, state = policy.predict(observation, state, deterministic=True)
             observation, _, _, _, info = env.step(action)
         successes += bool(info['is_success'])
     env.close()

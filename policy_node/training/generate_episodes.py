@@ -71,12 +71,21 @@ def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simul
     context.checkpoint_sha256 = loaded.sha256 or None
     policy = CheckedPolicy(loaded, is_clipped=True)
 
-    def act(observation: Observation) -> NDArray[Any]:
-        return policy.predict(observation)[0]
-
     random = loaded.policy if isinstance(loaded.policy, RandomPolicy) else None
-    on_start = random.start if random else None
-    return EpisodeGenerator(simulation, options.output, act, context, on_start), simulation
+    state: Any = None
+
+    def act(observation: Observation) -> NDArray[Any]:
+        nonlocal state
+        action, state = policy.predict(observation, state)
+        return action
+
+    def start(seeds: Sequence[int]) -> None:
+        nonlocal state
+        state = None
+        if random is not None:
+            random.start(seeds)
+
+    return EpisodeGenerator(simulation, options.output, act, context, start), simulation
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -53,7 +53,7 @@ def logged_run(start: Start, directory: Path, **parameters: object):
 
 
 def batch_run(
-    spec: TaskSpec, episodes: int, disturbances: str = 'none'
+    spec: TaskSpec, episodes: int, disturbances: str = 'none', policy: str = ''
 ) -> list[dict[str, list[bytes]]]:
     """The same without ROS: bytes by topic for each episode."""
     simulation = Simulation(spec.name, num_threads=1, disturbances=disturbances)
@@ -61,7 +61,7 @@ def batch_run(
     encoder, buffer = TickEncoder(spec), CommandBuffer(spec.robot, 0.0)
     status = runner.waiting_status()
     sent: list[bytes] = []
-    commander = Commander(load_policy('', status.task), status.control_hz)
+    commander = Commander(load_policy(policy, status.task), status.control_hz)
     responder = Responder(commander, status, lambda data: sent.append(data) or True)
     result: list[dict[str, list[bytes]]] = []
     while not runner.is_done:
@@ -72,6 +72,7 @@ def batch_run(
             result.append({})
         for source, data in messages:
             result[-1].setdefault('/' + source.name.lstrip('/'), []).append(data)
+        responder.note_phase(tick.status.phase, tick.stamp_ns)
         published = {source.name: data for source, data in messages}
         for source in responder.topics:
             responder.receive(source.name, published[source.name])
@@ -112,12 +113,13 @@ def test_bytes_are_equal_between_runs_in_real_time_and_without_ros(
 def test_a_disturbed_episode_is_the_same_over_ros_in_the_batch_and_in_its_check(
     start_process: Start, tmp_path: Path
 ) -> None:
-    policy = start_process(*POLICY_NODE)
+    policy = start_process(*POLICY_NODE, *ros_args(policy='robust'))
     logged = logged_run(
         start_process, tmp_path, mode='lockstep', episodes=2, disturbances='hardware'
     )
     end(policy)
-    assert [without_times(each) for each in logged] == batch_run(REACH, 2, 'hardware')
+    batch = batch_run(REACH, 2, 'hardware', 'FetchReach_robust')
+    assert [without_times(each) for each in logged] == batch
     assert logged[0]['/ground_truth/joint_states'] != logged[0]['/joint_states']
     for path in tmp_path.iterdir():
         assert EpisodeChecker().check(path).difference is None

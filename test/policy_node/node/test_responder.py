@@ -435,3 +435,29 @@ def test_robots_of_other_namespaces_are_named_where_there_is_none():
         'no robot here: there is one in /arm1, /arm2; join it with --ros-args -r __ns:=/arm1'
     )
     assert health.news(report) and not health.news(health.report(6.0, 0, elsewhere=['/arm1']))
+
+
+@pytest.mark.parametrize('status_first', [True, False])
+def test_a_policy_forgets_at_the_borders_of_episodes(status_first: bool) -> None:
+    """The memory after the first tick of an episode holds that tick alone, in any order."""
+    runner = EpisodeRunner(Simulation('FetchReach', num_threads=1))
+    encoder, commander = TickEncoder(REACH), Commander(load_policy('FetchReach_robust'), 25.0)
+    responder = Responder(commander, runner.waiting_status(), Wire())
+
+    def play(phase_is_told: bool) -> None:
+        tick = runner.advance(np.full(4, 0.1))
+        messages = {spec.name: data for spec, data in encoder.encode(tick)}
+        if phase_is_told and status_first:
+            responder.note_phase(tick.status.phase, tick.stamp_ns)
+        feed(responder, messages)
+        if phase_is_told and not status_first:
+            responder.note_phase(tick.status.phase, tick.stamp_ns)
+
+    for _ in range(5):
+        play(phase_is_told=True)
+    assert np.count_nonzero(commander._state) == 12
+    runner.end_episode()
+    play(phase_is_told=True)
+    assert np.count_nonzero(commander._state) == 4
+    play(phase_is_told=True)
+    assert np.count_nonzero(commander._state) == 8

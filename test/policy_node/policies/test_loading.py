@@ -133,8 +133,11 @@ def test_no_name_is_the_shipped_actor_of_the_task(monkeypatch: pytest.MonkeyPatc
     # A task of another package has none.
     others = {task: path for task, path in shipped_actors().items() if task != 'HandReach'}
     monkeypatch.setattr(loading, 'shipped_actors', lambda: others)
+    assert load_policy('robust', 'FetchReach').description == 'actor FetchReach_robust.safetensors'
     with pytest.raises(ValueError, match=r'no actor is shipped for HandReach .*FetchReach'):
         load_policy('', 'HandReach')
+    with pytest.raises(ValueError, match=r'no robust actor is shipped for HandReach .*FetchReach'):
+        load_policy('robust', 'HandReach')
 
 
 @pytest.mark.parametrize('name', ['random', 'resting', ''])
@@ -152,7 +155,9 @@ def test_a_file_in_the_home_directory_is_found_there(
 
 
 def test_unknown_and_unfitting_names_are_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"no actor 'zzz'; shipped: .*, 'random' or 'resting'$"):
+    with pytest.raises(
+        ValueError, match=r"no actor 'zzz'; shipped: .*, 'random', 'resting' or 'robust'$"
+    ):
         load_policy('zzz', 'FetchReach')
     for mistyped, meant in {'rnd': 'random', 'fetchreach': 'FetchReach'}.items():
         with pytest.raises(ValueError, match=rf"'resting'; did you mean '{meant}'\?$"):
