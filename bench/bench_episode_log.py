@@ -26,8 +26,7 @@ import numpy as np  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from fetch_hand_sim.episodes.context import RecordingContext  # noqa: E402
-from fetch_hand_sim.episodes.recorder import EpisodeRecorder  # noqa: E402
+from fetch_hand_sim.episodes.recorder import EpisodeRecorder, RecordingContext  # noqa: E402
 from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
 from msgs_spec.cdr import TopicCodec  # noqa: E402

@@ -29,8 +29,8 @@ from rich.table import Table  # noqa: E402
 from rosbags.highlevel import AnyReader  # noqa: E402
 
 from fetch_hand_sim.episode_log import load_episodes, read_summary  # noqa: E402
-from fetch_hand_sim.episodes.context import RecordingContext  # noqa: E402
 from fetch_hand_sim.episodes.generator import EpisodeGenerator  # noqa: E402
+from fetch_hand_sim.episodes.recorder import RecordingContext  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
 from msgs_spec.codecs import decode  # noqa: E402
 from msgs_spec.observations import ObservationAssembler  # noqa: E402

@@ -23,8 +23,7 @@ from fetch_hand_sim.episode_log import (
 from fetch_hand_sim.episode_log.bag import offered_qos_text
 from fetch_hand_sim.episode_log.model import former_model_sha256, mjcf_attachment, model_sha256
 from fetch_hand_sim.episode_log.reader import LoggedTick, logged_topics, split_ticks
-from fetch_hand_sim.episodes.goals import accept_goal
-from fetch_hand_sim.episodes.perturbations import accept_perturbation
+from fetch_hand_sim.episodes.inputs import accept_goal, accept_perturbation
 from fetch_hand_sim.episodes.recorder import episode_result
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation

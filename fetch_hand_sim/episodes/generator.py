@@ -17,10 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeLogError, EpisodeWriter
-from fetch_hand_sim.episodes.context import RecordingContext
-from fetch_hand_sim.episodes.recorder import DIVERGED, LoggedEpisode, episode_result
-from fetch_hand_sim.episodes.robot_episode import RobotEpisode, sense
-from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS
+from fetch_hand_sim.episodes.recorder import (
+    DIVERGED,
+    LoggedEpisode,
+    RecordingContext,
+    episode_result,
+)
+from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS, RobotEpisode, sense
 from fetch_hand_sim.simulation import Observation, Simulation
 from msgs_spec.actions import clip_command, command_from_action
 from msgs_spec.arrays import Array

@@ -1,9 +1,9 @@
-"""Logs the ticks of a running robot, episode by episode, without holding the robot up.
+"""Log the ticks of a running robot, episode by episode, without delaying the robot.
 
-A tick puts its messages into a queue; one thread writes them, and another waits for the disk where
-a finished file has to. A killed robot loses what the operating system had not got yet. That is a
-quarter of a second of wall time at most, however fast the robot runs: one that is faster than its
-disk waits. A disk that fails stops logging, never the robot.
+A tick puts its messages into a queue. One thread writes them; another waits for the disk, which a
+finished file has to. A killed robot loses the messages that the operating system does not have yet:
+a quarter of a second of wall-clock time at most, at every rate, because a robot that is faster than
+its disk waits. A disk that fails stops logging, never the robot.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from queue import Queue
+from queue import Empty, Queue
 from threading import Semaphore, Thread
 
 from fetch_hand_sim.episode_log import (
@@ -22,29 +23,89 @@ from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeOutcome,
     EpisodeWriter,
+    episode_metadata,
 )
-from fetch_hand_sim.episodes.backlog import Backlog, StalledError
+from fetch_hand_sim.episode_log.model import compiled_attachment, mjcf_attachment, model_sha256
+from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tick import EpisodeStatus, Tick
 from msgs_spec.topics import TopicSpec
+from node_runtime.source_revision import source_revision
 
 Messages = Sequence[tuple[TopicSpec, bytes]]
+Task = Callable[[], None]
 
 # Seconds after which the oldest message is handed to the operating system, where simulated time
 # does not lead to that: a robot that is paused, waits for commands or is slow.
 _FLUSH_AFTER = 0.18
-# Files that may wait for the disk to have them for good; the operating system has them.
+# Seconds that a message may wait for that before the robot waits for the disk.
+_LONGEST_WAIT = 0.2
+# Seconds without progress after which the disk counts as failed, and between two looks at it.
+_STALL = 5.0
+_LOOK_AFTER = 0.002
+# Finished files that may wait for the disk; the operating system has them.
 _MAX_UNSTORED = 16
-# Seconds of waiting that are worth a line, and seconds between two lines.
+# Seconds of waiting that are reported, and seconds between two reports.
 _SLOW = 0.1
 _SLOW_PERIOD = 10.0
-# Seconds between two looks at whether anybody still waits for the disk at the end, and seconds
-# after which it is said that this is what is waited for.
-_LOOK_AFTER = 0.1
+# At the end: seconds between two looks at `gives_up`, seconds after which the wait is reported, and
+# seconds that a failed disk may delay the end.
+_ASK_AFTER = 0.1
 _PATIENCE = 3.0
-# Seconds that a disk which has failed may still hold up the end.
 _LAST_CHANCE = 5.0
-# Why an episode was cut short that MuJoCo gave up.
+# End reason of an episode whose simulation diverged.
 DIVERGED = 'diverged'
+
+
+class RecordingContext:
+    """Makes metadata and attachments for the episodes of one simulation.
+
+    Args:
+        simulation: The simulation whose episodes are logged.
+        with_compiled_model: Whether to store the compiled model with its meshes, 3 MB per episode;
+            its MJCF text is always stored.
+        perturb_limit: Largest force of a push, N.
+
+    Attributes:
+        attachments: The model, stored with every episode.
+        checkpoint_sha256: Fingerprint of the actor that commands the robot, if known.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        *,
+        with_compiled_model: bool = True,
+        perturb_limit: float = 0.0,
+    ) -> None:
+        self._simulation = simulation
+        self._perturb_limit = perturb_limit
+        self._model_sha256 = model_sha256(simulation.model)
+        # Starts a process, which would delay a running robot.
+        self._source_revision = source_revision()
+        self.attachments: list[Attachment] = [mjcf_attachment(simulation.asset)]
+        if with_compiled_model:
+            self.attachments.append(compiled_attachment(simulation.model))
+        self.checkpoint_sha256: str | None = None
+
+    def metadata(self, status: EpisodeStatus) -> dict[str, str]:
+        """Return the metadata record `episode` for an episode with this first status."""
+        return episode_metadata(
+            self._simulation.spec.with_joint_prefix(status.joint_prefix),
+            episode=status.episode,
+            seed=status.seed,
+            reward_type=status.reward_type,
+            success_rule=status.success_rule,
+            control_hz=status.control_hz,
+            timing=self._simulation.timing,
+            joint_prefix=status.joint_prefix,
+            model_sha256=self._model_sha256,
+            source_revision=self._source_revision,
+            checkpoint_sha256=self.checkpoint_sha256,
+            perturb_limit=self._perturb_limit,
+            disturbances=status.disturbances,
+            variation=status.variation,
+            started=datetime.now(UTC).isoformat(timespec='milliseconds'),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +113,7 @@ class LoggedEpisode:
     """A completed file.
 
     Attributes:
-        status: Of the last tick.
+        status: Status of the last tick.
         path: The bag directory.
         is_complete: Whether the episode ran to its end.
     """
@@ -73,11 +134,11 @@ class EpisodeRecorder:
             recorded.
         on_error: Called once, with one line, when the disk fails, by any thread.
         on_logged: Called for every completed file, by a thread of its own.
-        on_slow: Called with one line when the robot has to wait for the disk, now and then.
+        on_slow: Called with one line, now and then, when the robot has to wait for the disk.
 
     Attributes:
-        has_failed: Whether the disk failed, so that nothing more is logged.
-        waited_s: Seconds the robot has waited for the disk.
+        has_failed: Whether the disk failed, so that logging has stopped.
+        waited_s: Seconds that the robot has waited for the disk.
     """
 
     def __init__(
@@ -93,210 +154,211 @@ class EpisodeRecorder:
     ) -> None:
         self.has_failed = False
         self.waited_s = 0.0
-        self._untold = Semaphore(1)
+        self._unreported = Semaphore(1)
         self._metadata = metadata
         self._on_error = on_error
+        self._on_logged = on_logged
         self._on_slow = on_slow
-        self._waited_said_s = self._say_after = 0.0
+        self._reported_s = self._report_after = 0.0
         self._status: EpisodeStatus | None = None
-        # What the writing thread is to do, in order.
-        self._backlog: Backlog[Callable[[], None]] = Backlog()
-        self._files = _EpisodeFiles(
-            EpisodeDirectory(directory, namespace=namespace),
-            attachments,
-            self._fail,
-            on_logged,
-        )
-        self._thread = Thread(target=self._write, name='episode_log', daemon=True)
-        self._thread.start()
+        # Used by the writing thread alone.
+        self._episodes = EpisodeDirectory(directory, namespace=namespace)
+        self._attachments = attachments
+        self._writer: EpisodeWriter | None = None
+        # Time of the oldest message that was taken from the queue and is not flushed.
+        self._unflushed_since: float | None = None
+        self._tasks_done = 0
+        self._tasks: Queue[tuple[float, Task] | None] = Queue()
+        self._unstored: Queue[Task | None] = Queue(_MAX_UNSTORED)
+        # Daemons: a disk that never answers must not delay the end of the process.
+        self._threads = [
+            Thread(target=self._run, args=(loop,), name=name, daemon=True)
+            for loop, name in (
+                (self._write_all, 'episode_log'),
+                (self._store_all, 'episode_store'),
+            )
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def record(self, tick: Tick, messages: Messages) -> None:
-        """Logs a tick: a reset begins a file, a finished episode completes it."""
+        """Log a tick: a reset begins a file, a finished episode completes it."""
         if tick.status.phase == 'reset':
             self._end('reset before the end')
             if not self.has_failed:
-                metadata = self._metadata(tick.status)
-                self._put(partial(self._files.begin, tick.status, metadata))
+                self._put(partial(self._begin, tick.status, self._metadata(tick.status)))
                 self._status = tick.status
         if self._status is None:
             return
-        self._put(partial(self._files.write_tick, tick.stamp_ns, messages))
+        self._put(partial(self._write_tick, tick.stamp_ns, messages))
         self._status = tick.status
         if tick.status.phase == 'finished':
             self._end(DIVERGED if tick.has_diverged else None)
 
     def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> None:
-        """Logs a message received since the last tick; between episodes there is no file."""
+        """Log a message received since the last tick; between episodes it belongs to no file."""
         if self._status is not None:
-            self._put(partial(self._files.write_received, topic, data, is_refused))
+            self._put(partial(self._write_received, topic, data, is_refused))
 
     def close(self, reason: str, gives_up: Callable[[], bool] = lambda: False) -> None:
-        """Completes everything, also what is still being completed.
+        """Complete all files and wait for the disk.
 
         Args:
-            reason: What cuts the running episode short, if there is one.
-            gives_up: Asked now and then while the disk takes its time: whether to leave what it
-                has not taken, which `fetch_hand_sim episodes recover` completes.
+            reason: Why the running episode, if any, is cut short.
+            gives_up: Called while the disk takes its time. Once it returns True, the files that
+                the disk does not have are left for `fetch_hand_sim episodes recover`.
         """
         self._end(reason)
-        self._backlog.close()
-        began = time.monotonic()
-        self._await(self._thread, gives_up, began)
-        self._files.finish()
-        self._await(self._files.storing, gives_up, began)
+        self._tasks.put(None)
+        began, is_reported = time.monotonic(), False
+        for thread in self._threads:
+            while thread.is_alive() and not self.has_failed:
+                thread.join(_ASK_AFTER)
+                if thread.is_alive() and gives_up():
+                    self._fail('episode log stopped: the disk was not waited for any more')
+                elif not is_reported and time.monotonic() - began > _PATIENCE:
+                    is_reported = True
+                    self._on_slow('waiting for the disk; another signal (Ctrl-C) gives up')
+            if self.has_failed:
+                thread.join(_LAST_CHANCE)
 
-    def _await(self, thread: Thread, gives_up: Callable[[], bool], began: float) -> None:
-        """Waits for the end of a thread that a disk may hold up, also for ever."""
-        has_said = False
-        while thread.is_alive() and not self.has_failed:
-            thread.join(_LOOK_AFTER)
-            if thread.is_alive() and gives_up():
-                self._fail('episode log stopped: the disk was not waited for any more')
-            elif not has_said and time.monotonic() - began > _PATIENCE:
-                has_said = True
-                self._on_slow('waiting for the disk; another signal (Ctrl-C) gives up')
-        if self.has_failed:
-            thread.join(_LAST_CHANCE)
+    # The robot's thread
 
     def _end(self, reason: str | None) -> None:
-        """Completes the running episode, if there is one; with a reason, marked as cut short."""
+        """Complete the running episode, if any; with a reason, marked as cut short."""
         status, self._status = self._status, None
         if status is not None:
-            self._put(partial(self._files.end, status, reason))
+            self._put(partial(self._finish, status, reason))
 
-    def _put(self, write: Callable[[], None]) -> None:
-        """Queues what is to be written; a robot that is faster than its disk waits here."""
+    def _put(self, task: Task) -> None:
+        """Queue a task; a robot that is faster than its disk waits here."""
         if self.has_failed:
             return
-        try:
-            waited = self._backlog.put(write)
-        except StalledError as error:
-            self._fail(f'episode log stopped: {error}')
-            return
-        if waited > 0.0:
-            self.waited_s += waited
-            self._say_slow(time.monotonic())
+        began = now = progressed = time.monotonic()
+        done = self._tasks_done
+        while not self.has_failed and now - self._oldest(now) > _LONGEST_WAIT:
+            time.sleep(_LOOK_AFTER)
+            now = time.monotonic()
+            if done != self._tasks_done:
+                done, progressed = self._tasks_done, now
+            if now - progressed > _STALL:
+                self._fail(f'episode log stopped: the disk took nothing for {_STALL:g} s')
+        self._tasks.put((now, task))
+        if now > began:
+            self.waited_s += now - began
+            self._report_slow(now)
 
-    def _say_slow(self, now: float) -> None:
-        if self.waited_s - self._waited_said_s > _SLOW and now >= self._say_after:
-            self._waited_said_s = self.waited_s
-            self._say_after = now + _SLOW_PERIOD
+    def _oldest(self, now: float) -> float:
+        """Return the time of the oldest message that the operating system does not have."""
+        since = self._unflushed_since
+        if since is not None:
+            return since
+        try:
+            head = self._tasks.queue[0]
+        except IndexError:
+            return now
+        return now if head is None else head[0]
+
+    def _report_slow(self, now: float) -> None:
+        if self.waited_s - self._reported_s > _SLOW and now >= self._report_after:
+            self._reported_s = self.waited_s
+            self._report_after = now + _SLOW_PERIOD
             self._on_slow(
                 f'the disk is slower than the robot, which waits for it: {self.waited_s:.1f} s '
                 'so far'
             )
 
+    # Any thread
+
     def _fail(self, line: str) -> None:
-        # First of all: what is put into the backlog after it was cleared is not waited for.
         self.has_failed = True
         self._status = None
-        self._backlog.clear()
-        if self._untold.acquire(blocking=False):
+        if self._unreported.acquire(blocking=False):
             self._on_error(line)
 
-    def _write(self) -> None:
-        """Writes what is queued until the recorder is closed; runs in a thread of its own."""
+    def _run(self, loop: Task) -> None:
         try:
-            while not self._backlog.is_done:
-                write = self._backlog.take(_FLUSH_AFTER) or self._files.flush
-                if not self.has_failed:
-                    self._try(write)
-                if self.has_failed or not self._files.has_unflushed:
-                    self._backlog.note_saved()
+            loop()
         except BaseException:
             self._fail('episode log stopped: an error in the program')
             raise
 
-    def _try(self, write: Callable[[], None]) -> None:
+    # The writing thread
+
+    def _write_all(self) -> None:
+        """Run the queued tasks until the recorder is closed."""
         try:
-            write()
-        except EpisodeLogError as error:
-            self._fail(str(error))
+            while self._run_next():
+                pass
+        finally:
+            self._unstored.put(None)
 
+    def _run_next(self) -> bool:
+        """Run the next task, or flush where that is due; return False at the end."""
+        task: Task | None = self._flush
+        try:
+            entry = self._tasks.get(timeout=self._time_to_flush())
+        except Empty:
+            pass
+        else:
+            since, task = entry or (None, None)
+            if self._unflushed_since is None:
+                self._unflushed_since = since
+        if task is not None and not self.has_failed:
+            try:
+                task()
+            except EpisodeLogError as error:
+                self._fail(str(error))
+        self._tasks_done += 1
+        if self.has_failed or self._writer is None or not self._writer.has_unflushed:
+            self._unflushed_since = None
+        return task is not None
 
-class _EpisodeFiles:
-    """The file in progress, and those that wait for the disk; used by one thread.
+    def _time_to_flush(self) -> float | None:
+        if self._unflushed_since is None:
+            return None
+        return max(0.0, self._unflushed_since + _FLUSH_AFTER - time.monotonic())
 
-    Methods that write raise `EpisodeLogError` at the first error of the disk.
-    """
-
-    def __init__(
-        self,
-        episodes: EpisodeDirectory,
-        attachments: Sequence[Attachment],
-        on_error: Callable[[str], None],
-        on_logged: Callable[[LoggedEpisode], None],
-    ) -> None:
-        self._episodes = episodes
-        self._attachments = attachments
-        self._on_error = on_error
-        self._on_logged = on_logged
-        self._writer: EpisodeWriter | None = None
-        # A thread that a disk holds up for ever must not hold up the end of the process.
-        self._unstored: Queue[Callable[[], None] | None] = Queue()
-        self._room = Semaphore(_MAX_UNSTORED)
-        self.storing = Thread(target=self._store_all, name='episode_store', daemon=True)
-        self.storing.start()
-
-    @property
-    def has_unflushed(self) -> bool:
-        """Whether something was written that the operating system does not have yet."""
-        return self._writer is not None and self._writer.has_unflushed
-
-    def flush(self) -> None:
-        """Hands what was written to the operating system."""
+    def _flush(self) -> None:
         if self._writer is not None:
             self._writer.flush()
 
-    def begin(self, status: EpisodeStatus, metadata: Mapping[str, str]) -> None:
-        """Begins the file of an episode with this first status."""
-        self._room.acquire()
+    def _begin(self, status: EpisodeStatus, metadata: Mapping[str, str]) -> None:
         self._writer = self._episodes.begin(status.task, status.seed, metadata, self._attachments)
 
-    def write_tick(self, stamp_ns: int, messages: Messages) -> None:
-        """Writes the messages of a tick."""
+    def _write_tick(self, stamp_ns: int, messages: Messages) -> None:
         if self._writer is not None:
             self._writer.write_tick(stamp_ns, messages)
 
-    def write_received(self, topic: TopicSpec, data: bytes, is_refused: bool) -> None:
-        """Writes a message that the robot received."""
+    def _write_received(self, topic: TopicSpec, data: bytes, is_refused: bool) -> None:
         if self._writer is not None:
             self._writer.write_received(topic, data, is_refused=is_refused)
 
-    def end(self, status: EpisodeStatus, reason: str | None) -> None:
-        """Ends the file of an episode with this last status; a reason if it was cut short."""
+    def _finish(self, status: EpisodeStatus, reason: str | None) -> None:
         if self._writer is not None:
             writer, self._writer = self._writer, None
             writer.end(episode_result(status), reason)
             self._unstored.put(partial(self._store, writer, status, reason is None))
 
-    def finish(self) -> None:
-        """Nothing more comes: `storing` ends once all files are on the disk."""
-        self._unstored.put(None)
+    # The storing thread
 
     def _store_all(self) -> None:
-        """Stores files until there are no more; runs in a thread of its own."""
-        try:
-            while (store := self._unstored.get()) is not None:
-                store()
-        except BaseException:
-            self._on_error('episode log stopped: an error in the program')
-            raise
+        """Bring finished files to the disk until the recorder is closed."""
+        while (store := self._unstored.get()) is not None:
+            store()
 
     def _store(self, writer: EpisodeWriter, status: EpisodeStatus, is_complete: bool) -> None:
         try:
             path = writer.store()
         except EpisodeLogError as error:
-            self._on_error(str(error))
+            self._fail(str(error))
         else:
             if path is not None:
                 self._on_logged(LoggedEpisode(status, path, is_complete))
-        finally:
-            self._room.release()
 
 
 def episode_result(status: EpisodeStatus) -> dict[str, str]:
-    """What the metadata record `episode_result` says of an episode, from its last status."""
+    """Return the metadata record `episode_result` of an episode with this last status."""
     return EpisodeOutcome(
         steps=status.tick,
         episode_return=status.episode_return,

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from fetch_hand_sim.episodes.robot_episode import has_ended
+from fetch_hand_sim.episodes.runner import has_ended
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures, check_render_mode, render_fps
 from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
 from fetch_hand_sim.gym_envs.task_attributes import (

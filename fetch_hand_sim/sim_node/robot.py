@@ -8,8 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from fetch_hand_sim.episodes.goals import accept_goal
-from fetch_hand_sim.episodes.perturbations import accept_perturbation
+from fetch_hand_sim.episodes.inputs import accept_goal, accept_perturbation
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.schedule import TickSchedule

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.episode_log import EpisodeLogError
 from fetch_hand_sim.episode_log.writer import named_seeds
-from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
+from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.simulation import Observation, Simulation
 from msgs_spec.parameters import LARGEST_SEED
 from node_runtime.command_line import (

@@ -23,8 +23,8 @@ import yaml
 from test_architecture import pages
 
 from fetch_hand_sim.__main__ import main as fetch_hand_sim
-from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
+from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.parameters import NODES, validate
 from msgs_spec.services import SERVICES

@@ -22,8 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fetch_hand_sim.episodes.context import RecordingContext
-from fetch_hand_sim.episodes.recorder import EpisodeRecorder
+from fetch_hand_sim.episodes.recorder import EpisodeRecorder, RecordingContext
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tick import TickEncoder

@@ -29,8 +29,8 @@ from fetch_hand_sim.episode_log.model import former_model_sha256, model_sha256
 from fetch_hand_sim.episode_log.reader import split_ticks
 from fetch_hand_sim.episodes import checker
 from fetch_hand_sim.episodes.checker import EpisodeChecker
-from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
+from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.actions import action_from_command
 from msgs_spec.cdr import LayoutError, TopicCodec

@@ -9,8 +9,8 @@ import pytest
 
 from fetch_hand_sim.episode_log import EpisodeWriter
 from fetch_hand_sim.episode_log.arrays import load_episode
-from fetch_hand_sim.episodes.context import RecordingContext
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
+from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.simulation import Simulation
 
 ROBOTS = 2

@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from fetch_hand_sim.episode_log import (
     read_episode,
 )
 from fetch_hand_sim.episodes import recorder as recorder_module
-from fetch_hand_sim.episodes.backlog import Backlog
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder, Messages, episode_result
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
@@ -189,7 +187,7 @@ def test_a_disk_that_takes_nothing_any_more_stops_the_log(
 ) -> None:
     stuck = threading.Event()
     monkeypatch.setattr(EpisodeWriter, 'write_tick', lambda *_: stuck.wait(20.0))
-    monkeypatch.setattr(recorder_module, 'Backlog', partial(Backlog, stall=0.3))
+    monkeypatch.setattr(recorder_module, '_STALL', 0.3)
     monkeypatch.setattr(recorder_module, '_LAST_CHANCE', 0.1)
     errors, longest = record(tmp_path / 'recorder', ticks, pause=0.01)
     stuck.set()
@@ -268,7 +266,7 @@ def test_a_recorder_that_has_failed_idles(
     for tick in (*ticks, ticks[0]):
         recorder.record(*tick)
     until(lambda: bool(errors))
-    recorder._backlog.put(lambda: None)
+    recorder._tasks.put((time.monotonic(), lambda: None))
     began = time.process_time()
     time.sleep(0.5)
     assert time.process_time() - began < 0.25

@@ -10,7 +10,7 @@ import pytest
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
 from fetch_hand_sim.episodes.checker import EpisodeChecker
-from fetch_hand_sim.episodes.context import RecordingContext
+from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.robots import FINGERTIPS
