@@ -1,7 +1,7 @@
-"""Logged episodes as a LeRobot dataset, format 3.0: what imitation learning on robots reads.
+"""Write logged episodes as a LeRobot dataset, format 3.0, for imitation learning.
 
-Needs pyarrow (the extra `[data]`), not lerobot itself, whose pins exclude other packages' torch.
-Files are those of `LeRobotDataset.create` and `save_episode` in lerobot 0.4.4.
+Needs pyarrow (the extra `[data]`), not lerobot itself, whose pins exclude other versions of torch.
+Files equal those of `LeRobotDataset.create` and `save_episode` in lerobot 0.4.4.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from msgs_spec.tasks import TaskSpec
 
 _VERSION = 'v3.0'
 _FILES_PER_CHUNK = 1000
-# Uncompressed, as `meta/info.json` says; films are not measured.
+# Uncompressed, as `meta/info.json` records; films are not measured.
 _FILE_MEGABYTES, _FILM_MEGABYTES = 100, 200
 _FILE = 'chunk-{chunk_index:03d}/file-{file_index:03d}'
 _DATA, _FILM = f'data/{_FILE}.parquet', f'videos/{{video_key}}/{_FILE}.mp4'
@@ -44,20 +44,19 @@ Row = dict[str, Any]
 def export_lerobot(
     by_task: ByTask, directory: Path, camera: Camera | None = None
 ) -> dict[str, Path]:
-    """Writes the episodes of each task as a dataset, N frames an episode, all of them or none.
+    """Write the episodes of each task as a dataset, N frames an episode, all of them or none.
 
-    A frame is `observation.state`, what is observed of the robot; `observation.environment_state`,
-    what is observed of the object, then the desired goal; `action`; and what came of it,
-    `next.reward`, `next.success` and `next.done`. All float32, as LeRobot's policies take them.
+    A frame has `observation.state` (the robot), `observation.environment_state` (the object, then
+    the desired goal), `action`, and its results `next.reward`, `next.success` and `next.done`. All
+    are float32, as LeRobot's policies expect.
 
     Args:
-        by_task: Episodes, at least one of each task, each with a step, and none that is apart from
-            the first of its task, see `writing.why_apart`.
-        directory: Where to write.
-        camera: Whose films are part of it; None for none.
+        by_task: Episodes, at least one of each task, each with a step and the settings of the first
+            of its task, see `writing.why_apart`.
+        camera: Camera of the films; None for no films.
 
     Returns:
-        Each task's dataset, `directory/<task>`: `LeRobotDataset('me/<task>', root=...)`.
+        The dataset of each task, `directory/<task>`, for `LeRobotDataset('me/<task>', root=...)`.
 
     Raises:
         ExportError: If pyarrow is missing, or a dataset exists or cannot be written; none is
@@ -115,7 +114,7 @@ class _Dataset:
         self._write_json('meta/info.json', self._info(rows))
 
     def _row(self, columns: Columns, where: dict[str, int]) -> Row:
-        """What `meta/episodes` says of an episode."""
+        """Return the row of an episode in `meta/episodes`."""
         index = columns['index']
         return {
             'episode_index': int(columns['episode_index'][0]),
@@ -136,7 +135,7 @@ class _Dataset:
         rows: Sequence[Row],
         where: dict[str, int],
     ) -> list[Histogram]:
-        """Writes the film of some episodes and adds to their rows where it is."""
+        """Write the film of some episodes and add its place to their rows."""
         path = self._file(_FILM, video_key=camera.key, **where)
         colors = write_episodes(path, episodes, camera, self.rate)
         begins = accumulate((row['length'] for row in rows), initial=0)
@@ -190,7 +189,7 @@ class _Dataset:
 
 
 def _files(episodes: Sequence[Columns]) -> Iterator[list[Columns]]:
-    """The episodes, file by file."""
+    """Yield the episodes of each file."""
     group: list[Columns] = []
     size = 0
     for columns in episodes:
@@ -204,7 +203,7 @@ def _files(episodes: Sequence[Columns]) -> Iterator[list[Columns]]:
 
 
 def _column(values: NDArray[Any]) -> Any:
-    """Numbers, or vectors of fixed size; a vector of one number is that number."""
+    """Return a column of numbers, or of vectors of fixed size; (n, 1) becomes numbers."""
     pyarrow = require_module('pyarrow')
     flat = pyarrow.array(values.ravel())
     if values.ndim == 1 or values.shape[1] == 1:
@@ -213,7 +212,7 @@ def _column(values: NDArray[Any]) -> Any:
 
 
 def _flat(found: Row) -> Row:
-    """Statistics by column and kind as one row has them."""
+    """Return statistics by column and kind as the entries of one row."""
     return {
         f'stats/{name}/{kind}': value
         for name, kinds in found.items()
@@ -222,7 +221,7 @@ def _flat(found: Row) -> Row:
 
 
 def _tasks(spec: TaskSpec) -> Any:
-    """The one task; pandas reads the names as the index of the table."""
+    """Return the table of the one task; pandas reads the names as its index."""
     names = '__index_level_0__'
     number = {'pandas_type': 'int64', 'numpy_type': 'int64', 'metadata': None}
     name = {'pandas_type': 'unicode', 'numpy_type': 'object', 'metadata': None}

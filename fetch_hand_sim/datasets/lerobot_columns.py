@@ -1,4 +1,4 @@
-"""The columns of a LeRobot dataset: what a frame holds, and what policies normalise it with.
+"""The columns of a LeRobot dataset, and their statistics for normalisation.
 
 Names and types are those of lerobot 0.4.4 (`lerobot/utils/constants.py`, `datasets/utils.py`).
 """
@@ -16,14 +16,14 @@ from msgs_spec.tasks import TaskSpec
 Columns = dict[str, NDArray[Any]]
 
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
-# How the names of observed parts begin that are no part of the robot.
+# Beginning of the names of observed parts that do not belong to the robot.
 _OBJECT = 'object'
-# What counts frames, in the episode and over the whole dataset.
+# Numbers of frames, episodes and tasks.
 _COUNTS = ('frame_index', 'episode_index', 'index', 'task_index')
 
 
 def features(spec: TaskSpec) -> dict[str, dict[str, Any]]:
-    """The columns of a task's dataset as `meta/info.json` has them: type, shape, names."""
+    """Return type, shape and names of the columns, as in `meta/info.json`."""
     robot, rest = _parts(spec)
     goal = [f'desired_goal_{index}' for index in range(spec.goal.size)]
     return {
@@ -43,7 +43,7 @@ def _feature(dtype: str, names: list[str] | None = None) -> dict[str, Any]:
 
 
 def _parts(spec: TaskSpec) -> tuple[list[str], list[str]]:
-    """Names of the observed numbers of the robot, and of its object."""
+    """Return the names of the observed numbers of the robot, and of its object."""
     robot: list[str] = []
     rest: list[str] = []
     for part in spec.observation:
@@ -53,12 +53,11 @@ def _parts(spec: TaskSpec) -> tuple[list[str], list[str]]:
 
 
 def frames(episode: EpisodeArrays, episode_index: int, first_index: int) -> Columns:
-    """The columns of one episode's N frames, one per action.
+    """Return the columns of the N frames of an episode, one per action.
 
     Args:
-        episode: The episode.
-        episode_index: Which of the dataset it is.
-        first_index: How many frames come before it.
+        episode_index: Number of the episode in the dataset.
+        first_index: Number of frames before it.
     """
     spec, count = episode.spec, len(episode)
     seen = episode.observations['observation'][:count]
@@ -84,7 +83,7 @@ def frames(episode: EpisodeArrays, episode_index: int, first_index: int) -> Colu
 
 
 def statistics(values: NDArray[Any]) -> dict[str, Any]:
-    """What policies normalise with, of frames (n,) or (n, size); each a list."""
+    """Return the statistics of frames (n,) or (n, size) for normalisation; each is a list."""
     rows = values.reshape(len(values), -1)
     numbers = rows.astype(np.float64)
     return {
@@ -103,5 +102,5 @@ def statistics(values: NDArray[Any]) -> dict[str, Any]:
 
 
 def quantile_name(share: float) -> str:
-    """Name of a quantile, `q50`."""
+    """Return the name of a quantile, such as `q50`."""
     return f'q{round(100 * share):02d}'

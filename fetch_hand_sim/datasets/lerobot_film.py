@@ -1,4 +1,4 @@
-"""The films of a LeRobot dataset: every frame of its episodes, drawn from what was logged."""
+"""The films of a LeRobot dataset: every frame of its episodes, drawn from the log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fetch_hand_sim.films.studio import Studio
 from msgs_spec.arrays import Picture
 
 _LEVELS = 256
-# Pictures from one that can be shown without another to the next, as lerobot encodes them.
+# Pictures from one keyframe to the next, as lerobot encodes films.
 _KEYFRAME_EVERY = 2
 
 Histogram = NDArray[np.int64]
@@ -26,12 +26,12 @@ Histogram = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """What the films of a dataset show.
+    """The camera of the films of a dataset.
 
     Attributes:
-        width: Of pictures, pixels; even, as H.264 wants them.
-        height: Likewise.
-        name: Of the model's camera; None for the usual view.
+        width: Width of pictures, pixels; even, because of H.264.
+        height: Height, likewise.
+        name: Name of a camera of the model; None for the usual view.
     """
 
     width: int
@@ -40,11 +40,11 @@ class Camera:
 
     @property
     def key(self) -> str:
-        """Name of the column."""
+        """The name of the column."""
         return f'observation.images.{self.name or "scene"}'
 
     def feature(self, rate: float) -> dict[str, Any]:
-        """The column as `meta/info.json` has it, of films with so many pictures per second."""
+        """Return the column as in `meta/info.json`, for `rate` pictures per second."""
         return {
             'dtype': 'video',
             'shape': [self.height, self.width, 3],
@@ -65,15 +65,15 @@ class Camera:
 def write_episodes(
     path: Path, episodes: Sequence[EpisodeArrays], camera: Camera, rate: float
 ) -> list[Histogram]:
-    """Writes a film of the frames of episodes but their last, which no action follows.
+    """Write a film of all frames of episodes except the last of each, which has no action.
 
     Returns:
-        How often each level of each channel was drawn in each episode, (3, 256).
+        How often each level of each channel was drawn, (3, 256) for each episode.
 
     Raises:
-        ValueError: If the model has no such camera, or an episode cannot be read.
-        RuntimeError: If there is no OpenGL.
-        ValueError: If ffmpeg is missing.
+        ValueError: If the model has no such camera, an episode cannot be read, or ffmpeg is
+            missing.
+        RuntimeError: If OpenGL is missing.
         OSError: If the film cannot be written.
     """
     studio = Studio(camera.width, camera.height, camera.name)
@@ -99,11 +99,11 @@ def _counted(
 
 
 def color_statistics(histogram: Histogram, pixels: int) -> dict[str, Any]:
-    """What policies normalise with: levels in [0, 1], each (3, 1, 1).
+    """Return the statistics of pictures for normalisation: levels in [0, 1], each (3, 1, 1).
 
     Args:
         histogram: (3, 256) how often each level was drawn.
-        pixels: Of a picture.
+        pixels: Number of pixels of a picture.
     """
     levels = np.arange(_LEVELS) / (_LEVELS - 1)
     total = int(histogram[0].sum())

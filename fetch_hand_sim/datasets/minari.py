@@ -1,4 +1,4 @@
-"""Logged episodes as Minari datasets.
+"""Write logged episodes as Minari datasets.
 
 Needs the extra `[data]`. Values are those of `load_episodes`, float64, unchanged.
 """
@@ -37,18 +37,18 @@ from node_runtime.command_line import UsageError, progress
 # Parts of a dataset's id become directories.
 _DATASET_NAME = re.compile(r'[A-Za-z0-9][\w-]*(/[A-Za-z0-9][\w-]*)*', re.ASCII)
 _VERSION = re.compile(r'-v\d+$')
-# Minari's: where datasets live, and what is in the directories above one.
+# Variable with the folder of Minari's datasets, and the file in each folder above a dataset.
 _MINARI_PATH, _NAMESPACE = 'MINARI_DATASETS_PATH', 'namespace_metadata.json'
 
 
 def dataset_name(text: str) -> str:
-    """Returns the name of a dataset, with a version after it if it has none.
+    """Return the name of a dataset; without a version it gets `-v0`.
 
     Raises:
         UsageError: If it is not allowed.
     """
     *folders, _ = text.split('/')
-    # In a folder with a version is another dataset, and Minari finds none within it.
+    # A folder with a version is a dataset, and Minari finds no dataset within it.
     if not _DATASET_NAME.fullmatch(text) or any(map(_VERSION.search, folders)):
         raise UsageError(
             f'dataset name {text!r}; allowed: letters, digits, _ and -, parts separated by /, a '
@@ -58,14 +58,13 @@ def dataset_name(text: str) -> str:
 
 
 def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]:
-    """Writes the episodes of each task as a Minari dataset, all of them or none.
+    """Write the episodes of each task as a Minari dataset, all of them or none.
 
     Args:
-        by_task: Episodes, at least one of each task, and none that is apart from the first of its
-            task, see `writing.why_apart`.
-        directory: Where Minari datasets live (`MINARI_DATASETS_PATH`).
-        name: Of the dataset, such as `logged-v0` or `me/logged-v0`; the task comes before it, and a
-            version after it if it has none.
+        by_task: Episodes, at least one of each task, with the settings of the first of its task,
+            see `writing.why_apart`.
+        directory: Folder of the Minari datasets (`MINARI_DATASETS_PATH`).
+        name: Name such as `logged-v0` or `me/logged-v0`; the task comes before it.
 
     Returns:
         The id of each task's dataset, `<task>/<name>`.
@@ -99,7 +98,7 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
 def _buffers(
     collector: Any, episodes: Sequence[EpisodeArrays], advance: Callable[[int], None]
 ) -> Iterator[Any]:
-    """What Minari writes, one after the other."""
+    """Yield the episodes as Minari's buffers."""
     for index, episode in enumerate(episodes):
         yield collector.EpisodeBuffer(
             id=index,
@@ -117,9 +116,9 @@ def _buffers(
 def _create_dataset(
     minari: Any, dataset_id: str, episodes: Sequence[EpisodeArrays], buffers: Iterator[Any]
 ) -> None:
-    """Writes a dataset where `MINARI_DATASETS_PATH` says."""
+    """Write a dataset into `MINARI_DATASETS_PATH`."""
     spec = episodes[0].spec
-    # Actions worked out from commands are not all float32.
+    # Actions computed from commands may need float64.
     actions = spaces.Box(-1.0, 1.0, (spec.robot.action_size,), np.float64)
     with _unmeasured():
         dataset = minari.create_dataset_from_buffers(
@@ -133,14 +132,14 @@ def _create_dataset(
             data_format='arrow',
             requirements=_requirements(episodes[0]),
         )
-    # Measures it, too.
+    # This measures the dataset, too.
     complete = [{'complete': episode.is_complete} for episode in episodes]
     dataset.storage.update_episode_metadata(complete)
 
 
 @contextmanager
 def _unmeasured() -> Iterator[None]:
-    """Minari looks at every file of a dataset after every episode, to say how large it is."""
+    """Keep Minari from measuring all files of a dataset after every episode."""
     storage = require_module('minari.dataset.minari_storage').MinariStorage
     measure = storage.get_size
     storage.get_size = lambda dataset: 0.0
@@ -152,14 +151,14 @@ def _unmeasured() -> Iterator[None]:
 
 @contextmanager
 def _appearing(directory: Path, dataset_ids: Sequence[str]) -> Iterator[None]:
-    """Minari writes into a hidden folder meanwhile; what is whole at the end moves to its place."""
+    """Let Minari write into a hidden folder; whole datasets move to their place at the end."""
     # Minari joins a relative path to itself.
     directory, before = directory.resolve(), os.environ.get(_MINARI_PATH)
     with hidden_folder(directory, 'minari') as hidden:
         os.environ[_MINARI_PATH] = str(hidden)
         try:
             with warnings.catch_warnings():
-                # Minari warns of every field that only an author could fill in.
+                # Minari warns about every field that only an author can fill in.
                 warnings.filterwarnings('ignore', module='minari')
                 yield
         finally:
@@ -176,7 +175,7 @@ def _appearing(directory: Path, dataset_ids: Sequence[str]) -> Iterator[None]:
 
 
 def _environment(episode: EpisodeArrays) -> Any:
-    """The Gymnasium environment the episode could have come from, for `recover_environment`."""
+    """Return the spec of the environment of the episode, for `recover_environment`."""
     register_environments()
     record = episode.record
     spec = copy.deepcopy(gymnasium.spec(environment_id(episode.spec.name)))

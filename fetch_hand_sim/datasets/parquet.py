@@ -1,4 +1,4 @@
-"""Logged episodes as Parquet tables.
+"""Write logged episodes as Parquet tables.
 
 Needs the extra `[data]`. Values are those of `load_episodes`, float64, unchanged.
 """
@@ -28,16 +28,15 @@ _OBSERVATIONS = ('observation', 'achieved_goal', 'desired_goal')
 
 
 def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
-    """Writes the episodes of each task as two tables, all of them or none.
+    """Write the episodes of each task as two tables, all of them or none.
 
     `<task>.parquet` has N + 1 rows per episode, one per observation: `episode_index`, `step`,
     `timestamp` in seconds since the reset, the three observations, then what happened after it:
     `action`, `command`, `reward`, `terminated`, `truncated`, `next_success`, all null in the last
-    row. `<task>_episodes.parquet` has a row per episode: what the file says of itself.
+    row. `<task>_episodes.parquet` has a row per episode with its metadata and result.
 
     Args:
         by_task: Episodes, at least one of each task.
-        directory: Where to write.
 
     Returns:
         The two files of each task.
@@ -63,14 +62,14 @@ def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
 
 
 def _tables(pyarrow: Any, episodes: Sequence[EpisodeArrays]) -> tuple[Any, Any]:
-    """The steps of some episodes of one task, and the episodes."""
+    """Return the tables of steps and of episodes of one task."""
     steps = [_step_table(pyarrow, index, episode) for index, episode in enumerate(episodes)]
     rows = [_episode_row(index, episode) for index, episode in enumerate(episodes)]
     return pyarrow.concat_tables(steps), pyarrow.Table.from_pylist(rows)
 
 
 def _write_tables(parquet: Any, tables: Mapping[Path, Any]) -> None:
-    """Writes all tables under hidden names, then gives them theirs: a full disk leaves none."""
+    """Write all tables under hidden names, then rename them, so a full disk leaves none."""
     hidden = {path: path.with_name(f'.{path.name}.partial') for path in tables}
     try:
         for path, table in tables.items():
@@ -101,7 +100,7 @@ def _step_table(pyarrow: Any, index: int, episode: EpisodeArrays) -> Any:
 
 
 def _column(pyarrow: Any, values: NDArray[Any], rows: int) -> Any:
-    """A column of numbers, or of vectors of fixed size, filled up with nulls to `rows`."""
+    """Return a column of numbers, or of vectors of fixed size, filled with nulls to `rows`."""
     column = pyarrow.array(values.ravel())
     if values.ndim == 2:
         column = pyarrow.FixedSizeListArray.from_arrays(column, values.shape[1])
@@ -116,7 +115,7 @@ def _episode_row(index: int, episode: EpisodeArrays) -> dict[str, Any]:
         'task': episode.spec.name,
         'seed': record.seed,
         'steps': len(episode),
-        # Of an episode that was cut off and does not say it, what its ticks come to.
+        # The records of a cut-off episode may lack them.
         'return': _first(outcome.episode_return, sum(episode.rewards.tolist())),
         'success': _first(outcome.is_success, bool(episode.success[-1])),
         'complete': outcome.is_complete,

@@ -1,4 +1,4 @@
-"""What all exports do: they are alone in their folder, and overwrite nothing."""
+"""Shared by all exports: exclusive access to a folder, and no overwriting."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class ExportError(CommandError):
 
 
 def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
-    """Returns why an episode cannot be in a dataset with another of its task, '' if it can.
+    """Return why an episode cannot be in a dataset with another of its task, '' if it can.
 
-    Minari's has one environment, LeRobot's one rate, and a column of rewards means one thing.
+    A dataset of Minari has one environment, one of LeRobot has one rate, and rewards need one rule.
     """
     for name in _SETTINGS:
         if name == 'timing' and episode.record.control_hz == DEFAULT_CONTROL_HZ:
-            # Both mean the same there, and logs of 1.0 do not say it.
+            # Both mean the same at this rate, and logs of 1.0 do not record it.
             continue
         here, there = getattr(episode.record, name), getattr(first.record, name)
         if here != there:
@@ -40,7 +40,7 @@ def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
 
 
 def require_module(module: str) -> Any:
-    """Imports a module of the extra.
+    """Import a module of the extra `[data]`.
 
     Raises:
         ExportError: If it is missing.
@@ -56,11 +56,11 @@ def require_module(module: str) -> Any:
 
 @contextmanager
 def alone_in(directory: Path) -> Iterator[None]:
-    """Makes a folder and waits until nobody else who asks for that writes to it."""
+    """Make a folder and lock it against other exports until the end of the block."""
     directory.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        # Some file systems have no locks.
+        # Some file systems lack locks.
         with suppress(OSError):
             fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
@@ -70,9 +70,9 @@ def alone_in(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def hidden_folder(directory: Path, name: str) -> Iterator[Path]:
-    """Makes a hidden folder in one that nobody else writes to, and removes it at the end.
+    """Make a hidden folder in a locked one, and remove it at the end of the block.
 
-    What an export left there that was killed goes first.
+    The hidden folder of a killed export is removed first.
     """
     hidden = directory / f'.{name}.partial'
     shutil.rmtree(hidden, ignore_errors=True)
@@ -84,17 +84,17 @@ def hidden_folder(directory: Path, name: str) -> Iterator[Path]:
 
 
 def require_new(paths: Iterable[Path]) -> None:
-    """Raises `ExportError` if one of them is there."""
+    """Raise `ExportError` if a path exists."""
     for path in paths:
         if path.exists():
             raise ExportError(f'{path} exists; nothing is overwritten')
 
 
 def move_all(targets: Mapping[Path, Path]) -> None:
-    """Gives files or folders their names; where one cannot have it, none has.
+    """Rename files or folders, all of them or none.
 
     Args:
-        targets: By where each is now, on the same disk, where it is to be.
+        targets: New path by present path, on the same disk.
 
     Raises:
         OSError: If one cannot be moved.

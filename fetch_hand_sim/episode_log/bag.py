@@ -250,7 +250,7 @@ class BagFile:
         return self._chunks + (self._chunk_bytes > 0)
 
     def has_room(self, size: int) -> bool:
-        """Whether readers accept the file with one more message of `size` bytes."""
+        """Return whether readers accept the file with one more message of `size` bytes."""
         return not self._exceeded(size)
 
     def flush(self) -> None:

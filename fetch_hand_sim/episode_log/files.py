@@ -60,7 +60,7 @@ def metadata_file(directory: Path) -> Path:
 
 
 def is_mcap(path: Path) -> bool:
-    """Whether a name ends as that of an MCAP file; macOS puts `._` files beside them."""
+    """Return whether a name is that of an MCAP file; macOS puts `._` files beside them."""
     return path.suffix == '.mcap' and not path.name.startswith('._')
 
 
@@ -235,7 +235,7 @@ def create(path: Path) -> BinaryIO:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a process is writing the regular file."""
+    """Return whether a process is writing the regular file."""
     with open_regular(path) as stream:
         return not try_lock(stream, shared=True)
 

@@ -55,7 +55,7 @@ def parse_file(data: bytes) -> tuple[Contents, Messages]:
     """Parse a whole file.
 
     Raises:
-        ValueError: If it is damaged, larger than the limits, or ambiguous; one line says why.
+        ValueError: If it is damaged, larger than the limits, or ambiguous.
     """
     if not data.endswith(MCAP0_MAGIC):
         raise ValueError('truncated, damaged or no MCAP file: its last bytes are not those of one')
@@ -91,7 +91,7 @@ def require_one_meaning(contents: Contents) -> None:
     """Refuse several episodes in a file, and two channels, metadata records or files of one name.
 
     Raises:
-        ValueError: As it says.
+        ValueError: If it finds one.
     """
     for name, count in Counter(each.name for each in contents.metadata).items():
         if count > 1 and name.startswith('episode'):
@@ -245,7 +245,7 @@ def _check_message_indexes(contents: Contents, messages: Messages) -> None:
 def _check_statistics(
     data: bytes, summary: Summary, contents: Contents, messages: Messages
 ) -> None:
-    """Check the statistics, where a count of 0 is unknown but for the number of messages."""
+    """Check the statistics. Some tools write 0 for all counts except that of the messages."""
     if len(summary[Opcode.STATISTICS]) > 1:
         raise ValueError('ambiguous: two records of statistics')
     for position, end in summary[Opcode.STATISTICS]:

@@ -162,7 +162,7 @@ class HasOutcome:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the episode ran to its end; False if it was interrupted."""
+        """True if the episode ran to its end, False if it was interrupted."""
         return self.outcome.is_complete
 
 
@@ -254,7 +254,7 @@ def _number_or_none(text: str, kind: type[Number]) -> Number | None:
     return value if abs(value) <= _LARGEST else None
 
 
-# What is written
+# Writing
 
 
 # Meaning of the messages of an episode. In version 1, which recorded no number, a robot ignored
@@ -293,7 +293,7 @@ def episode_metadata(
     """Return the contents of the record `episode`.
 
     Args:
-        episode: Number of the episode in this run, from 0; the number in the file name goes on over
+        episode: Number of the episode in this run, from 0; the number in the file name continues over
             runs.
         control_hz: Ticks per simulated second.
         timing: Recorded only as `seconds` at another rate than 25 Hz, because robots up to 1.0

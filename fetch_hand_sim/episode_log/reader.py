@@ -229,7 +229,7 @@ def _known_topics(task: TaskSpec) -> dict[str, TopicSpec]:
 
 @lru_cache(maxsize=256)
 def _defines(type_name: str, text: bytes) -> bool:
-    """Whether a `ros2msg` text has the fields that ROS 2 Jazzy gives the type."""
+    """Return whether a `ros2msg` text has the fields that ROS 2 Jazzy gives the type."""
     expected = schema_text(type_name)
     if text == expected.encode():
         return True

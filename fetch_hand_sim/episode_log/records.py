@@ -84,7 +84,7 @@ class Fields:
 
     @property
     def is_at_end(self) -> bool:
-        """Whether all fields are read."""
+        """True if all fields are read."""
         return self._position == len(self._data)
 
     def number(self, size: int) -> int:

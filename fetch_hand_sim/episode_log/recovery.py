@@ -1,7 +1,7 @@
 """Find episodes that a killed process or a full disk cut off, and make valid bags of them.
 
-Every folder may contain anything. An entry that looks like a leftover but is none is reported with
-its problem; it is never followed, waited for or entered.
+Every folder may contain anything. An entry with the name of a leftover and other
+contents is reported with its problem; it is never followed, waited for or entered.
 """
 
 from __future__ import annotations
@@ -146,11 +146,11 @@ def recover_episode(leftover: Path | str) -> Path | None:
     """Complete an episode that a crash cut off.
 
     All whole chunks become a bag under the name of the episode; at most the last quarter of a
-    second is missing. The new file replaces the torn one when it has been read back. A torn file
-    of which more than a few bytes are not read is kept beside it, in `.<name>.aside`.
+    second is missing. The new file replaces the torn one when it has been read back. If more
+    than a few bytes of the torn file are unreadable, it is kept in `.<name>.aside`.
 
-    An episode without messages is moved to `.<name>.aside`, or removed if its file is empty or has
-    no more than a few bytes beyond a good header.
+    An episode without messages is moved to `.<name>.aside`. It is removed if its file is empty, or
+    has only a few bytes beyond a good header.
 
     Args:
         leftover: Hidden directory of the episode, see `find_leftovers`.
@@ -294,7 +294,7 @@ def _read(stream: BinaryIO) -> _Remains:
 
 
 def _has_length(chunk: bytes, length: int) -> bool:
-    """Whether the fields of a torn chunk add up to its length; then no bit of it has flipped."""
+    """Return whether the fields of a torn chunk add up to its length: no bit of it has flipped."""
     fields = Fields(chunk[RECORD.size : RECORD.size + 64], 'chunk')
     fields.bytes(28)
     compression = fields.text()
@@ -303,7 +303,7 @@ def _has_length(chunk: bytes, length: int) -> bool:
 
 @contextmanager
 def _replaced(file: Path, remains: _Remains, aside: Path) -> Iterator[None]:
-    """Write the file anew and put that in its place, locked until the end of the block."""
+    """Write the file again and put that in its place, locked until the end of the block."""
     contents = remains.contents
     records = {record.name: record.content for record in contents.metadata}
     if EPISODE not in records:
@@ -331,7 +331,7 @@ def _replaced(file: Path, remains: _Remains, aside: Path) -> Iterator[None]:
 def _write(
     stream: BinaryIO, file: Path, remains: _Remains, records: dict[str, dict[str, str]]
 ) -> str:
-    """Write the file anew, as far as a writer would have written; return its `metadata.yaml`."""
+    """Write the file again within the limits of a writer; return its `metadata.yaml`."""
     contents, metadata = remains.contents, checked_strings(records[EPISODE])
     messages = contents.messages()
     specs = contract_topics(metadata)

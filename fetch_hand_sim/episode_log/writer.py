@@ -226,7 +226,7 @@ class EpisodeWriter:
 
     @property
     def has_unflushed(self) -> bool:
-        """Whether there are messages that the operating system does not have yet."""
+        """True if the operating system does not have all messages yet."""
         return self._is_open and self._bag.has_unflushed
 
     def finish(self, result: Mapping[str, str]) -> Path | None:
@@ -338,7 +338,7 @@ class EpisodeWriter:
         return EpisodeLogError(f'episode log stopped, {self._stream.name}: {_reason(error)}')
 
     def _stop(self) -> None:
-        """Accept no more messages; closing the stream releases the lock."""
+        """Close the stream, which releases the lock."""
         self._is_open = False
         with suppress(OSError):
             self._stream.close()

@@ -1,7 +1,7 @@
-"""Logged episodes by the thousand: the batched simulation writes what `sim_node` would.
+"""Log episodes by the thousand with the batched simulation.
 
-The files are those of a robot in lockstep that got the same commands: same messages, stamps, log
-times and metadata keys, so whatever reads the node's episodes reads these.
+The files equal those of `sim_node` in lockstep under the same commands: same messages, stamps, log
+times and metadata keys.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from msgs_spec.topics import topic
 
 Act = Callable[[Observation], NDArray[Any]]
 
-# Completing a file waits for the disk several times; so many files wait at once.
+# Files that wait for the disk at once.
 _COMPLETING_THREADS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class _Robot:
-    """One of the batch, through one episode, and what it said and received, tick by tick."""
+    """One robot of the batch in one episode; stamp, messages and received command of each tick."""
 
     episode: RobotEpisode
     messages: list[tuple[int, list[Any], bytes | None]] = field(default_factory=list)
 
 
 class EpisodeGenerator:
-    """Runs an actor in all robots of a simulation and logs every episode.
+    """Runs a policy in all robots of a simulation and logs every episode.
 
     Args:
         simulation: The robots.
@@ -75,18 +75,13 @@ class EpisodeGenerator:
         self._period_ns = round(simulation.tick_duration * 1e9)
 
     def generate(self, episodes: int, first_seed: int = 0) -> Iterator[LoggedEpisode]:
-        """Yields the episodes, in order, as their files are completed.
+        """Yield the episodes, in order, as their files are completed.
 
-        Episode i has the seed `first_seed + i` and the stamps it would have in a series run by
-        one robot.
-
-        Args:
-            episodes: How many.
-            first_seed: Seed of the first.
+        Episode i has the seed `first_seed + i` and the stamps of a series of one robot.
 
         Raises:
             EpisodeLogError: If a file cannot be written.
-            KeyboardInterrupt: At Ctrl-C, after what is finished.
+            KeyboardInterrupt: At Ctrl-C, after the finished episodes.
         """
         with ThreadPoolExecutor(_COMPLETING_THREADS, 'episode_log') as pool:
             waiting: deque[Future[LoggedEpisode]] = deque()
@@ -109,7 +104,7 @@ class EpisodeGenerator:
         return _Robot(RobotEpisode(self._simulation, episode, first_seed + episode, stamp_ns))
 
     def _run(self, robots: Sequence[_Robot], first_seed: int) -> None:
-        """Runs one episode in every robot; robots beyond those given run idle."""
+        """Run one episode in every robot; further robots of the simulation run idle."""
         simulation, robot_spec = self._simulation, self._simulation.spec.robot
         simulation.reset(seed=first_seed)
         if self._on_start is not None:
@@ -132,12 +127,12 @@ class EpisodeGenerator:
                     self._take(robot, tick)
 
     def _take(self, robot: _Robot, tick: Tick) -> None:
-        """Encodes a tick."""
+        """Encode a tick."""
         messages = self._encoder.encode(tick, latched=tick.status.phase != 'running')
         robot.messages.append((tick.stamp_ns, messages, None))
 
     def _receive(self, robots: Sequence[_Robot], commands: Array) -> None:
-        """Notes the command that each robot got after its last tick, as `policy_node` sends it."""
+        """Note the command for each robot after its last tick, as `policy_node` sends it."""
         for robot, command in zip(robots, commands, strict=False):
             if not robot.episode.is_finished:
                 stamp_ns, messages, _ = robot.messages[-1]
@@ -157,7 +152,7 @@ class EpisodeGenerator:
                 if command is not None:
                     writer.write_received(self._commands, command)
         except KeyboardInterrupt:
-            # A part of an episode that had been played to its end would be neither.
+            # The episode is whole, and its file would be marked as interrupted.
             writer.discard()
             raise
         robot.messages.clear()
@@ -165,7 +160,7 @@ class EpisodeGenerator:
 
 
 def _completed(waiting: deque[Future[LoggedEpisode]]) -> Iterator[LoggedEpisode]:
-    """Waits for the files, in order; what has not been waited for is left."""
+    """Wait for the files, in order; an interrupt leaves the others in `waiting`."""
     while waiting:
         logged = waiting[0].result()
         waiting.popleft()

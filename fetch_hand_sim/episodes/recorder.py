@@ -39,7 +39,7 @@ Task = Callable[[], None]
 _FLUSH_AFTER = 0.18
 # Seconds that a message may wait for that before the robot waits for the disk.
 _LONGEST_WAIT = 0.2
-# Seconds without progress after which the disk counts as failed, and between two looks at it.
+# Seconds without progress until the disk counts as failed, and seconds between two checks.
 _STALL = 5.0
 _LOOK_AFTER = 0.002
 # Finished files that may wait for the disk; the operating system has them.
@@ -47,7 +47,7 @@ _MAX_UNSTORED = 16
 # Seconds of waiting that are reported, and seconds between two reports.
 _SLOW = 0.1
 _SLOW_PERIOD = 10.0
-# At the end: seconds between two looks at `gives_up`, seconds after which the wait is reported, and
+# At the end: seconds between two calls of `gives_up`, seconds until the wait is reported, and
 # seconds that a failed disk may delay the end.
 _ASK_AFTER = 0.1
 _PATIENCE = 3.0
@@ -205,8 +205,8 @@ class EpisodeRecorder:
 
         Args:
             reason: Why the running episode, if any, is cut short.
-            gives_up: Called while the disk takes its time. Once it returns True, the files that
-                the disk does not have are left for `fetch_hand_sim episodes recover`.
+            gives_up: Called during the wait. When it returns True, the unfinished files are left
+                for `fetch_hand_sim episodes recover`.
         """
         self._end(reason)
         self._tasks.put(None)

@@ -22,17 +22,17 @@ from msgs_spec.tick import EpisodeStatus, Phase, Tick
 
 # Simulated time of the first tick. Not 0, because ROS takes a time of 0 for "no time yet".
 FIRST_STAMP_NS = 1_000_000_000
-# How many seeds there are; the first follows the last.
+# Number of seeds; the first follows the last.
 _SEEDS = 2**32
 
 
 @dataclass(frozen=True, slots=True)
 class Sensed:
-    """What all robots of a simulation sense at one tick, and what it is worth.
+    """Readings, goals and rewards of all robots of a simulation at one tick.
 
     Attributes:
-        readings: One reading of the sensors, (N, size) each.
-        true_readings: The same without disturbances; None where there are none.
+        readings: Readings of the sensors, (N, size) each.
+        true_readings: The same without disturbances; None if disturbances are off.
         achieved: (N, goal size).
         desired: (N, goal size).
         reward: (N,).
@@ -48,7 +48,7 @@ class Sensed:
 
 
 def sense(simulation: Simulation) -> Sensed:
-    """Reads the sensors of all robots, once."""
+    """Read the sensors of all robots, once."""
     readings, truth = simulation.readings(), None
     if not simulation.disturbances.is_off:
         truth = simulation.true_readings()
@@ -59,32 +59,30 @@ def sense(simulation: Simulation) -> Sensed:
 
 
 def has_ended(ticks: Any, episode_ticks: int, has_diverged: Any) -> Any:
-    """Whether an episode is over: time is up or MuJoCo gave it up.
+    """Return whether episodes are over: time is up or the simulation diverged.
 
     Args:
-        ticks: Steps so far; of many episodes an array.
+        ticks: Steps so far, a number or an array.
         episode_ticks: Steps after which time is up.
-        has_diverged: Whether MuJoCo gave it up in this step; of many an array.
+        has_diverged: Whether the simulation diverged in this step, likewise.
     """
     return has_diverged | (ticks >= episode_ticks)
 
 
 class RobotEpisode:
-    """From its reset until time is up or MuJoCo gives up.
+    """One episode of one robot among N, from its reset until time is up or it diverges.
 
     Args:
         simulation: The robots.
         episode: Number of the episode in its series.
         seed: Seed of its reset.
         first_stamp_ns: Simulated time of its reset.
-        joint_prefix: What the names of joints begin with on the network.
+        joint_prefix: Beginning of the names of joints in messages.
 
     Attributes:
-        seed: As given.
-        first_stamp_ns: As given.
         tick: Steps so far.
-        has_diverged: Whether MuJoCo gave up, which ends the episode.
-        status: What was said last; `waiting` before the reset.
+        has_diverged: Whether the simulation diverged, which ends the episode.
+        status: The last status; `waiting` before the reset.
     """
 
     def __init__(
@@ -109,16 +107,11 @@ class RobotEpisode:
 
     @property
     def is_finished(self) -> bool:
-        """Whether its last tick was made."""
+        """True after its last tick."""
         return self.status.phase == 'finished'
 
     def start(self, sensed: Sensed, index: int) -> Tick:
-        """Returns tick 0, right after the reset.
-
-        Args:
-            sensed: By all robots.
-            index: Which of them this one is.
-        """
+        """Return tick 0, right after the reset, of robot `index`."""
         disturbances = self._simulation.disturbances
         if not disturbances.is_off:
             self._disturbances = disturbances.to_json()
@@ -126,13 +119,11 @@ class RobotEpisode:
         return self._make_tick('reset', sensed, index, None)
 
     def step(self, sensed: Sensed, index: int, command: Array, has_diverged: bool) -> Tick:
-        """Returns the tick that a step led to.
+        """Return the tick of robot `index` after a step.
 
         Args:
-            sensed: By all robots, after the step.
-            index: Which of them this one is.
-            command: (action size,), what was applied.
-            has_diverged: Whether MuJoCo gave the robot up in this step.
+            command: (action size,), the applied command.
+            has_diverged: Whether the simulation diverged in this step.
         """
         self.tick += 1
         self._return += float(sensed.reward[index])
@@ -183,20 +174,18 @@ class EpisodeRunner:
     Stamps grow by one period per tick and never go back.
 
     Args:
-        simulation: With `num_envs` 1.
-        first_seed: Seed of the first episode.
-        episodes: How many episodes to run; 0 for no end.
-        first_episode: Index of the first episode, which has the seed `first_seed` plus it; to
-            run an episode from the middle of a series again.
+        simulation: A simulation of one robot.
+        episodes: Number of episodes to run; 0 for no end.
+        first_episode: Index of the first episode, to repeat an episode from the middle of a series.
         first_stamp_ns: Simulated time of the first tick, likewise.
-        joint_prefix: What the names of joints begin with on the network.
+        joint_prefix: Beginning of the names of joints in messages.
 
     Attributes:
-        simulation: As given.
-        spec: Its task, with the joint names of the network.
+        spec: The task, with the joint names of the messages.
         episode: Index of the running or next episode, from 0.
-        current: The running or last episode; before the first one that one, waiting.
-        stamp_ns: Simulated time of the last tick; one period before the first if there is none.
+        current: The running or last episode; before the first tick the first episode, waiting.
+        stamp_ns: Simulated time of the last tick; before the first tick one period less than its
+            time.
         is_between_episodes: Whether the next tick is a reset.
 
     Raises:
@@ -232,7 +221,7 @@ class EpisodeRunner:
 
     @property
     def is_done(self) -> bool:
-        """Whether all episodes asked for are finished."""
+        """True if all requested episodes are finished."""
         return 0 < self._episodes <= self.episode - self._first_episode
 
     @property
@@ -245,20 +234,20 @@ class EpisodeRunner:
 
     @property
     def has_started(self) -> bool:
-        """Whether there has been a tick."""
+        """True after the first tick."""
         return self.stamp_ns >= self._first_stamp_ns
 
     def waiting_status(self) -> EpisodeStatus:
-        """What to say of the first episode before it starts."""
+        """Return the status of the first episode before it starts."""
         return self._make_episode(self.stamp_ns).status
 
     def resting_command(self) -> Array:
-        """The command (action size,) that leaves the robot as it is."""
+        """Return the command (action size,) that keeps the robot in its state."""
         (command,) = self.simulation.resting_commands()
         return np.asarray(command)
 
     def set_next_seed(self, seed: int) -> None:
-        """Gives the next episode to start a seed, and those after it the seeds that follow."""
+        """Set the seed of the next episode; later episodes have the seeds that follow."""
         following = self.episode if self.is_between_episodes else self.episode + 1
         self._new_first_seed = seed - following
         self._series_seed = seed - self._first_episode
@@ -268,7 +257,7 @@ class EpisodeRunner:
         self._new_disturbances = disturbances
 
     def set_goal(self, goal: Array) -> None:
-        """Replaces the goal (goal size,) of the running episode from the next tick on.
+        """Replace the goal (goal size,) of the running episode from the next tick on.
 
         Raises:
             ValueError: If it does not fit the task.
@@ -276,29 +265,29 @@ class EpisodeRunner:
         self.simulation.set_goal(goal[None])
 
     def perturb(self, body: str, wrench: Array) -> None:
-        """Pushes a body during the next tick of the running episode.
+        """Push a body during the next tick of the running episode.
 
         Raises:
-            ValueError: If there is no such body, or the numbers are none.
+            ValueError: If the model has no such body, or a number is not finite.
         """
         self.simulation.perturb(body, wrench)
 
     def end_episode(self) -> None:
-        """Gives the running episode up: the next tick starts another."""
+        """End the running episode; the next tick starts another."""
         if not self.is_between_episodes:
             self._finish()
 
     def start_over(self) -> None:
-        """Gives the series up: the next tick starts its first episode again, and time goes on.
+        """Start the series again with the next tick; stamps continue to grow.
 
-        With its first seed, or the one that was given last.
+        The first episode has its first seed, or the seed that was set last.
         """
         self.is_between_episodes = True
         self.episode = self._first_episode
         self._first_seed, self._new_first_seed = self._series_seed, None
 
     def advance(self, command: Array) -> Tick:
-        """Advances by one tick: the reset of the next episode, or one step of the running one.
+        """Advance by one tick: the reset of the next episode, or one step of the running one.
 
         Args:
             command: (action size,) in command units and within limits; a reset ignores it.
