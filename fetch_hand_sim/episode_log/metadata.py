@@ -293,8 +293,7 @@ def episode_metadata(
     """Return the contents of the record `episode`.
 
     Args:
-        episode: Number of the episode in this run, from 0; the number in the file name continues over
-            runs.
+        episode: Number of the episode in this run, from 0; file names count over all runs.
         control_hz: Ticks per simulated second.
         timing: Recorded only as `seconds` at another rate than 25 Hz, because robots up to 1.0
             recorded nothing and kept `ticks`.
