@@ -1,18 +1,16 @@
-"""`make demo`: a robot and an actor in two processes, watched from a third.
+"""Run a simulated robot and its policy in two processes and print a row for each logged episode.
 
-It starts `sim_node` and `policy_node`, listens to the robot as any other subscriber would, and
-prints a row for every episode that it finds logged.
+The rows come from the episode files. The demo also subscribes to the robot, to show its progress.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import re
 import signal
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +23,7 @@ from fetch_hand_sim.commands.node_processes import (
     start_nodes,
     stop_node,
 )
-from fetch_hand_sim.episode_log import (
-    Episode,
-    EpisodeOutcome,
-    EpisodeRecord,
-    read_episode,
-)
+from fetch_hand_sim.episode_log import EpisodeOutcome, EpisodeRecord, read_summary
 from msgs_spec.codecs import decode_status
 from msgs_spec.parameters import LARGEST_SEED
 from msgs_spec.tasks import TaskSpec, task_spec
@@ -49,29 +42,20 @@ from node_runtime.command_line import (
     whole_number,
 )
 from node_runtime.node_main import StopSignals, destroy, find_place_for_logs
-from node_runtime.ros import (
-    DISCOVERY_TIME,
-    count_publishers,
-    rclpy_profile,
-    ros_message_class,
-)
+from node_runtime.ros import DISCOVERY_TIME, count_publishers, rclpy_profile, ros_message_class
 from node_runtime.transport import keep_discovery_local
 
 _NAME = 'fetch_hand_sim demo'
 _START_TIMEOUT = 60.0
-# What shells add to the number of the signal that ended a command.
+# Shells add this to the number of the signal that ended a command.
 _SIGNALLED = 128
-# What rmw calls the node of an endpoint that is discovered before its node.
+# The name in rmw of a node that is discovered after its endpoints.
 _NAMELESS = '_NODE_NAME_UNKNOWN_'
 _COLUMNS = '{:>7}  {:>5}  {:>5}  {:>7}  {:<7}  {}'
 
 
 class Watcher:
-    """A plain subscriber that follows an episode's progress.
-
-    Args:
-        spec: The task of the robot.
-    """
+    """A subscriber that follows the progress of an episode."""
 
     def __init__(self, spec: TaskSpec) -> None:
         import rclpy
@@ -90,21 +74,21 @@ class Watcher:
             )
 
     def others(self) -> str:
-        """Who would take part in what this demo starts, in words; '' for nobody."""
+        """Name a process that would interact with the nodes of this demo, or return ''."""
         if count_publishers(self._node, 'episode_status'):
             return 'a robot'
         if waiting := self._waiting_policies():
             return min(waiting)
-        # Its nodes are still to come.
+        # The nodes of this demo have not started yet.
         nodes = self._node.get_node_names_and_namespaces()
         if nodes.count(('demo', '/')) > 1:
             return 'another demo'
         commands = [each.name for each in topics(self._spec) if each.name.endswith('commands')]
         is_commanded = any(count_publishers(self._node, name) for name in commands)
-        return 'who publishes commands' if is_commanded else ''
+        return 'a publisher of commands' if is_commanded else ''
 
     def _waiting_policies(self) -> set[str]:
-        """Who waits for a robot, under any name: it commands nobody yet, and reports its health."""
+        """Return the nodes that wait for a robot: they read its status and report diagnostics."""
         listeners = self._node.get_subscriptions_info_by_topic('episode_status')
         reporters = self._node.get_publishers_info_by_topic(DIAGNOSTICS.name)
         waiting, reporting = (
@@ -113,11 +97,24 @@ class Watcher:
         return {name for name in waiting & reporting if name != _NAMELESS}
 
     def spin(self) -> None:
-        """Serves callbacks for a moment."""
+        """Serve callbacks for 50 ms at most."""
         self._executor.spin_once(timeout_sec=0.05)
 
+    def show(self, progress: Progress, bar: TaskID) -> None:
+        """Update a progress bar of the current episode."""
+        status = self.status
+        if status is None or status.phase == 'waiting':
+            return
+        progress.update(
+            bar,
+            description=f'episode {status.episode}',
+            completed=self.ticks,
+            total=task_spec(status.task, control_hz=status.control_hz).episode_ticks,
+            note=f'tick {self.ticks}, seed {status.seed}',
+        )
+
     def close(self, exit_code: int) -> None:
-        """Leaves the graph; a process that cannot ends with `exit_code`."""
+        """Destroy the node; if that fails, the process ends with `exit_code`."""
         self._executor.remove_node(self._node)
         destroy(self._node, exit_code)
 
@@ -126,7 +123,7 @@ class Watcher:
             status = EpisodeStatus.from_values(decode_status(message))
         except ValueError:
             return
-        # Whoever says something else there is not the robot that was started here.
+        # A robot with another task is not the one that this demo started.
         if status.task == self._spec.name:
             self.status, self.ticks = status, status.tick
 
@@ -136,54 +133,47 @@ class Watcher:
 
 
 class Demo:
-    """Runs the two nodes until the episodes are done.
-
-    Args:
-        options: Of the command line.
-        console: Where it prints.
-    """
+    """Runs the two nodes until the episodes are done."""
 
     def __init__(self, options: argparse.Namespace, console: Console) -> None:
         self._options = options
         self._console = console
         self._spec = task_spec(options.task)
         self._directory = Path(options.episode_dir)
-        self._known = set(self._episodes())
+        self._known = self._episodes()
         self._outcomes: list[EpisodeOutcome] = []
-        self._log: Path | None = None
 
     def run(self, stop: StopSignals) -> int:
-        """Runs the demo and returns the exit code."""
-        commander, exit_code = self._policy(), EXIT_FAILURE
+        """Run the demo; return its exit code."""
+        policy, exit_code = self._policy(), EXIT_FAILURE
         watcher = Watcher(self._spec)
         try:
             _require_to_be_alone(watcher, stop)
-            exit_code = EXIT_SUCCESS if stop else self._play(commander, watcher, stop)
+            exit_code = EXIT_SUCCESS if stop else self._play(policy, watcher, stop)
             if exit_code == EXIT_SUCCESS and stop.received:
                 exit_code = _SIGNALLED + signal.Signals[stop.received]
             return exit_code
         finally:
             watcher.close(exit_code)
 
-    def _play(self, commander: str, watcher: Watcher, stop: StopSignals) -> int:
-        """Runs the nodes, prints what they did and returns the exit code."""
+    def _play(self, policy: str, watcher: Watcher, stop: StopSignals) -> int:
+        """Run the nodes and return the exit code; print their output after a failure."""
         began = time.monotonic()
-        # What the nodes print is shown if something goes wrong.
-        with open_log('demo') as logs:
-            self._log = Path(logs.name)
-            policy, sim = start_nodes(
-                {'policy_node': {'policy': commander}, 'sim_node': self._sim_parameters()}, logs
+        with open_log('demo') as output:
+            nodes = start_nodes(
+                {'policy_node': {'policy': policy}, 'sim_node': self._sim_parameters()}, output
             )
             try:
-                self._watch(watcher, sim, policy, stop)
+                self._watch(watcher, nodes, stop)
                 if stop:
                     complain(_NAME, 'stopping')
             finally:
-                codes = [stop_node(process) for process in (sim, policy)]
-            self._print_new_rows()
+                codes = [stop_node(process) for process in reversed(nodes)]
+            self._print_new_rows(self._console)
             if any(codes) or (len(self._outcomes) < self._options.episodes and not stop):
-                self._console.print(Path(logs.name).read_text(), markup=False, highlight=False)
-                self._console.print(f'the nodes ended with exit codes {codes}')
+                text = Path(output.name).read_text()
+                self._console.print(text, markup=False, highlight=False)
+                self._console.print(f'sim_node and policy_node ended with exit codes {codes}')
                 return EXIT_FAILURE
         self._print_summary(time.monotonic() - began)
         return EXIT_SUCCESS
@@ -206,49 +196,45 @@ class Demo:
         }
 
     def _watch(
-        self,
-        watcher: Watcher,
-        sim: subprocess.Popen[str],
-        policy: subprocess.Popen[str],
-        stop: StopSignals,
+        self, watcher: Watcher, nodes: Sequence[subprocess.Popen[str]], stop: StopSignals
     ) -> None:
         columns = (TextColumn('{task.description}'), BarColumn(), TextColumn('{task.fields[note]}'))
         print(_COLUMNS.format('episode', 'seed', 'steps', 'return', 'success', 'file'), flush=True)
         deadline = time.monotonic() + _START_TIMEOUT
         with Progress(*columns, console=self._console, transient=True) as progress:
             bar = progress.add_task('starting', total=self._spec.episode_ticks, note='')
-            while sim.poll() is None and policy.poll() is None and not stop:
+            while not stop and all(process.poll() is None for process in nodes):
                 watcher.spin()
-                _show(progress, bar, watcher)
+                watcher.show(progress, bar)
                 self._print_new_rows(progress.console)
                 has_started = watcher.status is not None and watcher.status.phase != 'waiting'
                 if not has_started and time.monotonic() > deadline:
                     return
 
-    def _episodes(self) -> Iterator[Path]:
-        if self._directory.is_dir():
-            yield from (p for p in self._directory.iterdir() if not p.name.startswith('.'))
+    def _episodes(self) -> set[Path]:
+        if not self._directory.is_dir():
+            return set()
+        return {path for path in self._directory.iterdir() if not path.name.startswith('.')}
 
-    def _logged(self) -> list[Path]:
-        """New episodes that the robot says it logged: others may log in the same directory."""
-        found = sorted(set(self._episodes()) - self._known)
-        said = self._log.read_bytes() if found and self._log else b''
-        # No digit may follow, of a longer seed.
-        return [p for p in found if re.search(rb', %b(?!\d)' % re.escape(os.fsencode(p)), said)]
-
-    def _print_new_rows(self, console: Console | None = None) -> None:
-        for path in self._logged():
+    def _print_new_rows(self, console: Console) -> None:
+        for path in sorted(self._episodes() - self._known):
             self._known.add(path)
             try:
-                episode = read_episode(path)
-                row = _row(episode, path)
+                summary = read_summary(path)
+                record = EpisodeRecord.parse(summary.metadata)
             except ValueError:
-                # Unreadable, or not of this project.
                 continue
-            self._outcomes.append(episode.outcome)
-            (console or self._console).print(
-                printable(row), markup=False, highlight=False, soft_wrap=True
-            )
+            # Another simulator node may log into the same folder.
+            is_own = record.task.name == self._spec.name
+            if not is_own or record.seed != self._options.seed + record.episode:
+                continue
+            outcome = summary.outcome
+            self._outcomes.append(outcome)
+            success = 'yes' if outcome.is_success else 'no'
+            total = f'{outcome.episode_return or 0.0:g}'
+            row = (record.episode, record.seed, outcome.steps or 0, total, success, path)
+            text = printable(_COLUMNS.format(*row))
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def _print_summary(self, seconds: float) -> None:
         count = len(self._outcomes)
@@ -265,57 +251,35 @@ class Demo:
 
 
 def _require_to_be_alone(watcher: Watcher, stop: StopSignals) -> None:
-    """Refuses to start nodes beside those of others, who would play with them or against them.
-
-    Raises:
-        CommandError: If there are some.
-    """
+    """Raise CommandError if nodes of other processes would interact with those of this demo."""
     end = time.monotonic() + DISCOVERY_TIME
     while not stop and time.monotonic() < end:
         watcher.spin()
         if found := watcher.others():
             raise CommandError(
-                f'{found} in / runs already and would take part: end that first, or choose '
+                f'{found} is running in / and would interact with this demo: stop it, or set '
                 'another ROS_DOMAIN_ID'
             )
 
 
-def _row(episode: Episode, path: Path) -> str:
-    """The line of a logged episode, as its file tells it."""
-    record, outcome = EpisodeRecord.parse(episode.metadata), episode.outcome
-    success = 'yes' if outcome.is_success else 'no'
-    total = f'{outcome.episode_return or 0.0:g}'
-    return _COLUMNS.format(record.episode, record.seed, outcome.steps or 0, total, success, path)
-
-
-def _show(progress: Progress, bar: TaskID, watcher: Watcher) -> None:
-    status = watcher.status
-    if status is None or status.phase == 'waiting':
-        return
-    note = f'tick {watcher.ticks}, seed {status.seed}'
-    ticks = task_spec(status.task, control_hz=status.control_hz).episode_ticks
-    description = f'episode {status.episode}'
-    progress.update(bar, description=description, completed=watcher.ticks, total=ticks, note=note)
-
-
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
-    parser.add_argument('--task', default='FetchReach', help='default: %(default)s')
-    count, seed = whole_number(1), whole_number(0, LARGEST_SEED)
-    parser.add_argument('--episodes', type=count, default=5, help='how many; default: %(default)s')
-    parser.add_argument('--seed', type=seed, default=0, help='of the first; default: %(default)s')
-    parser.add_argument(
+    add, count, seed = parser.add_argument, whole_number(1), whole_number(0, LARGEST_SEED)
+    add('--task', default='FetchReach', help='default: %(default)s')
+    add('--episodes', type=count, default=5, help='number of episodes; default: %(default)s')
+    add('--seed', type=seed, default=0, help='seed of the first episode; default: %(default)s')
+    add(
         '--episode-dir',
         type=os.path.expanduser,
         default='episodes',
-        help='where they are logged; default: %(default)s',
+        help='folder for the episodes; default: %(default)s',
     )
-    parser.add_argument(
+    add(
         '--policy',
         default='',
         help='a shipped actor, a file, random or resting; default: the shipped actor of the task',
     )
-    parser.add_argument('--checkpoint', dest='policy', action=FormerOption, help=argparse.SUPPRESS)
+    add('--checkpoint', dest='policy', action=FormerOption, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     try:
         task_spec(options.task)
@@ -325,7 +289,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the demo; returns the exit code."""
+    """Run the demo; return its exit code."""
     options = _parse(arguments)
     return run_command(_NAME, lambda: _run(options))
 

@@ -88,8 +88,8 @@ def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path)
     code, output = finish(start_process(*command, '--episodes', '1', cwd=tmp_path), timeout=60.0)
     assert code == 1
     assert output == (
-        f'fetch_hand_sim demo: {who} in / runs already and would take part: end that first, or '
-        'choose another ROS_DOMAIN_ID\n'
+        f'fetch_hand_sim demo: {who} is running in / and would interact with this demo: stop it, '
+        'or set another ROS_DOMAIN_ID\n'
     )
 
 
