@@ -1,4 +1,4 @@
-"""Builds the ROS package `fetch_hand_sim`, with colcon or with pip alone."""
+"""Build the ROS package `fetch_hand_sim`, with colcon or with pip alone."""
 
 import sys
 from glob import glob
@@ -6,17 +6,17 @@ from pathlib import Path
 
 from setuptools import find_packages, setup
 
-# Said here as well, because pip looks at `python_requires` after it has fetched what is needed.
+# Before pip, which reads `python_requires` only after it has downloaded the dependencies.
 if sys.version_info < (3, 11):  # noqa: UP036
     sys.exit(f'fetch_hand_sim needs Python 3.11 or newer; this is {sys.version.split()[0]}')
 
 PACKAGE = 'fetch_hand_sim'
 
-# To train actors, and to have them as modules; to run them takes NumPy alone.
+# For training and for actors as modules; NumPy alone runs actors.
 ACTORS = ['torch>=2.6']
-# What a command needs beyond the base installation; it says so itself where it is missing.
+# Extras of single commands; a command names its missing extra.
 EXTRAS = {
-    # ROS 2 Jazzy itself, for a machine without it.
+    # ROS 2 Jazzy, for machines without it.
     'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
     'actors': ACTORS,
     'train': [*ACTORS, 'matplotlib>=3.8', 'tensorboard>=2.16'],
@@ -32,7 +32,7 @@ EXTRAS = {
 }
 # `make docs`; docutils 0.23 is too new for Sphinx 9.0.
 DOCS = ['furo>=2025.12', 'myst-parser>=5', 'sphinx>=9,<10']
-# What test/ needs beyond all of that. An extra called `test` makes `colcon test` use pytest.
+# Further packages for test/. An extra called `test` makes `colcon test` use pytest.
 TEST = [
     'colcon-core',
     'colcon-package-selection',
@@ -82,7 +82,7 @@ setup(
         'fetch_hand_sim': ['py.typed'],
         'policy_node': ['py.typed', 'actors/*'],
     },
-    # Critics, to train on from a shipped actor: in the repository only.
+    # Critics of the shipped actors are in the repository only.
     exclude_package_data={'policy_node': ['actors/*.training.safetensors']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
@@ -91,8 +91,8 @@ setup(
         (f'share/{PACKAGE}/config', glob('config/*.*')),
     ],
     zip_safe=True,
-    # Without rclpy and the messages: in a ROS workspace pip must not replace those of ROS. No `~=`:
-    # colcon cannot read it, and would then find no tests and say that they passed.
+    # Without rclpy and the messages: in a ROS workspace, pip must not replace them. Without `~=`:
+    # colcon cannot read it; `colcon test` would pass without running tests.
     install_requires=[
         'gymnasium>=1.0',
         'gymnasium-robotics>=1.4.2,<1.5',

@@ -1,4 +1,4 @@
-"""A private ROS graph for the whole run, and processes that never outlive their test."""
+"""A private ROS graph for each run, and processes that end with their test."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from support.run_guard import DOMAIN_LOCK_PORT, start_guard
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-# Low domains are what people set by hand; above 101 the ports of DDS meet Linux' ephemeral ones.
+# Users set low domains by hand; ports of domains above 101 overlap Linux' ephemeral ports.
 DOMAINS = range(40, 102)
 
 
 def reserve_domain() -> tuple[int, socket.socket]:
-    """Returns a ROS domain nobody else tests in; it is reserved while the socket is open."""
+    """Return a free ROS domain, which stays reserved while the socket is open."""
     for domain in DOMAINS:
         lock = socket.socket()
         try:
@@ -35,7 +35,7 @@ def reserve_domain() -> tuple[int, socket.socket]:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds what `make twin` and `make torture` turn up."""
+    """Add the options that `make twin` and `make torture` raise."""
     parser.addoption(
         '--twin-seeds',
         type=int,
@@ -57,11 +57,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Sets the environment of ROS before any message class is imported; children inherit it."""
-    # A shell starts what runs in the background with SIGINT ignored, and children inherit that.
+    """Set the environment of ROS before message classes are imported; children inherit it."""
+    # Shells start background processes with SIGINT ignored, which children inherit.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    # So does `nohup` with SIGHUP. It stays ignored here; a handler is nothing that is inherited.
+    # So does `nohup` with SIGHUP. Children do not inherit a handler.
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, lambda *_: None)
     domain, lock = reserve_domain()
@@ -89,31 +89,31 @@ def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> 
 
 @pytest.fixture(scope='session')
 def twin_seeds(pytestconfig: pytest.Config) -> range:
-    """The seeds of the comparison with Gymnasium-Robotics."""
+    """Seeds of the comparison with Gymnasium-Robotics."""
     return range(pytestconfig.getoption('--twin-seeds'))
 
 
 @pytest.fixture(scope='session')
 def hostile_count(pytestconfig: pytest.Config) -> int:
-    """How many random messages a hostile test sends."""
+    """Number of random messages in a hostile test."""
     return int(pytestconfig.getoption('--hostile-messages'))
 
 
 @pytest.fixture(scope='session')
 def soak_seconds(pytestconfig: pytest.Config) -> float:
-    """How long memory is watched."""
+    """Seconds for which memory is measured."""
     return float(pytestconfig.getoption('--soak-seconds'))
 
 
 @pytest.fixture
 def ros_environment() -> dict[str, str]:
-    """A copy of the environment nodes are started with, for a test to add to."""
+    """A copy of the environment of nodes, which a test may extend."""
     return os.environ | {'PYTHONUNBUFFERED': '1'}
 
 
 @pytest.fixture
 def node() -> Iterator[Node]:
-    """A node of this process, in a context of rclpy that ends with the test."""
+    """A node in this process; its rclpy context ends with the test."""
     import rclpy
 
     rclpy.init()
@@ -127,9 +127,9 @@ def node() -> Iterator[Node]:
 def start_process(
     ros_environment: dict[str, str],
 ) -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Starts processes with text pipes; what still runs after the test is killed with its children.
+    """Return a function that starts a process with text pipes, like `subprocess.Popen`.
 
-    Takes the command, then the keyword arguments of `subprocess.Popen`.
+    After the test, running processes are killed with their children.
     """
     started: list[subprocess.Popen[str]] = []
 

@@ -1,1 +1,1 @@
-"""The command lines."""
+"""Commands for episodes and the demo, and their node processes."""

@@ -30,10 +30,10 @@ _NAME = 'fetch_hand_sim episodes check'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
+    """Run the command; return its exit code."""
     parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument(
-        'paths', type=Path, nargs='+', metavar='PATH', help='episode, or directory of episodes'
+        'paths', type=Path, nargs='+', metavar='PATH', help='an episode, or a folder of episodes'
     )
     parser.add_argument('--json', action='store_true', help='print one JSON array instead of lines')
     options = parser.parse_args(arguments)
@@ -52,7 +52,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _expand(paths: Sequence[Path]) -> tuple[list[Path], int]:
-    """Returns the episodes meant by some paths, and the exit code for what is none."""
+    """Return the episodes in the paths, and the exit code for invalid paths."""
     episodes: list[Path] = []
     code = EXIT_SUCCESS
     for path in paths:
@@ -69,7 +69,7 @@ def _expand(paths: Sequence[Path]) -> tuple[list[Path], int]:
 
 
 def _check(episodes: Sequence[Path], results: list[CheckResult], is_quiet: bool) -> int:
-    """Checks episodes, appends what came out to `results`, and returns the exit code."""
+    """Check episodes, append to `results`, and return the exit code."""
     checker = EpisodeChecker()
     code = EXIT_SUCCESS
     with progress('episodes', len(episodes)) as advance:

@@ -44,18 +44,18 @@ _NEEDED = {'parquet': ('pyarrow',), 'minari': ('pyarrow', 'minari'), 'lerobot': 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
-    parser.add_argument('path', type=Path, help='an episode, or a directory of episodes')
+    parser.add_argument('path', type=Path, help='an episode, or a folder of episodes')
     parser.add_argument('--to', choices=tuple(_TITLES), required=True)
-    parser.add_argument('--output', type=Path, required=True, help='directory to write to')
+    parser.add_argument('--output', type=Path, required=True, help='folder for the datasets')
     add_filter_options(parser)
-    parser.add_argument('--name', help='of a Minari dataset; default: logged-v0')
+    parser.add_argument('--name', help='name of a Minari dataset; default: logged-v0')
     parser.add_argument(
         '--pictures',
         type=picture_size,
         metavar='WxH',
-        help='films of this size in a LeRobot dataset; default: none',
+        help='size of films in a LeRobot dataset; default: no films',
     )
-    parser.add_argument('--camera', help='of the model, for --pictures; default: a good view')
+    parser.add_argument('--camera', help='camera of the model for --pictures; default: a good view')
     options = parser.parse_args(arguments)
     if options.name is not None and options.to != 'minari':
         parser.error(f'--name is for --to minari, not {options.to}')
@@ -64,12 +64,12 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     if options.camera and not options.pictures:
         parser.error('--camera needs --pictures')
     if options.pictures and any(side % 2 for side in options.pictures):
-        parser.error('--pictures: even sides are allowed')
+        parser.error('--pictures: both sides must be even')
     return options
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
+    """Run the command; return its exit code."""
     options = _parse(arguments)
     return run_command(_NAME, lambda: _run(options))
 
@@ -104,38 +104,35 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _each_once(paths: Sequence[Path]) -> list[Path]:
-    """Paths without those that lead to one before, as links do."""
+    """Return the paths without links to earlier ones."""
     first: dict[str, Path] = {}
     for path in paths:
         known = first.setdefault(os.path.realpath(path), path)
         if known is not path:
-            complain(_NAME, f'{path} is {known}, which is taken once')
+            complain(_NAME, f'{path} is {known}, which is exported once')
     return list(first.values())
 
 
 def _why_none(path: Path, filtered: int) -> str:
     if filtered:
-        return f'none of {filtered} episodes in {path} is one of those asked for'
+        return f'the filters reject all {filtered} episodes in {path}'
     return str(holds_no_episode(path))
 
 
 def _counted(episodes: Sequence[EpisodeArrays]) -> str:
-    """How many there are, and how many of them were cut short, which learners may not expect."""
+    """Return the number of episodes, and of interrupted ones, which learners may not expect."""
     interrupted = sum(not episode.is_complete for episode in episodes)
     told = f', {interrupted} of them interrupted,' if interrupted else ''
     return f'{len(episodes)} episodes{told}'
 
 
 def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.Namespace) -> bool:
-    """Reads an episode and puts it beside those of its task, if it is asked for.
-
-    Returns:
-        Whether it is.
+    """Read an episode into `by_task` if it passes the filters; return whether it does.
 
     Raises:
-        EpisodeReadError: If it cannot be read, or a dataset of this kind cannot hold it.
+        EpisodeReadError: If it cannot be read, or a dataset of this kind cannot contain it.
     """
-    # A summary is read in a fraction of the time that all messages take.
+    # Reading a summary is much faster than reading all messages.
     summary = read_summary(path)
     if not is_wanted(options, summary.metadata.get('task'), summary):
         return False
@@ -148,16 +145,16 @@ def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.
 
 
 def _why_left_out(episode: EpisodeArrays, others: Sequence[EpisodeArrays], to: str) -> str:
-    """Why a dataset of this kind cannot hold an episode beside others of its task; '' if it can."""
+    """Return why a dataset of this kind cannot contain an episode, or ''."""
     if to == 'parquet':
         return ''
     if len(episode) == 0:
-        return f'no step was taken, and {_TITLES[to]} needs one'
+        return f'no steps; {_TITLES[to]} needs at least one'
     return why_apart(episode, others[0]) if others else ''
 
 
 def _export(options: argparse.Namespace, by_task: ByTask, name: str) -> dict[str, str]:
-    """Writes all, a Minari dataset under a name; returns for each task where it is."""
+    """Write all datasets; return the location by task."""
     if options.to == 'parquet':
         files = export_parquet(by_task, options.output)
         return {task: ', '.join(map(str, paths)) for task, paths in files.items()}
@@ -169,7 +166,7 @@ def _export(options: argparse.Namespace, by_task: ByTask, name: str) -> dict[str
 
 
 def _export_lerobot(options: argparse.Namespace, by_task: ByTask) -> dict[str, Path]:
-    # Films are drawn with MuJoCo, which the other kinds do without.
+    # Only films need MuJoCo.
     from fetch_hand_sim.datasets.lerobot import export_lerobot
     from fetch_hand_sim.datasets.lerobot_film import Camera
 

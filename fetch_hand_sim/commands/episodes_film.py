@@ -40,12 +40,14 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         metavar='WxH',
         help='pixels; default: 640x480',
     )
-    parser.add_argument('--camera', help='a camera of the model; default: a good view')
+    parser.add_argument('--camera', help='camera of the model; default: a good view')
     parser.add_argument(
         '--grid', type=two_numbers(20), metavar='CxR', help='columns x rows of episodes: 4x4'
     )
-    parser.add_argument('--frame', type=int, help='of a picture; default: -1, the last')
-    parser.add_argument('--speed', type=float, help='of a film: simulated seconds per second')
+    parser.add_argument('--frame', type=int, help='frame for a picture; default: -1, the last')
+    parser.add_argument(
+        '--speed', type=float, help='simulated seconds per second of a film; default: 1'
+    )
     options = parser.parse_args(arguments)
     if options.speed is not None and not _SPEEDS[0] <= options.speed <= _SPEEDS[1]:
         parser.error(f'--speed {options.speed:g}; allowed: {_SPEEDS[0]:g} ... {_SPEEDS[1]:g}')
@@ -53,7 +55,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
+    """Run the command; return its exit code."""
     options = _parse(arguments)
     return run_command(_NAME, lambda: _run(options))
 
@@ -66,7 +68,6 @@ def _run(options: argparse.Namespace) -> int:
         _check_is_used(options)
         _render(options)
     except ValueError as error:
-        # Unreadable episodes too.
         raise UsageError(str(error)) from None
     except (RuntimeError, OSError) as error:
         raise CommandError(str(error)) from None
@@ -75,16 +76,16 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check_is_used(options: argparse.Namespace) -> None:
-    """Refuses what the kind of file has no use for."""
+    """Raise UsageError for options that the kind of file ignores."""
     from fetch_hand_sim.films.film import STILL
 
     if options.out.suffix.lower() in STILL:
         if options.speed is not None:
             raise UsageError(
-                f'--speed is of a film (.mp4, .gif, .webp); {options.out} is a picture'
+                f'--speed is for films (.mp4, .gif, .webp); {options.out} is a picture'
             )
     elif options.frame is not None:
-        raise UsageError(f'--frame is of a picture (.png, .jpg); {options.out} is a film')
+        raise UsageError(f'--frame is for pictures (.png, .jpg); {options.out} is a film')
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -108,7 +109,7 @@ def _render(options: argparse.Namespace) -> None:
             stills = [draw(studio, recording, index) for recording in recordings]
             write_picture(options.out, tile(stills, columns))
             return
-        # Of several rates the fastest: none loses a frame.
+        # At the fastest rate, no recording loses a frame.
         hz = max(recording.arrays.record.control_hz for recording in recordings)
         pictures: Iterator[Picture] = studio.pictures(recordings[0])
         count = len(recordings[0].frames)

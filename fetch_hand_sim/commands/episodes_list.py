@@ -40,17 +40,16 @@ from node_runtime.command_line import (
 _NAME = 'fetch_hand_sim episodes list'
 _COLUMNS = ('episode', 'task', 'seed', 'steps', 'return', 'success', 'seconds', 'KiB', 'ended')
 _NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB'})
-# Every column fits, whatever a file says: of a name that is cut short nobody finds the episode, so
-# a narrow terminal wraps lines instead.
+# Wide enough for every column. A narrow terminal wraps lines, which keeps names whole.
 _WIDEST = 400
 _LONGEST_CELL = 60
 
 
 def read_summaries(directory: Path) -> tuple[list[EpisodeSummary], list[EpisodeReadError]]:
-    """Reads all episodes of a directory; what cannot be read comes as an error, in one line each.
+    """Read all episodes of a folder; return the errors of the unreadable ones.
 
     Raises:
-        EpisodeReadError: If the directory itself cannot be read.
+        EpisodeReadError: If the folder cannot be read.
     """
     episodes, errors = [], []
     for path in find_episodes(directory):
@@ -62,7 +61,7 @@ def read_summaries(directory: Path) -> tuple[list[EpisodeSummary], list[EpisodeR
 
 
 def make_table(episodes: Sequence[EpisodeSummary]) -> Table:
-    """Returns the table of some episodes."""
+    """Return a table with one row for each episode."""
     table = Table(box=None, pad_edge=False, header_style='bold')
     for name in _COLUMNS:
         table.add_column(name, justify='right' if name in _NUMBERS else 'left', no_wrap=True)
@@ -88,7 +87,7 @@ def _cells(episode: EpisodeSummary) -> list[str]:
 
 
 def _name(file: Path) -> str:
-    """What it is called where it lies: its bag's folder, which may have been renamed or copied."""
+    """Return the current name of an episode; its bag may have been renamed."""
     is_bag = (file.parent / 'metadata.yaml').is_file()
     return file.parent.name if is_bag else file.stem.removesuffix('_0')
 
@@ -98,21 +97,21 @@ def _known(number: int | float | None) -> str:
 
 
 def _shown(cell: str) -> str:
-    """What a file says, so that it leaves room for what others say."""
+    """Return printable text of at most `_LONGEST_CELL` characters."""
     text = printable(cell)
     return text if len(text) <= _LONGEST_CELL else f'{text[: _LONGEST_CELL - 3]}...'
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
-    parser.add_argument('directory', type=Path, help='where episodes are collected')
+    parser.add_argument('directory', type=Path, help='folder of episodes')
     add_filter_options(parser)
-    parser.add_argument('--json', action='store_true', help='print one JSON array, no table')
+    parser.add_argument('--json', action='store_true', help='print a JSON array instead of a table')
     return parser.parse_args(arguments)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
+    """Run the command; return its exit code."""
     options = _parse(arguments)
     return run_command(_NAME, lambda: _run(options))
 
@@ -132,9 +131,9 @@ def _run(options: argparse.Namespace) -> int:
         filtered = len(episodes) - len(shown)
         print(f'{len(shown)} episodes, {successes} successes; {filtered} filtered')
         if not (episodes or errors) and (below := folders_below(options.directory)):
-            print(f'there are some in {below}')
+            print(f'episodes are in {below}')
     for leftover in leftovers:
-        remedy = '' if leftover.problem else '; fetch_hand_sim episodes recover makes a bag of it'
+        remedy = '' if leftover.problem else '; complete it with fetch_hand_sim episodes recover'
         print(f'{leftover}{remedy}', file=sys.stderr if options.json else sys.stdout)
     for skipped in errors:
         complain(_NAME, f'skipped {skipped}')
@@ -150,7 +149,7 @@ def _print_table(episodes: Sequence[EpisodeSummary]) -> None:
 
 
 def _as_json(episode: EpisodeSummary) -> dict[str, Any]:
-    """The row of an episode with values in their own types, None where the file says nothing."""
+    """Return the row of an episode as JSON values, None for missing ones."""
     metadata, outcome = episode.metadata, episode.outcome
     return {
         'path': str(episode.path),

@@ -36,12 +36,12 @@ _NAME = 'fetch_hand_sim episodes recover'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
+    """Run the command; return its exit code."""
     parser = CommandParser(prog=_NAME, description=__doc__)
     parser.add_argument(
-        'directory', type=Path, help='where episodes are collected, or one that is unfinished'
+        'directory', type=Path, help='folder of episodes, or one unfinished episode'
     )
-    parser.add_argument('--dry-run', action='store_true', help='only name what is unfinished')
+    parser.add_argument('--dry-run', action='store_true', help='only list unfinished episodes')
     options = parser.parse_args(arguments)
     return run_command(_NAME, lambda: _run(options))
 
@@ -50,7 +50,7 @@ def _run(options: argparse.Namespace) -> int:
     try:
         # Path.is_dir raises where a name is too long.
         if not os.path.isdir(options.directory):
-            raise UsageError(f'{options.directory} is no directory')
+            raise UsageError(f'{options.directory} is not a folder')
         leftovers = _find(options.directory)
     except EpisodeLogError as error:
         raise UsageError(str(error)) from None
@@ -70,7 +70,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _find(directory: Path) -> list[Leftover]:
-    """The unfinished episodes in a folder; of the folder of one, as lists name it, that one."""
+    """Return the unfinished episodes in a folder, or the one that `directory` names."""
     path = Path(os.path.abspath(directory))
     if files.active_name(path) is None:
         return find_leftovers(directory)
@@ -84,7 +84,7 @@ def _without_messages(leftover: Path) -> str:
 
 
 def _recover(leftover: Path) -> bool:
-    """Recovers one episode and says what came out; False if it is left unfinished."""
+    """Recover one episode and print the result; return False if it stays unfinished."""
     try:
         path = recover_episode(leftover)
         if path is None:

@@ -384,7 +384,7 @@ def test_an_episode_without_a_step_is_left_out_of_a_dataset_by_name(tmp_path, ca
     assert episodes_export.main(arguments) == 1
     printed = capsys.readouterr()
     assert '1 episodes of FetchReach: Minari dataset FetchReach/logged-v0' in printed.out
-    assert 'seed1: no step was taken, and Minari needs one' in printed.err
+    assert 'seed1: no steps; Minari needs at least one' in printed.err
     assert_one_line_each(printed.err, 1)
 
 

@@ -391,7 +391,7 @@ def test_list_calls_episodes_as_their_folders_and_names_those_below(reach, tmp_p
     assert [line.split('  ')[0] for line in lines[1:3]] == ['kept', 'kept too']
     assert episodes_list.main([str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == f'there are some in {tmp_path / "day 1"}'
+    assert lines[-1] == f'episodes are in {tmp_path / "day 1"}'
 
 
 def test_a_narrow_terminal_wraps_names_and_numbers_instead_of_cutting_them(
@@ -536,7 +536,7 @@ def test_recover_makes_bags_of_leftovers_and_says_which_it_cannot(reach, tmp_pat
     damaged.write_bytes(bytes(100) + damaged.read_bytes()[100:])
     assert episodes_recover.main([str(tmp_path), '--dry-run']) == 0
     assert episodes_list.main([str(tmp_path)]) == 0
-    assert capsys.readouterr().out.count('fetch_hand_sim episodes recover makes a bag of it') == 3
+    assert capsys.readouterr().out.count('complete it with fetch_hand_sim episodes recover') == 3
     assert episodes_recover.main([str(tmp_path)]) == 1
     output = capsys.readouterr()
     assert 'marked as interrupted' in output.out

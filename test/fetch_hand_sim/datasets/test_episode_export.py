@@ -349,4 +349,4 @@ def test_an_episode_and_a_link_to_it_are_one(episodes, tmp_path, capsys):
     )
     printed = capsys.readouterr()
     assert '1 episodes of ' in printed.out
-    assert f'{folder / "b"} is {folder / "a"}, which is taken once' in printed.err
+    assert f'{folder / "b"} is {folder / "a"}, which is exported once' in printed.err

@@ -166,7 +166,7 @@ def test_colors_are_summed_up_as_numbers_are():
 @pytest.mark.parametrize(
     ('arguments', 'says'),
     [
-        (['--to', 'lerobot', '--pictures', '95x96'], 'even sides'),
+        (['--to', 'lerobot', '--pictures', '95x96'], 'must be even'),
         (['--to', 'lerobot', '--pictures', 'large'], '1x1 ... 4096x4096'),
         (['--to', 'lerobot', '--pictures', '0x0'], '1x1 ... 4096x4096'),
         (['--to', 'minari', '--pictures', '96x96'], 'is for --to lerobot'),
