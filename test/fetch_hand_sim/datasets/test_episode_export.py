@@ -298,7 +298,7 @@ def test_of_a_folder_only_what_is_asked_for_is_exported(episodes, tmp_path, monk
         assert [each['complete'] for each in told] == complete
         assert dataset.storage.metadata['dataset_size'] == dataset.storage.get_size()
     assert episodes_export.main([*arguments, '--task', 'FetchReach']) == 2
-    assert f'none of 3 episodes in {folder} is one of' in capsys.readouterr().err
+    assert f'the filters reject all 3 episodes in {folder}' in capsys.readouterr().err
     assert episodes_export.main([str(tmp_path), *arguments[1:]]) == 2
     assert f'{tmp_path} holds no episode; there are some in {folder}' in capsys.readouterr().err
 
