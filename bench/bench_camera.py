@@ -1,7 +1,7 @@
-"""What the camera of `visualization_node` costs, with and without somebody who looks.
+"""Measure the CPU time of `visualization_node`'s camera, with and without subscribers.
 
 `make bench-camera` runs it. A robot runs in real time, `visualization_node` beside it; in turn
-nobody subscribes, then somebody takes raw pictures, then JPEG. Said is the processor time of
+there is no subscriber, then one of raw pictures, then one of JPEG. Said is the processor time of
 `visualization_node`, what arrived of pictures, and the rate of `joint_states`.
 """
 
@@ -80,7 +80,7 @@ def measure(watcher: Watcher, pid: int, label: str, seconds: float) -> None:
 
 
 def main() -> None:
-    """Measures without anybody, with raw pictures, with JPEG."""
+    """Measure without subscriber, with raw pictures, with JPEG."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--task', default='FetchPush', choices=tuple(TASKS))
     parser.add_argument('--seconds', type=float, default=20.0, help='per measurement')

@@ -1,4 +1,4 @@
-"""What logging costs a robot, and whether its memory grows (`make bench-episodes`).
+"""Measure the CPU time and memory of logging (`make bench-episodes`).
 
 The ticks of one episode are recorded beforehand; then the recorder of `sim_node` writes them over
 and over, paced, so that files are completed behind the back of running ticks as on a robot.

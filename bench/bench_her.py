@@ -195,7 +195,7 @@ def plot(rows: Sequence[Row], path: Path, title: str) -> None:
 
 
 def describe_machine(options: argparse.Namespace) -> str:
-    """What was measured on what, one line."""
+    """Return machine and versions in one line."""
     tqc = ['sb3_contrib'] if 'sb3_tqc' in options.competitors else []
     versions = ('mujoco', 'torch', 'stable_baselines3', *tqc)
     parts = [
@@ -232,7 +232,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def write_csv(rows: Sequence[Row], columns: Sequence[str], path: Path, machine: str) -> None:
-    """Writes rows below a comment that says where they come from."""
+    """Write rows below a comment with the machine."""
     with path.open('w', newline='') as file:
         file.write(f'# {machine}\n')
         writer = csv.DictWriter(file, columns, lineterminator='\n')

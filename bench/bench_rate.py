@@ -1,7 +1,7 @@
-"""The rate of `joint_states` in real time, as an independent subscriber sees it.
+"""Measure the rate of `joint_states` in real time with an independent subscriber.
 
-`make bench-rate` runs it: on the machine as it is, while somebody sends ten messages of 10 MB a
-second, then with every CPU kept busy by a process of its own. Late ticks are those `sim_node`
+`make bench-rate` runs it: on the idle machine, beside ten messages of 10 MB a second, then with a
+busy process on every CPU. Late ticks are those `sim_node`
 counts itself, read from `/diagnostics`. At the end: how soon after its start a policy commands.
 """
 
@@ -36,7 +36,7 @@ from node_runtime.transport import keep_discovery_local, leave_out_shared_memory
 
 
 class Watcher:
-    """Notes when joint states arrive and what the robot says of missed ticks."""
+    """Records the arrival of joint states and the missed ticks that the robot reports."""
 
     def __init__(self, joint_states: TopicSpec) -> None:
         self.times: list[float] = []
@@ -59,7 +59,7 @@ class Watcher:
             self._loop.wait(min(left, 0.1))
 
     def wait_for_ticks(self, timeout: float = 60.0) -> None:
-        """Waits until the robot is heard."""
+        """Wait for the first ticks of the robot."""
         end = time.perf_counter() + timeout
         while len(self.times) < 25:
             if time.perf_counter() > end:

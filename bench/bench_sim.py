@@ -147,7 +147,7 @@ def _median_ratio(ours: list[float], theirs: list[float]) -> float:
 
 
 def describe_machine() -> str:
-    """What the numbers were measured on, one line."""
+    """Return machine and versions in one line."""
     parts = [
         processor(),
         f'{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start',

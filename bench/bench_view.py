@@ -1,11 +1,9 @@
-"""What viewers cost a robot: the rate of `joint_states` without any, with one, with its visitors.
+"""Measure the rate of `joint_states` without viewer, with one, and with its visitors.
 
-`make bench-view` runs it. Visitors are web sockets that take every picture and draw none, and one
-that asks for everything and then reads and confirms nothing; with `--browser` a headless Chromium
-draws as well, on the same processors. In lockstep a policy that rests answers every tick, so ticks
-per second say what is left of the machine; since that changes by itself from one minute to the
-next, the viewer is stopped (`SIGSTOP`) every other two seconds. `taskset -c 0,1 ...` leaves two
-processors.
+`make bench-view` runs it. Visitors are web sockets that receive every picture, and one that
+never reads; `--browser` adds a headless Chromium on the same CPUs. In lockstep, a resting policy
+answers every tick, so ticks per second measure the free CPU time. Because that varies over minutes,
+the viewer is stopped (`SIGSTOP`) every other two seconds. `taskset -c 0,1 ...` leaves two CPUs.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ from support.visitors import DeafVisitor, Visitor  # noqa: E402
 VISITORS = 3
 # Seconds of a turn with the viewer or without, and before it until either is under way.
 _TURN, _SETTLING = 1.6, 0.4
-# Seconds after which a process that was told to end is killed.
+# Seconds from SIGTERM to SIGKILL.
 _END_TIMEOUT = 20.0
 
 
@@ -93,7 +91,7 @@ def take_turns(watcher: Watcher, seconds: float) -> None:
         watcher.watch(2.0)
         turns = np.zeros((max(2, round(seconds / _TURN)), 2))
         for index, turn in enumerate(turns):
-            # Who begins changes too.
+            # The order alternates.
             for runs in (0, 1) if index % 2 else (1, 0):
                 view.send_signal(signal.SIGCONT if runs else signal.SIGSTOP)
                 turn[runs] = rate(watcher, _TURN)

@@ -1,4 +1,4 @@
-"""What importance weights make of luck: FetchPush with a gamble, episodes of the shipped actor.
+"""Measure importance weights on luck: FetchPush with a gamble, episodes of the shipped actor.
 
 A goal that is chosen because a gamble led to it makes the gamble look good. Weights should take
 that back, so that gambles succeed as often as landings meet goals, and leave pushes as they are.

@@ -19,7 +19,7 @@ from msgs_spec.robots import FINGERTIPS
 from policy_node import load_policy
 from policy_node.training.evaluation.episodes import FIRST_SEED, run_episodes
 
-# A goal asks a finger to move where it is farther away than this, metres.
+# A finger has to move if its goal is farther away than this, in metres.
 _ASKED = 0.02
 # The thumb, which is last, moves whichever finger does.
 _FINGERS = FINGERTIPS[:-1]

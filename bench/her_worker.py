@@ -45,7 +45,7 @@ SAC_ENVS = 8
 
 
 class Examiner:
-    """Keeps the training clock, evaluates when due and says when to stop."""
+    """Measures training time, evaluates at intervals and decides when to stop."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self._options = options
@@ -145,7 +145,7 @@ COMPETITORS = {
 
 
 def main() -> None:
-    """Trains as the command line says."""
+    """Train one competitor."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('competitor', choices=COMPETITORS)
     parser.add_argument('task')

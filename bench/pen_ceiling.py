@@ -55,7 +55,7 @@ def smallest_rotation(task: str, goals: Array, generator: np.random.Generator) -
 
 
 def has_other_sign(goals: Array) -> NDArray[np.bool_]:
-    """Whether the quaternion of a goal, to Euler angles and back, comes out with the other sign."""
+    """Return whether conversion to Euler angles and back flips the sign of a goal's quaternion."""
     there_and_back = euler_to_quaternion(quaternion_to_euler(goals[:, 3:]))
     return np.asarray((there_and_back * goals[:, 3:]).sum(axis=-1) < 0.0)
 

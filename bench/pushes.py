@@ -1,7 +1,7 @@
 """In how many episodes of FetchPush a policy moves the block, and where its gripper goes.
 
-On-policy learning sees what noise around its own actor does and nothing else: an actor whose noisy
-episodes leave the block alone has nothing to learn from (docs/research/onpolicy).
+On-policy learning only sees the noisy episodes of its own actor. If they never move the block, the
+actor cannot learn (docs/research/onpolicy).
 
 python bench/pushes.py none --noise .8
 python bench/pushes.py runs/push/latest.safetensors --noise .8

@@ -167,7 +167,7 @@ def main() -> None:
     """Answers requests until standard input ends."""
     warnings.simplefilter('ignore')
     answers = os.fdopen(os.dup(1), 'w')
-    os.dup2(2, 1)  # What the peers print must not end up among the answers.
+    os.dup2(2, 1)  # Keeps the output of the peers out of the answers.
     implementation, task, reference_id, num_envs, threads, path = sys.argv[1:]
     worker = WORKERS[implementation](task, reference_id, int(num_envs), int(threads), path)
     print(json.dumps({'ready': implementation}), file=answers, flush=True)

@@ -33,7 +33,7 @@ TESTS = (
 )
 PAGES = ('README.md', 'docs/content', 'docs/envs/fetch', 'docs/envs/shadow_dexterous_hand')
 DOCSTRINGS = ('fetch', 'shadow_dexterous_hand')
-# What an example leaves to its reader, in the reference and here.
+# Imports that examples omit, in the reference and here.
 THEIRS = 'import gymnasium, gymnasium_robotics\ngymnasium.register_envs(gymnasium_robotics)\n'
 OURS = 'import fetch_hand_sim\nfetch_hand_sim.register_gymnasium_robotics(override=True)\n'
 # Loaded by pytest before its tests: they take the environments that `tests.utils` lists.

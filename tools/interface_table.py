@@ -85,7 +85,7 @@ def _code(text: str) -> str:
 
 
 def _family(tasks: Iterable[TaskSpec]) -> str:
-    """What a set of tasks is called."""
+    """Return the name of a set of tasks."""
     names = {task.name for task in tasks}
     for label, belongs in _FAMILIES.items():
         if names == {task.name for task in TASKS.values() if belongs(task)}:

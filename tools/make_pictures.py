@@ -1,7 +1,7 @@
 """`make pictures`: the film of the README and a picture of every task, from logged episodes.
 
-Each task's shipped actor plays a few episodes, which are logged and drawn; where there is no actor
-yet, commands are random and the picture says so.
+The shipped actor of each task plays a few episodes, which are logged and drawn. Without an actor,
+commands are random; the picture names them.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ MOMENT = 0.4
 
 @dataclass(frozen=True)
 class Act:
-    """What one tile shows: episodes one after the other, and a line of text."""
+    """Content of one tile: consecutive episodes and a line of text."""
 
     recordings: list[Recording]
     text: str
 
 
 def log_episodes(task: str, folder: Path) -> list[Recording]:
-    """Lets the shipped actor play; random commands where there is none."""
+    """Log episodes of the shipped actor, or of random commands."""
     policy = task if is_actor_shipped(task) else 'random'
     arguments = ['--task', task, '--policy', policy, '--episodes', str(EPISODES)]
     code = generate_episodes([*arguments, '--num-envs', '16', '--output', str(folder / task)])
@@ -57,7 +57,7 @@ def log_episodes(task: str, folder: Path) -> list[Recording]:
 
 
 def is_worth_showing(recording: Recording) -> bool:
-    """Whether the goal is reached at the end and was not at the start."""
+    """Return whether the robot reaches the goal after the first tenth of the episode."""
     success = recording.arrays.success
     return bool(success[-1]) and not bool(success[: len(success) // 10].any())
 

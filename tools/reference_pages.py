@@ -1,4 +1,4 @@
-"""The pages of the reference that only the installed package knows: commands, training fields.
+"""Write the generated pages of the reference: commands and training fields.
 
 `make docs` writes them to `docs/generated`, which git ignores.
 """

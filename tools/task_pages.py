@@ -1,7 +1,7 @@
-"""What the pages of docs/tasks say in numbers: from `msgs_spec` and the shipped actors.
+"""Write the numbers in the pages of docs/tasks, from `msgs_spec` and the shipped actors.
 
-`python tools/task_pages.py --write` renews them between their markers; the words around stay. A
-page that is missing is begun.
+`python tools/task_pages.py --write` replaces the text between the markers of each page and creates
+missing pages.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def index_section(actors: Path = ACTORS) -> str:
 
 
 def _thirteen() -> list[TaskSpec]:
-    # Those of other packages have no reference.
+    # Third-party tasks have no reference.
     return [task for task in TASKS.values() if task.reference_id is not None]
 
 

@@ -60,7 +60,7 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
 
 
 def test_every_page_is_in_the_documentation() -> None:
-    """What no table of contents names, Sphinx would warn of; GitHub's readers would not find it."""
+    """Each page is in a table of contents, where readers on GitHub find it."""
     listed: set[Path] = set()
     for page in pages():
         for block in re.findall(

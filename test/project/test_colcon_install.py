@@ -1,4 +1,4 @@
-"""What `colcon build` installs: the layout ROS tools look for, and nodes that start from it."""
+"""`colcon build` installs the layout of ROS packages; `colcon test` runs the tests."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def workspace(tmp_path_factory):
         shutil.copy2(ROOT / name, target)
     build = colcon(workspace, 'build')
     assert build.returncode == 0, build.stdout + build.stderr
-    # colcon repairs an incomplete `data_files` and says so; pip would not.
+    # colcon completes missing `data_files` with a warning; pip does not.
     assert 'WARNING' not in build.stderr
     return workspace
 
@@ -80,7 +80,7 @@ def in_install(workspace, ros_environment):
 
 @pytest.fixture(scope='module')
 def distribution(prefix):
-    """What setup.py declares, as installed."""
+    """The installed metadata of setup.py."""
     (site_packages,) = prefix.glob('lib/python3*/site-packages')
     (found,) = importlib.metadata.distributions(name=PACKAGE, path=[str(site_packages)])
     return found
@@ -98,7 +98,7 @@ def test_every_executable_is_where_ros2_run_looks(prefix, executables):
     assert {path.name for path in folder.iterdir()} == executables
     for path in folder.iterdir():
         assert path.stat().st_mode & stat.S_IXUSR, path
-        # Not the interpreter of the build: the node must find the packages of whoever starts it.
+        # Not the interpreter of the build: the node needs the packages of the user's environment.
         assert path.read_text().startswith('#!/usr/bin/env python3\n'), path
 
 
@@ -119,7 +119,7 @@ def test_data_files_are_all_installed(prefix, folder):
 @pytest.mark.parametrize('package', PYTHON_PACKAGES)
 def test_every_tracked_file_of_a_python_package_is_installed(distribution, package):
     site_packages = Path(distribution.locate_file(''))
-    # What training goes on from stays in the repository.
+    # Critics stay in the repository.
     tracked = {
         name
         for name in tracked_files()

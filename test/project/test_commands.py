@@ -18,7 +18,7 @@ from node_runtime.command_line import EXTRAS
 from support import script_environment
 from support.entry_points import console_scripts, leaves, started_as_modules
 
-# What each command needs beyond the base installation.
+# Modules that each command needs beyond the base installation.
 NEEDS = {
     'sim': ['rclpy'],
     'policy': ['rclpy'],

@@ -1,4 +1,4 @@
-"""Ctrl-C while a command is being loaded: one line and 130, wherever it comes; no traceback."""
+"""Ctrl-C while a command is imported ends in one line and exit code 130, without traceback."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from support.entry_points import console_scripts, started_as_modules
 
 # As pip writes it into the folder of programs.
 SCRIPT = 'import sys\nfrom {module} import {function}\nsys.exit({function}())\n'
-# What `python -X importtime` says after each import begins so.
+# Start of the lines of `python -X importtime`.
 IMPORT = 'import time:'
-# The last import before Ctrl-C is answered.
+# The last import before Ctrl-C has its handler.
 GUARD = 'node_runtime.signals'
 
 

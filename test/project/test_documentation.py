@@ -1,7 +1,6 @@
-"""What README and docs show can be done: Python blocks run, command lines are understood.
+"""The examples in README and docs are valid: Python blocks run, parsers accept command lines.
 
-Python runs as it stands. A command line is handed to the parser of what it names, which must take
-it; some are run. What is somebody else's (pip, git, ...) is only known by name.
+Some command lines also run. Other programs (pip, git, ...) are only known by name.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from msgs_spec.topics import topics
 from support import ROOT, script_environment
 from support.shell_lines import commands, python_blocks, shell_lines
 
-# Of others, or of the reader: nothing here says what they take.
+# Other programs, or files of the reader.
 FOREIGN = set('. > apt cd colcon git ls mkdir pip python3 rviz2 ssh touch uvx'.split())
 # The controller is run by test_write_your_own_controller.py, against a robot.
 RUN_ELSEWHERE = {'write_your_own_controller.md'}

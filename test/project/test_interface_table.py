@@ -1,4 +1,4 @@
-"""The tables of docs/interface.md are what the package says."""
+"""The tables of docs/interface.md equal the definitions in the package."""
 
 from __future__ import annotations
 

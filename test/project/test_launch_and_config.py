@@ -29,7 +29,7 @@ def resolved(text: str, arguments: dict[str, str]) -> str:
 
 
 def is_meant(action: ElementTree.Element, arguments: dict[str, str]) -> bool:
-    """What `if` says; its one form here is `not-equals`."""
+    """Evaluate `if`; these files only use `not-equals`."""
     condition = action.get('if')
     if condition is None:
         return True
@@ -160,7 +160,6 @@ def test_what_is_only_looked_at_runs_on_and_is_not_logged():
         '',
     )
     assert values['wait_for_commands'] is True
-    # Which is whatever the robot does.
     assert parameters_of('policy_node', **given_by_view())['task'] == ''
     logged = parameters_of('sim_node', **given_by_view(episode_dir='there'))
     assert logged['episode_dir'] == 'there'

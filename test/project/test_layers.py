@@ -19,7 +19,7 @@ PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
 TRAINING = 'policy_node.training'
 
 ABOVE_RUNTIME = ('fetch_hand_sim', 'policy_node', 'mujoco', 'gymnasium', 'torch', 'safetensors')
-# What a module may never import, at any depth of its code, by the innermost package named here.
+# Packages that modules may not import, even in functions; the innermost key applies.
 FORBIDDEN = {
     'msgs_spec': ('node_runtime', *ABOVE_RUNTIME),
     'node_runtime': ABOVE_RUNTIME,
@@ -66,7 +66,7 @@ class Import:
 
 
 def is_within(module: str, package: str) -> bool:
-    """Whether `module` is `package` or lies in it."""
+    """Return whether `module` is `package` or a part of it."""
     return module == package or module.startswith(package + '.')
 
 
@@ -85,7 +85,7 @@ def _absolute(node: ast.ImportFrom, package: str) -> str:
     return '.'.join([*base, node.module] if node.module else base)
 
 
-# What takes the name of a module or package as its first argument, a bare name too.
+# Functions whose first argument is the name of a module or package.
 _BY_NAME = ('import_module', '__import__', 'find_spec', 'run_module', 'files', 'resolve_name')
 # Inside any other text, for `python -m` and the like, a package counts only with what follows it:
 # `policy_node` alone is the name of a node and of an executable, which is found as an entry point.
@@ -136,7 +136,7 @@ def imports(source: str, package: str) -> Iterator[Import]:
 
 
 def forbidden(module: str) -> tuple[str, ...]:
-    """What `module` may not import."""
+    """Return the packages that `module` may not import."""
     layer = max((name for name in FORBIDDEN if is_within(module, name)), key=len)
     return FORBIDDEN[layer]
 
@@ -186,7 +186,7 @@ def import_graph(modules: Mapping[str, str], late: bool = False) -> dict[str, se
         loaded = {each.module for each in found if late or not each.nested}
         if late:
             loaded.discard(package)
-        # `from a import b` says `a` and `a.b`; where `a.b` is a module, `a` is only its place.
+        # `from a import b` counts as `a` and `a.b`; if `a.b` is a module, `a` is only its package.
         places = {module.rpartition('.')[0] for module in loaded if module in modules}
         packages = {f'{module}.__init__' for module in loaded - places}
         graph[name] = ((loaded | packages) & set(modules)) - {name}

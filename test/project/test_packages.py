@@ -1,4 +1,4 @@
-"""What is published: wheel, sdist and package.xml are whole and say the same."""
+"""Wheel, sdist and package.xml are complete and agree."""
 
 from __future__ import annotations
 

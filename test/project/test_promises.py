@@ -1,4 +1,4 @@
-"""What docs/promises.md promises to stay, name by name, as it was in version 1.0."""
+"""The names that docs/promises.md keeps still exist."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def test_a_command_is_shown_with_what_it_prints() -> None:
 
 
 def constructors() -> Iterator[tuple[str, str]]:
-    """Name of each class, where it is, and what its `__init__` says."""
+    """Yield each class with its place and the docstring of its `__init__`."""
     for package in ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node'):
         for path in (ROOT / package).rglob('*.py'):
             for node in ast.walk(ast.parse(path.read_text())):

@@ -1,4 +1,4 @@
-"""A test run that is killed leaves no node behind, and its ROS domain is free again."""
+"""A killed test run leaves no node behind and releases its ROS domain."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from support import ROOT, script_environment
 from support.run_guard import DOMAIN_LOCK_PORT, processes_of
 
-# What the run starts, and what that starts in a session of its own.
+# A test that starts a demo, which starts nodes in sessions of their own.
 TEST = """
 import os, sys, time
 

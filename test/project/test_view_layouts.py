@@ -1,4 +1,4 @@
-"""Layouts for rviz2, Foxglove and PlotJuggler show topics that there are."""
+"""Layouts for rviz2, Foxglove and PlotJuggler show existing topics."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def plotjuggler():
 
 
 def lua(text, values):
-    """What a function of the layout returns."""
+    """Run a Lua function of the layout."""
     names = {'math': SimpleNamespace(sqrt=math.sqrt, acos=math.acos, min=min, max=max)}
     names |= {'value': values[0]} | {f'v{i}': each for i, each in enumerate(values[1:], start=1)}
     return eval(text.removeprefix('return ').replace('^', '**'), names)

@@ -38,8 +38,7 @@ def find_browser() -> str | None:
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
-# Seconds after which a browser that says nothing counts as broken, on a machine without a GPU that
-# does other things too.
+# Seconds without an answer after which a browser counts as broken, on a busy machine without GPU.
 _PATIENCE = 180.0
 _CONTROL = 2
 _KEY_CODES = {'Control': 17, 'ArrowLeft': 37, 'ArrowUp': 38, 'ArrowRight': 39, 'ArrowDown': 40}
@@ -144,12 +143,12 @@ class Browser:
         )
 
     def screenshot(self) -> Picture:
-        """What the page shows, (height, width, 3)."""
+        """Return the pixels of the page, (height, width, 3)."""
         data = base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
         return np.asarray(Image.open(BytesIO(data)).convert('RGB'))
 
     def requests(self) -> list[str]:
-        """Addresses that the page has asked for."""
+        """Return the addresses that the page requested."""
         return [
             event['params']['request']['url']
             for event in self.events

@@ -90,7 +90,7 @@ class Message:
 
 @dataclass
 class Content:
-    """What a file says; every part may be changed."""
+    """The content of a file, to be changed in any part."""
 
     metadata: dict[str, str]
     result: dict[str, str]
@@ -220,7 +220,7 @@ class Crafter:
             return [message]
         return [each for each in content.messages if each.topic == message.topic]
 
-    # What the records say
+    # Records
 
     def number(self, content: Content) -> None:
         content.metadata[self.pick(('seed', 'episode', 'episode_ticks'))] = self.pick(NUMBERS)
@@ -256,7 +256,7 @@ class Crafter:
             )
         )
 
-    # What the messages say
+    # Messages
 
     def values(self, content: Content) -> None:
         for message in self.some(content):
@@ -330,7 +330,7 @@ class Crafter:
         for message in content.messages:
             message.topic = new[message.topic]
 
-    # What the topics are
+    # Topics
 
     def renamed_topic(self, content: Content) -> None:
         old, new = self.pick(tuple(content.types)), self.pick((*NAMES, '/x/y', 'clock', '//'))
@@ -480,7 +480,7 @@ def main() -> int:
             attack.place(file)
             for name in attack.tools:
                 signal.alarm(int(10 * CPU_SECONDS))
-                # What a reader of one file needs: what thousands before it left does not count.
+                # Counts the memory of this reader only.
                 reset_peak_memory()
                 resident = peak_memory()
                 began = time.process_time()

@@ -1,4 +1,4 @@
-"""What users can start: executables, commands, and modules for `python -m`."""
+"""Everything that users can start: executables, commands, and modules for `python -m`."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def leaves(
 
 
 def started_as_modules() -> list[str]:
-    """What `python -m` can start."""
+    """Return the modules that `python -m` can start."""
     found = []
     for package in ('fetch_hand_sim', 'policy_node'):
         for path in sorted((ROOT / package).rglob('*.py')):
             parts = path.relative_to(ROOT).with_suffix('').parts
             if parts == ('policy_node', 'policies', 'onnx'):
-                continue  # A child that tries a file out; nobody else starts it.
+                continue  # Only `load_policy` starts it.
             if path.name == '__main__.py':
                 found.append('.'.join(parts[:-1]))
             elif "__name__ == '__main__'" in path.read_text():

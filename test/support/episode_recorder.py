@@ -27,7 +27,7 @@ from msgs_spec.topics import TopicSpec, topic
 
 @dataclass(frozen=True)
 class RecordedTick:
-    """What is logged between two stamps: the messages of the tick, then the command received."""
+    """The log between two stamps: messages of the tick, then the received command."""
 
     stamp_ns: int
     messages: list[tuple[TopicSpec, bytes]]

@@ -1,4 +1,4 @@
-"""Actors nobody trained, and observations for them to answer."""
+"""Untrained actors, and observations for them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def observations(spec: TaskSpec, *leading: int, seed: int = 0) -> dict[str, np.n
 
 
 def fresh_actor(path: Path, task: str, **changes: object) -> Actor:
-    """Writes an actor nobody trained, with normalisers that are not trivial."""
+    """Write an untrained actor with non-trivial normalisers."""
     torch.manual_seed(1)
     spec = task_spec(task)
     fields = {

@@ -1,4 +1,4 @@
-"""A disk that is full, as far as files of this process are concerned."""
+"""A full disk for the files of this process."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ class Client:
         return [EpisodeStatus.from_values(decode_status(message)) for message in messages]
 
     def reports(self, node: str = '/sim_node') -> list[DiagnosticStatus]:
-        """What a node has said on `/diagnostics`."""
+        """Return the reports of a node on `/diagnostics`."""
         found = (message.status[0] for message in self.received['/diagnostics'])
         return [status for status in found if status.name == node]
 

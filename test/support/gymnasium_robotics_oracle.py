@@ -1,4 +1,4 @@
-"""Plays random actions in Gymnasium-Robotics and writes down what it says.
+"""Play random actions in Gymnasium-Robotics and record its answers.
 
 Runs in a process of its own under `python -O`: on MuJoCo >= 3.17 that package stops at an `assert`
 which compares an enum with a NumPy integer, and on other rates at one on its metadata.

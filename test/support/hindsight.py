@@ -1,4 +1,4 @@
-"""What hindsight of Stable-Baselines3 must find in an environment of this project."""
+"""Checks of Stable-Baselines3's hindsight replay on environments of this project."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def damaged(generator: np.random.Generator, data: bytes) -> bytes:
 
 
 def introduction(sha256: str) -> Any:
-    """What a commander says of itself."""
+    """Return the status message of a policy node."""
     return build_status(POLICY_STATUS, 0, 'policy', {'checkpoint_sha256': sha256})
 
 

@@ -1,4 +1,4 @@
-"""Kills processes that log episodes, each at a random moment, and says what they had lived through.
+"""Kill processes that log episodes, each at a random moment, and print their progress.
 
     python test/support/killed_recorder.py DIRECTORY KILLS LONGEST_LIFE SEED
 

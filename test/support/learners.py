@@ -1,4 +1,4 @@
-"""A learner small enough that what it should come to can be told by hand."""
+"""A learner whose result is known."""
 
 from __future__ import annotations
 

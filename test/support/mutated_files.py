@@ -144,7 +144,7 @@ class Mutator:
         return _bag(content, messages, self.random)
 
     def damage_in_a_valid_chunk(self) -> bytes:
-        """Flipped bits under a right CRC: somebody made them."""
+        """Flipped bits under a valid CRC."""
         data = bytearray()
         position = 0
         for offset, chunk in _chunks(self.whole, self.records):
@@ -159,7 +159,7 @@ class Mutator:
         return bytes(data + self.whole[position:])
 
     def bomb(self) -> bytes:
-        """Little that unpacks to much, told or not."""
+        """A small chunk of large uncompressed size, with a right or wrong size field."""
         size = int(2 ** self.random.integers(20, 31))
         told = int(self.random.choice([size, 2**12, 2**40]))
         zeros = bytes(min(size, 2**26))
@@ -274,7 +274,7 @@ READERS = {
 
 
 def outcome(read: object, path: Path) -> str:
-    """What a reader did; whatever else it raises comes through and fails the run."""
+    """Return the outcome of a reader; unexpected errors fail the run."""
     try:
         result = read(path)
     except (EpisodeReadError, EpisodeLogError) as error:

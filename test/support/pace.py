@@ -1,4 +1,4 @@
-"""Whether a robot in real time keeps its pace beside something, also on a machine that is busy."""
+"""Check that a robot keeps its rate beside a load, even on a busy machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from support.graph import Client
 
 TOPIC = 'achieved_goal'
 CONTROL_HZ = 25.0
-# Ticks per second that nobody may cost a robot.
+# Allowed loss of ticks per second.
 _LOSS = 0.4
 # Seconds before a turn and of a turn; after so many pairs of turns the robot is found too slow.
 _SETTLING, _TURN = 0.5, 3.0
@@ -22,15 +22,14 @@ _PAIRS = 6
 def assert_keeps_pace(
     connection: Client, beside: Callable[[], AbstractContextManager[object]]
 ) -> None:
-    """Compares turns of a robot that is left alone with turns beside something.
+    """Compare the simulated time that passes with and without a load.
 
-    What counts is how far the simulated time gets: a tick that is missed is never made up for. On
-    a quiet machine one pair of turns tells 24 Hz from 25. On a busy one both kinds of turns are as
-    slow as others leave them, so more pairs are taken until they are as fast as each other.
+    Other processes slow both kinds of turns, so on a busy machine more pairs of turns follow until
+    both are equally fast. A missed tick is lost, so simulated time counts all of them.
 
     Args:
-        connection: Has subscribed to `TOPIC`.
-        beside: Begins what the robot shall not notice, and ends it.
+        connection: A client that subscribed to `TOPIC`.
+        beside: Context in which the load runs.
     """
     alone, disturbed = np.zeros(2), np.zeros(2)
     for _ in range(_PAIRS):
@@ -38,15 +37,15 @@ def assert_keeps_pace(
         with beside():
             disturbed += progress(connection)
         before, now = (CONTROL_HZ * simulated / real for simulated, real in (alone, disturbed))
-        # Faster than it should be is only how a busy machine delivers.
+        # A busy machine may deliver ticks in bursts, above 25 Hz.
         if now > min(before, CONTROL_HZ) - _LOSS:
             return
-    raise AssertionError(f'{now:.2f} Hz, {before:.2f} Hz when left alone')
+    raise AssertionError(f'{now:.2f} Hz, {before:.2f} Hz without load')
 
 
 def progress(connection: Client) -> np.ndarray:
-    """Simulated and real seconds of a turn, from the arrival of one tick to that of another."""
-    # Ticks that came while nobody listened would count with the time at which they are read.
+    """Return simulated and real seconds between the arrivals of two ticks."""
+    # Ticks that arrived before the subscriber spins would have a wrong arrival time.
     connection.spin(_SETTLING)
     began = _next_tick(connection)
     connection.spin(_TURN)
@@ -54,7 +53,7 @@ def progress(connection: Client) -> np.ndarray:
 
 
 def _next_tick(connection: Client) -> np.ndarray:
-    """Stamp and arrival of the next tick, s; a robot that stands still has none."""
+    """Return stamp and arrival of the next tick, in seconds."""
     ticks = connection.received[TOPIC]
     count = len(ticks)
     connection.spin_until(lambda: len(ticks) > count, 'tick')

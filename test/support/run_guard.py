@@ -1,9 +1,8 @@
-"""Ends with a test run what the run started, however the run ends; keeps its domain until then.
+"""Kill the processes of a test run when the run ends, and hold its ROS domain until then.
 
-A run that is killed takes the lock of its ROS domain along, but not its nodes: in the domain of the
-next run they would answer its tests. So a process of its own holds the lock, waits for the end of
-the run, and kills whatever carries the run's mark in the environment it was started with: nodes,
-and what commands such as `demo` start in sessions of their own.
+Nodes outlive a killed run and would answer the tests of the next run in their domain. A guard
+process therefore holds the lock of the domain, waits for the end of the run, and kills every
+process whose environment contains the log directory of the run.
 
     python run_guard.py LOG_DIRECTORY  <a pipe whose other end only the run has
 """
@@ -19,23 +18,23 @@ import sys
 import time
 from pathlib import Path
 
-# Of `domain_coordinator` (ament_cmake_ros), so its users and these runs avoid each other.
+# The port of `domain_coordinator` (ament_cmake_ros), so that its users avoid these domains.
 DOMAIN_LOCK_PORT = 32768
 
 
 def start_guard(lock: socket.socket, log_directory: str) -> None:
-    """Starts a guard of this process, which hands the lock on.
+    """Start a guard of this process.
 
     Args:
-        lock: Reserves the domain of this run while any process has it open.
-        log_directory: ROS_LOG_DIR of all that this run starts, by which it is known; removed.
+        lock: Socket that reserves the domain of this run while a process has it open.
+        log_directory: ROS_LOG_DIR of the processes of this run; the guard removes it.
     """
-    # The end to write stays open until this process ends, and no other program inherits it.
+    # The write end stays open until this process ends; other programs do not inherit it.
     read_end, _ = os.pipe()
     subprocess.Popen(
         [sys.executable, '-S', '-E', __file__, log_directory],
         stdin=read_end,
-        # Whoever reads the output of the run shall not wait for its guard.
+        # A reader of the run's output must not wait for the guard.
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env={},

@@ -21,7 +21,7 @@ DEADLINE = 30.0
 
 
 def describe(spec, message):
-    """What a typed message says, as JSON."""
+    """Return the content of a typed message as JSON."""
     said = {'topic': spec.name, 'kind': 'typed'}
     if hasattr(message, 'header') or hasattr(message, 'clock'):
         said['stamp'] = message_stamp(message)

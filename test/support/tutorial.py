@@ -1,13 +1,12 @@
-"""A page as its reader follows it: every block done, one after the other, in one folder.
+"""Run every block of a page in one folder, as a reader would.
 
-Three kinds of blocks, told apart by what stands behind the fence:
+Kinds of blocks:
 
-- ```` ```sh ````: commands in the reader's terminal, which end by themselves. With words behind,
-  ```` ```sh second terminal ````: one command in another terminal of that name; it runs on until
-  the page is over, and then gets a Ctrl-C.
-- ```` ```python ````: run. With a name behind, ```` ```python robot.py ````: a file of that name.
-- ```` ``` ```` alone: what the block before prints. Lines come in this order, with others between;
-  `...` stands for anything.
+- ```` ```sh ````: commands that terminate. ```` ```sh second terminal ````: a command in another
+  terminal of this name; it receives Ctrl-C at the end of the page.
+- ```` ```python ````: a program to run. ```` ```python robot.py ````: a file of this name.
+- ```` ``` ````: lines that the previous block prints, in this order, perhaps with others between
+  them; `...` matches any text.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from pathlib import Path
 
 # A training or a benchmark on a busy machine.
 TIMEOUT = 1500.0
-# A node that is told to stop has its log to close.
+# A node closes its log before it ends.
 STOP_TIMEOUT = 30.0
 INTERRUPTED = 130
 
@@ -33,8 +32,8 @@ class Block:
 
     Attributes:
         kind: `sh`, `python` or '' for output.
-        label: The words behind.
-        text: What is in it.
+        label: The words after the kind.
+        text: The content.
     """
 
     kind: str
@@ -43,13 +42,13 @@ class Block:
 
 
 def blocks(page: str) -> list[Block]:
-    """The fenced blocks of a page, in order."""
+    """Return the fenced blocks of a page, in order."""
     found = re.findall(r'^```(\w*) ?([^\n]*)\n(.*?)^```$', page, flags=re.DOTALL | re.MULTILINE)
     return [Block(*parts) for parts in found]
 
 
 def missing_line(expected: str, printed: str) -> str | None:
-    """The first line of an output block that was not printed where it should be."""
+    """Return the first line of an output block that is missing in the output, or None."""
     lines = (_words(line) for line in printed.splitlines())
     for line in filter(None, map(_words, expected.splitlines())):
         pattern = '.*'.join(map(re.escape, line.split('...')))
@@ -64,12 +63,7 @@ def _words(line: str) -> str:
 
 @dataclass
 class Reader:
-    """Somebody who follows a page.
-
-    Attributes:
-        folder: Where.
-        environment: Of all that is started.
-    """
+    """Runs the blocks of a page in a folder."""
 
     folder: Path
     environment: Mapping[str, str]
@@ -77,7 +71,7 @@ class Reader:
     _printed: str = ''
 
     def follow(self, page: str) -> None:
-        """Does what the page says; fails where it does not do what the page says."""
+        """Run all blocks; fail if a block fails or prints something else."""
         try:
             for block in blocks(page):
                 self._do(block)

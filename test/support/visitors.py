@@ -42,7 +42,7 @@ class Visitor:
         Thread(target=self._take, args=(page,), daemon=True).start()
 
     def close(self) -> None:
-        """Leaves."""
+        """Close the connections."""
         self._connections.close()
 
     def _take(self, page: ClientConnection) -> None:
@@ -56,13 +56,9 @@ class Visitor:
 
 
 class DeafVisitor:
-    """Asks for all that a page asks for, in one session, and then reads and confirms nothing.
+    """A visitor that opens the connections of a page and then reads nothing, like a hung browser.
 
-    So is a browser that hangs: its system still takes what fits into the buffers of a connection,
-    here small ones, and then the server can write no more.
-
-    Args:
-        address: Host and port of the page.
+    Its receive buffers are small, so that writes of the server soon block.
     """
 
     def __init__(self, address: str) -> None:
@@ -74,7 +70,7 @@ class DeafVisitor:
         for target, fields, answer in (
             ('/state?sid=deaf', upgrade, 101),
             ('/ui?sid=deaf', upgrade, 101),
-            # Megabytes, which no buffer holds.
+            # Larger than any buffer.
             ('/model', '', 200),
         ):
             self._ask(address, f'GET {target} HTTP/1.1\r\nHost: {address}\r\n{fields}\r\n', answer)
@@ -94,7 +90,7 @@ class DeafVisitor:
         host, port = address.rsplit(':', 1)
         connection = socket.socket()
         self._connections.append(connection)
-        # Before it connects: the size is told to the server then.
+        # Before `connect`, which sends the size to the server.
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SMALL)
         connection.settimeout(_TIMEOUT)
         connection.connect((host, int(port)))
