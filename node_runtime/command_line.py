@@ -77,7 +77,7 @@ class CommandParser(argparse.ArgumentParser):
             print(message, end='', file=file or sys.stderr)
             return EXIT_SUCCESS
 
-        if code := _exit_code(self.prog, write, ()):
+        if code := _exit_code(self.prog, write):
             sys.exit(code)
 
     def _hint(self, message: str) -> str:
@@ -171,13 +171,13 @@ def run_command(name: str, run: Callable[[], int]) -> int:
         signal.default_int_handler(number, frame)
 
     with on_stop_signals(_unclaimed_signals(), stop) as received:
-        code = _exit_code(name, run, received)
+        code = _exit_code(name, run)
         # A command may run another one, which does not see the signal.
         return 128 + received[0] if received and code == EXIT_INTERRUPTED else code
 
 
-def _exit_code(name: str, run: Callable[[], int], received: Sequence[int]) -> int:
-    """Run the body of a command; `received` holds the stop signal once it has come."""
+def _exit_code(name: str, run: Callable[[], int]) -> int:
+    """Run the body of a command and turn its errors into exit codes."""
     try:
         code = run()
         sys.stdout.flush()
@@ -185,9 +185,7 @@ def _exit_code(name: str, run: Callable[[], int], received: Sequence[int]) -> in
     except CommandError as error:
         complain(name, error)
         return error.exit_code
-    except (KeyboardInterrupt, ImportError, RuntimeError) as error:
-        if not _is_interrupt(error, received):
-            raise
+    except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         discard_output(sys.stdout.fileno())
@@ -198,17 +196,6 @@ def _exit_code(name: str, run: Callable[[], int], received: Sequence[int]) -> in
         discard_output(sys.stdout.fileno())
         complain(name, f'cannot write: {error.strerror}')
         return EXIT_FAILURE
-
-
-def _is_interrupt(error: BaseException, received: Sequence[int]) -> bool:
-    """Return whether an error is KeyboardInterrupt or was raised in place of it.
-
-    Many libraries turn it into ImportError while they are imported. Python 3.11 turns it into
-    RuntimeError within `__set_name__`.
-    """
-    if isinstance(error, ImportError):
-        return bool(received)
-    return any(isinstance(each, KeyboardInterrupt) for each in (error, error.__cause__))
 
 
 def _unclaimed_signals() -> list[signal.Signals]:
@@ -241,18 +228,18 @@ def make_output_usable() -> None:
 
 
 def start_command(name: str, module: str, *extras: str) -> int:
-    """Import a module that needs extras and run its `main` as a command.
+    """Import a module that needs extras and run its `main`, a command.
 
-    The import takes seconds, so Ctrl-C and missing packages are handled before it.
+    The import takes seconds; `guard_loading` handles Ctrl-C meanwhile.
     """
-
-    def run() -> int:
+    try:
         for extra in extras:
             require_extra(extra)
-        main: Callable[[], int] = import_module(module).main
-        return main()
-
-    return run_command(name, run)
+    except UsageError as error:
+        complain(name, error)
+        return error.exit_code
+    main: Callable[[], int] = import_module(module).main
+    return main()
 
 
 def require_extra(extra: str, *needed: str) -> None:

@@ -102,32 +102,6 @@ def test_a_second_ctrl_c_ends_a_command_that_tidies_for_ever():
     assert process.returncode == -signal.SIGINT
 
 
-@pytest.mark.parametrize('error', ['ImportError', 'ZeroDivisionError'])
-def test_ctrl_c_may_come_out_of_an_import_as_its_failure_but_hides_no_other(error):
-    process = run_script(
-        'try:\n    print(1, flush=True)\n    time.sleep(60)\n'
-        f'except KeyboardInterrupt as interrupt:\n    raise {error}("unfit") from interrupt'
-    )
-    process.stdout.readline()
-    process.send_signal(signal.SIGINT)
-    said = process.communicate(timeout=20)[1]
-    if error == 'ImportError':
-        assert (process.returncode, said) == (130, 'tool: stopping\n')
-    else:
-        assert process.returncode == 1 and said.endswith('ZeroDivisionError: unfit\n')
-
-
-def test_ctrl_c_while_a_class_is_made_is_ctrl_c():
-    """As of NumPy's `finfo`, while it is imported; Python 3.11 makes RuntimeError of it."""
-    process = run_script(
-        'class Slow:\n    def __set_name__(self, owner, name):\n'
-        '        print(1, flush=True)\n        time.sleep(60)\nclass Owner:\n    part = Slow()'
-    )
-    process.stdout.readline()
-    process.send_signal(signal.SIGINT)
-    assert (process.communicate(timeout=20)[1], process.returncode) == ('tool: stopping\n', 130)
-
-
 def test_a_handler_of_others_stays():
     before = signal.getsignal(signal.SIGINT)
     seen: list[int] = []
