@@ -56,16 +56,7 @@ def test_template_gives_the_bytes_of_the_serialiser(spec):
 
 
 @every_topic
-def test_vectors_survive_bit_for_bit(spec):
-    vector = random_vector(spec)
-    if spec.size > 1:
-        vector[:2] = [-0.0, np.nextafter(0.0, 1.0)]
-    message = deserialize(spec.type_name, TopicCodec(spec).encode(STAMP, vector))
-    assert decode(spec, message).tobytes() == vector.tobytes()
-
-
-@every_topic
-def test_rclpy_reads_the_bytes(spec):
+def test_rclpy_reads_the_bytes_and_writes_the_same_fields(spec):
     serialization = pytest.importorskip('rclpy.serialization')
     vector = random_vector(spec, seed=1)
     data = TopicCodec(spec).encode(STAMP, vector)
@@ -75,16 +66,9 @@ def test_rclpy_reads_the_bytes(spec):
         assert message_stamp(message) == STAMP
     if hasattr(message, 'header'):
         assert message.header.frame_id == spec.frame
-
-
-@every_topic
-def test_rclpy_writes_the_same_fields_before_its_uninitialised_tail(spec):
-    serialization = pytest.importorskip('rclpy.serialization')
-    data = TopicCodec(spec).encode(STAMP, random_vector(spec, seed=1))
-    message = serialization.deserialize_message(data, ros_class(spec.type_name))
     theirs = serialization.serialize_message(message)
     assert len(data) <= len(theirs) <= len(data) + 8
-    # rclpy does not zero the padding between fields either; serialising once more does.
+    # rclpy leaves the padding uninitialised; serialising once more zeroes it.
     fields = deserialize(spec.type_name, theirs[: len(data)])
     assert serialize(spec.type_name, fields) == data
 

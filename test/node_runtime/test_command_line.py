@@ -14,7 +14,6 @@ from node_runtime.command_line import (
     CommandError,
     CommandParser,
     UsageError,
-    progress,
     require_extra,
     run_command,
     say,
@@ -51,10 +50,6 @@ def test_an_error_is_one_line_without_control_characters(error, code, capsys):
 def test_what_is_said_of_strange_names_can_be_printed_anywhere(capsys):
     say('runs/\udcff\x1b[31m done')
     assert capsys.readouterr().out == 'runs/\\udcff\\x1b[31m done\n'
-
-
-def test_the_code_of_a_command_is_its_own():
-    assert [run_command('tool', lambda code=code: code) for code in (0, 1, 2)] == [0, 1, 2]
 
 
 def test_an_error_that_nobody_expects_is_not_hidden():
@@ -164,24 +159,6 @@ def test_letters_that_the_output_does_not_have_are_escaped(monkeypatch):
     assert process.communicate(timeout=20) == ('\\u65e5\\u672c\n', 'tool: \\u0436\n')
 
 
-@pytest.mark.parametrize('open_pair', [pty.openpty, os.pipe])
-def test_what_nobody_reads_goes_nowhere_where_a_command_has_more_to_do(open_pair):
-    code = (
-        'import sys\n'
-        'from node_runtime.command_line import discard_unread_output\n'
-        'sys.stdin.readline()\n'
-        'discard_unread_output()\n'
-        'for stream in (sys.stdout, sys.stderr): print("line", file=stream, flush=True)\n'
-    )
-    reader, writer = open_pair()
-    streams = {'stdin': subprocess.PIPE, 'stdout': writer, 'stderr': writer, 'text': True}
-    process = subprocess.Popen([sys.executable, '-c', code], **streams)
-    os.close(writer)
-    os.close(reader)
-    process.communicate('\n', timeout=20)
-    assert process.returncode == 0
-
-
 def test_a_terminal_that_closes_takes_nothing_with_it_but_the_bar():
     terminal, its_other_end = pty.openpty()
     body = (
@@ -245,11 +222,6 @@ def test_progress_is_shown_to_a_person_only(is_watched):
         os.close(terminal)
     assert process.communicate(timeout=20)[0] == ''
     assert b'episodes' in shown and b'1/3' in shown
-
-
-def test_progress_passes_what_is_inside_on():
-    with pytest.raises(ValueError, match='inside'), progress('episodes', 1):
-        raise ValueError('inside')
 
 
 @pytest.mark.parametrize('text', ['0', '7', '', 'inf', '1.5', '-1', str(2**63), '\x1b[31m'])

@@ -31,7 +31,6 @@ from support.graph import (
     TIMEOUT,
     Start,
     client,
-    end,
     episodes_in,
     finish,
     ros_args,
@@ -58,18 +57,6 @@ def test_actor_in_another_process_reaches_its_goals(start_process: Start, tmp_pa
     assert [episode.result['success'] for episode in logged] == ['true', 'true']
     assert all(len(episode.topics['/commands'].messages) > 25 for episode in logged)
     assert all(len(e.metadata['checkpoint_sha256']) == 64 for e in logged)
-
-
-@pytest.mark.alone
-def test_no_tick_is_left_out_and_all_are_40_ms_apart(start_process: Start) -> None:
-    """How even the rate is in wall time depends on the machine: `make bench-rate` measures it."""
-    sim = start_process(*SIM_NODE)
-    with client(REACH) as robot:
-        robot.subscribe('joint_states')
-        robot.spin_until(lambda: len(robot.received['joint_states']) > 50, 'joint_states')
-        stamps = [message_stamp(message) for message in robot.received['joint_states']]
-    assert set(np.diff(stamps)) == {40_000_000}
-    end(sim)
 
 
 def test_every_topic_has_the_promised_type_and_quality(start_process: Start) -> None:

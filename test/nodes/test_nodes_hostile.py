@@ -18,8 +18,7 @@ from std_msgs.msg import Float64MultiArray
 from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import message_stamp
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
-from msgs_spec.topics import QosSpec, topic, topics
-from node_runtime.ros import rclpy_profile
+from msgs_spec.topics import topic, topics
 from support.graph import (
     POLICY_NODE,
     SIM_NODE,
@@ -165,22 +164,6 @@ def test_random_parameters_are_answered_and_only_allowed_ones_applied(
         count = len(robot.received['joint_states'])
         robot.spin_until(lambda: len(robot.received['joint_states']) > count + 20, 'ticks')
     end(sim)
-
-
-def test_best_effort_commander_is_named(start_process: Start) -> None:
-    sim = start_process(*SIM_NODE)
-    with client(REACH) as robot:
-        robot.subscribe('/diagnostics')
-        robot.node.create_publisher(
-            Float64MultiArray, 'commands', rclpy_profile(QosSpec(1, 'best_effort', 'volatile'))
-        )
-
-        def named() -> bool:
-            found = robot.received['/diagnostics']
-            return bool(found) and 'best effort; offer reliable' in found[-1].status[0].message
-
-        robot.spin_until(named, 'warning')
-    assert '/commands of /client is not received' in end(sim)
 
 
 @pytest.mark.alone

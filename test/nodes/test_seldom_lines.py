@@ -19,9 +19,3 @@ def test_a_line_is_said_again_after_its_time_whatever_the_system_clock_does(node
         time.sleep(pause)
         said.append(node.get_logger().warning('line', **seldom(0.2)))
     assert said == [True, False, True]
-
-
-def test_no_line_depends_on_the_system_clock():
-    for package in ('msgs_spec', 'fetch_hand_sim', 'policy_node'):
-        for path in (ROOT / package).rglob('*.py'):
-            assert 'throttle_duration_sec=' not in path.read_text(), path

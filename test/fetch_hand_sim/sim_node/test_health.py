@@ -13,7 +13,7 @@ from fetch_hand_sim.sim_node.health import Health, Surroundings
 from msgs_spec.codecs import message_stamp
 from msgs_spec.diagnostics import Level, encode_reports, next_report
 from msgs_spec.schemas import deserialize
-from msgs_spec.topics import DIAGNOSTICS, topics
+from msgs_spec.topics import DIAGNOSTICS
 
 FINE = Surroundings(commanders=['/policy_node'], robots=['/sim_node'], log='episodes')
 
@@ -201,10 +201,3 @@ def test_report_counts_rejections_by_reason(make):
     values = Health(case.robot, '/sim_node', case.clock.now).report(FINE, 101.0).values
     assert values['commands rejected'] == '3'
     assert (values['rejected: wrong size'], values['rejected: not finite']) == ('1', '2')
-
-
-def test_monitoring_is_no_part_of_a_tick(make):
-    case = make()
-    case.robot.tick()
-    assert {spec.name for spec, _ in case.ticks[0][1]}.isdisjoint({'/diagnostics'})
-    assert DIAGNOSTICS not in topics(case.robot.runner.spec)

@@ -30,7 +30,6 @@ from fetch_hand_sim.visualization_node.messages import (
 from fetch_hand_sim.visualization_node.transforms import Transforms, frame_prefix, view_transform
 from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TASKS
-from msgs_spec.topics import view_topic
 from support.frames import tree
 
 STAMP = 3_000_000_007
@@ -150,14 +149,6 @@ def test_a_shelf_on_a_table_is_marked_where_it_is(monkeypatch):
     assert scene.table_markers() is scene.table_markers()
 
 
-def test_a_joint_that_the_robot_does_not_report_stays_at_rest():
-    transforms, frame = Transforms('FetchReach'), moved_frame('FetchReach')
-    name = transforms._spec.robot.joints[4]
-    before = len(transforms.moving(frame))
-    del transforms._index[name]
-    assert len(transforms.moving(frame)) == before
-
-
 def test_an_image_keeps_its_pixels():
     picture = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
     message = deserialize_message(serialize_message(image_message(picture, 'camera', STAMP)), Image)
@@ -205,8 +196,3 @@ def test_the_camera_has_a_rate_of_its_own(hz, due, monkeypatch):
         if camera.is_due:
             camera.render(None, None)
     assert seen == due
-
-
-def test_an_unknown_topic_is_refused_with_those_there_are():
-    with pytest.raises(ValueError, match="FetchReach has no topic 'tf' to view; allowed: robot_d"):
-        view_topic(TASKS['FetchReach'], 'tf')
