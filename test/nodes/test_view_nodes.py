@@ -380,7 +380,15 @@ def wait_for_pictures(connection: Client, visitor: Visitor) -> None:
 
 @pytest.mark.alone
 @pytest.mark.timeout(400)
-@pytest.mark.parametrize('harm', ['visitor leaves', 'visitor is deaf', 'SIGSTOP', 'SIGKILL'])
+@pytest.mark.parametrize(
+    'harm',
+    [
+        pytest.param('visitor leaves', marks=pytest.mark.release),
+        'visitor is deaf',
+        'SIGSTOP',
+        pytest.param('SIGKILL', marks=pytest.mark.release),
+    ],
+)
 def test_a_page_or_a_viewer_that_ends_or_hangs_is_not_noticed(
     start_process: Start, harm: str
 ) -> None:

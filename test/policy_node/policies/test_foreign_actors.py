@@ -52,7 +52,7 @@ def test_onnx_actor_answers_as_its_checkpoint(onnx_file):
 @pytest.mark.parametrize(
     ('task', 'features'),
     [
-        ('HandManipulateBlockFull', 'symmetric'),
+        pytest.param('HandManipulateBlockFull', 'symmetric', marks=pytest.mark.release),
         ('HandManipulatePenFull', 'relative'),
     ],
 )

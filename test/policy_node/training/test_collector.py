@@ -108,6 +108,7 @@ def test_the_second_cycle_has_new_goals() -> None:
     assert (first.desired_goal != second.desired_goal).all()
 
 
+@pytest.mark.release
 def test_goals_of_failures_are_tried_again() -> None:
     """Only those of failures at goals as the task draws them, and the rest are drawn as ever."""
     config = TrainConfig('FetchReach', noise_std=0.0, random_epsilon=0.0, retry_failed=0.5)

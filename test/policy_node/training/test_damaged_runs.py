@@ -293,6 +293,7 @@ def test_a_run_larger_than_the_memory_is_one_line(
     assert 'not enough memory; replay_transitions, num_envs and' in error and error.count('\n') == 1
 
 
+@pytest.mark.release
 def test_a_replay_that_will_outgrow_the_memory_is_said_at_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -135,8 +135,15 @@ def test_the_actor_update_leaves_the_critic_alone_and_normalizers_untouched() ->
         assert torch.equal(actor[name], value) == ('normalizer' in name), name
 
 
-@pytest.mark.parametrize('layer_norm', [False, True])
-@pytest.mark.parametrize('precision', ['float32', 'bfloat16'])
+@pytest.mark.parametrize(
+    ('layer_norm', 'precision'),
+    [
+        (False, 'float32'),
+        pytest.param(True, 'float32', marks=pytest.mark.release),
+        pytest.param(False, 'bfloat16', marks=pytest.mark.release),
+        (True, 'bfloat16'),
+    ],
+)
 def test_it_finds_the_best_action(layer_norm: bool, precision: str) -> None:
     """Reward -|a - g|^2 without a future: the best action is the goal itself."""
     learner = make_learner(

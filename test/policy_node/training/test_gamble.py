@@ -144,10 +144,12 @@ def test_future_goals_make_a_gamble_a_sure_thing() -> None:
     assert learnt_values('none', {'future': 1.0})['gamble'] == pytest.approx(0.0, abs=0.1)
 
 
+@pytest.mark.release
 def test_goals_that_do_not_depend_on_the_landing_do_not() -> None:
     assert learnt_values('none', {'real': 1.0})['gamble'] == pytest.approx(-0.8, abs=0.1)
 
 
+@pytest.mark.release
 def test_weights_take_back_what_hindsight_does() -> None:
     mixture = {'future': 0.5, 'real': 0.5}
     biased, weighted = (learnt_values(kind, mixture) for kind in ('none', 'density'))
@@ -157,6 +159,7 @@ def test_weights_take_back_what_hindsight_does() -> None:
     assert weighted['walk'] == pytest.approx(-1.0, abs=0.1)
 
 
+@pytest.mark.release
 def test_weighted_gambles_succeed_as_often_as_gambles_do() -> None:
     """Once in five times; in a batch whose goals are half those achieved, three times."""
     learner, draw = gambler('density', {'future': 0.5, 'real': 0.5})

@@ -81,6 +81,7 @@ def proposals(tested: float, updates: int) -> np.ndarray:
     return proposer.goals(proposer.normalized(state))[:, 0]
 
 
+@pytest.mark.release
 def test_a_high_level_proposes_what_can_be_reached_on_the_way() -> None:
     near, far = proposals(tested=1.0, updates=1_000)
     assert near == pytest.approx(-0.5, abs=0.1), 'a goal within reach is proposed itself'

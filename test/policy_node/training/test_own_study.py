@@ -27,6 +27,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return name
 
 
+@pytest.mark.release
 def test_the_study_of_the_page_runs(module: str, tmp_path: Path) -> None:
     assert main(['--study', f'{module}:WIDTHS', *SMALL]) == 0
     report = tmp_path / 'docs' / 'research' / 'widths'

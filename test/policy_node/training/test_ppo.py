@@ -215,7 +215,12 @@ def learn(cycles: int, **changes: object) -> tuple[PPO, RolloutMaker]:
 
 
 @pytest.mark.parametrize(
-    'changes', [{'strategy': 'none'}, {'importance': 'decision'}], ids=['none', 'weighed']
+    'changes',
+    [
+        {'strategy': 'none'},
+        pytest.param({'importance': 'decision'}, marks=pytest.mark.release),
+    ],
+    ids=['none', 'weighed'],
 )
 def test_ppo_learns_to_do_what_the_goal_says(changes: dict[str, object]) -> None:
     learner, _ = learn(60, **changes)
@@ -492,7 +497,11 @@ def test_what_ppo_would_not_look_at_is_refused(changes: dict[str, object], messa
 
 @pytest.mark.parametrize(
     'changes',
-    [{}, {'importance': 'decision'}, {'goals': 'outcome=.8', 'first_value': -50.0}],
+    [
+        {},
+        pytest.param({'importance': 'decision'}, marks=pytest.mark.release),
+        pytest.param({'goals': 'outcome=.8', 'first_value': -50.0}, marks=pytest.mark.release),
+    ],
     ids=['taken', 'weighed', 'outcomes'],
 )
 def test_a_run_of_ppo_goes_on_where_it_stopped(changes: dict[str, object], tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from policy_node.training.networks.quantiles import levels, pooled, quantile_costs
@@ -20,6 +21,7 @@ def lottery(count: int, generator: np.random.Generator) -> Transitions:
     return Transitions(same, same, same, action, reward, np.zeros(count, np.float32))
 
 
+@pytest.mark.release
 def test_the_quantiles_of_a_lottery_are_learnt_and_its_mean_with_them() -> None:
     learner = make_learner(quantiles=5, gamma=0.95)
     generator = np.random.default_rng(0)
@@ -56,6 +58,7 @@ def test_the_cost_is_least_at_the_quantiles_of_the_target() -> None:
     assert quantile_costs(best.expand(3, 1, 4), sample).shape == (3, 1)
 
 
+@pytest.mark.release
 def test_truncated_critics_promise_less_of_a_lottery() -> None:
     generator = np.random.default_rng(0)
     options = {'critics': 2, 'quantiles': 25, 'target_update_interval': 1, 'gamma': 0.95}

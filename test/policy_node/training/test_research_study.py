@@ -211,6 +211,7 @@ def test_a_study_runs_measures_and_gives_the_same_bits_again(
     assert same[0] == same[1]
 
 
+@pytest.mark.release
 def test_a_stored_run_is_not_trained_again_and_another_seed_is_added(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

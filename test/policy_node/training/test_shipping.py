@@ -65,6 +65,7 @@ def test_what_was_done_is_said_and_a_few_episodes_replace_no_longer_evaluation(
     assert {file.name: file.read_bytes() for file in actors.iterdir()} == before
 
 
+@pytest.mark.release
 def test_an_actor_is_shipped_where_nobody_reads_its_table_any_more(
     run: Path, tmp_path: Path
 ) -> None:
