@@ -60,8 +60,8 @@ else
 	@$(BIN)/python -m fetch_hand_sim demo --task $(TASK) --episodes $(EPISODES)
 endif
 
-# Those that start nodes mostly wait, so two of them share the machine; those marked `alone` have it for
-# themselves. Beside the others, which compute, some of them fail now and then on two cores.
+# Tests that start nodes mostly wait, so three of them share the machine; tests marked `alone` have it for
+# themselves. Beside the other tests, which compute, some node tests fail now and then on two cores.
 NODE_TESTS := test/nodes test/fetch_hand_sim/replay_node \
 	test/fetch_hand_sim/episode_log/test_episode_endings.py \
 	test/fetch_hand_sim/episodes/test_episode_recorder.py
@@ -73,7 +73,7 @@ test-alone: env
 	$(BIN)/python -m pytest -m 'alone and not release' $(NODE_TESTS)
 
 test-nodes: env
-	$(BIN)/python -m pytest -m 'not alone and not release' -n 2 --dist worksteal $(NODE_TESTS)
+	$(BIN)/python -m pytest -m 'not alone and not release' -n 3 --dist worksteal $(NODE_TESTS)
 
 test-others: env
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(addprefix --ignore=,$(NODE_TESTS))
