@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.files import expand_episodes
 from fetch_hand_sim.episode_log.metadata import EpisodeOutcome, EpisodeRecord, HasOutcome
-from fetch_hand_sim.episode_log.reader import EpisodeFile, MessageRows, read_file
+from fetch_hand_sim.episode_log.reader import Episode, MessageRows, read_episode
 from msgs_spec.actions import action_from_command
 from msgs_spec.arrays import Array, Flags
 from msgs_spec.cdr import TopicCodec
@@ -97,7 +97,7 @@ def load_episodes(
 
 def load_episode(path: Path) -> EpisodeArrays:
     """Load one episode; see `load_episodes`."""
-    file = read_file(path)
+    file = read_episode(path)
     try:
         return _Decoder(file).decode()
     except EpisodeReadError:
@@ -119,7 +119,7 @@ def _assembler(task: TaskSpec, control_hz: float) -> ObservationAssembler:
 class _Decoder:
     """Decodes the topics of one file and joins them by tick."""
 
-    def __init__(self, file: EpisodeFile) -> None:
+    def __init__(self, file: Episode) -> None:
         self._file = file
         self._record = EpisodeRecord.parse(file.metadata)
         self._task = self._record.task

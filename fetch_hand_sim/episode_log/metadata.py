@@ -36,6 +36,8 @@ from msgs_spec.text import one_of
 Strings = Mapping[str, str]
 Number = TypeVar('Number', int, float)
 
+# End reason of an episode that was cut off, in its recovered file.
+RECOVERED = 'cut off, recovered later'
 # Seeds and numbers of episodes are parameters of a node and columns of a table: int64.
 _LARGEST = 2**63 - 1
 _SHOWN = 40

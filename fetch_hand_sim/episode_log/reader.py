@@ -1,4 +1,4 @@
-"""Read episode files. All commands read them through `read_file`, so they accept the same files."""
+"""Read episode files. All commands use `read_episode`, so they accept the same files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,6 @@ from fetch_hand_sim.episode_log.metadata import HasOutcome, parse_task
 from fetch_hand_sim.episode_log.records import (
     MESSAGE,
     MESSAGE_FIELD_BYTES,
-    AttachmentRecord,
     Channel,
     Contents,
     Messages,
@@ -55,28 +54,78 @@ class MessageRows:
 
 
 @dataclass(frozen=True, slots=True)
-class EpisodeFile(HasOutcome):
+class LoggedMessage:
+    """One message.
+
+    Attributes:
+        log_time_ns: Simulated time plus rank, see `log_time`.
+        publish_time_ns: The same.
+        sequence: Number of the message in its topic, from 0.
+        data: CDR bytes; `msgs_spec.schemas.deserialize` reads them.
+    """
+
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedTopic:
+    """A topic of an episode.
+
+    Attributes:
+        type_name: ROS name of the message type.
+        qos_yaml: Offered quality of service, rosbag2 YAML.
+        type_hash: RIHS01 hash of the type.
+        messages: Messages in order of log time.
+    """
+
+    type_name: str
+    qos_yaml: str
+    type_hash: str
+    messages: list[LoggedMessage] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class Episode(HasOutcome):
     """An episode file, checked as a whole.
 
     Attributes:
         path: The MCAP file.
         metadata: The record `episode`.
         result: The record `episode_result`.
-        attachments: All attachments.
-        schemas: By id.
-        channels: By id; no two have the same topic.
-        messages: All messages, sorted by log time.
+        attachments: Contents by file name.
+        schemas: Types by id.
+        channels: Topics by id; no two have the same name.
+        sorted_messages: All messages, sorted by log time.
         size_bytes: Size of the file.
     """
 
     path: Path
     metadata: dict[str, str]
     result: dict[str, str]
-    attachments: list[AttachmentRecord]
+    attachments: dict[str, bytes]
     schemas: dict[int, Schema]
     channels: dict[int, Channel]
-    messages: Messages
+    sorted_messages: Messages
     size_bytes: int
+
+    @cached_property
+    def topics(self) -> dict[str, LoggedTopic]:
+        """Topics by resolved name, in order of the first message."""
+        found: dict[int, LoggedTopic] = {}
+        for id, sequence, log_time, publish_time, data in self.sorted_messages.rows():
+            if id not in found:
+                channel = self.channels[id]
+                schema = self.schemas.get(channel.schema_id)
+                found[id] = LoggedTopic(
+                    type_name=schema.name if schema else '',
+                    qos_yaml=channel.metadata.get('offered_qos_profiles', ''),
+                    type_hash=channel.metadata.get('topic_type_hash', ''),
+                )
+            found[id].messages.append(LoggedMessage(log_time, publish_time, sequence, data))
+        return {self.channels[id].topic: logged for id, logged in found.items()}
 
     def count(self, name: str) -> int:
         """Return the number of messages of a topic, named as the contract names it."""
@@ -88,26 +137,26 @@ class EpisodeFile(HasOutcome):
         Raises:
             EpisodeReadError: If there are none, or not all have the same size.
         """
-        indices = self._indices(name)
-        starts, headers = self.messages.starts[indices], self.messages.headers[indices]
+        indices, messages = self._indices(name), self.sorted_messages
+        starts, headers = messages.starts[indices], messages.headers[indices]
         sizes = np.unique(headers['size']).tolist()
         if len(sizes) != 1:
             found = f'sizes {sizes[:5]}' if sizes else 'no message'
             raise EpisodeReadError(f'{self.path}: {found} of {name}; one size is needed')
         size = sizes[0] - MESSAGE_FIELD_BYTES
-        buffer = np.frombuffer(self.messages.unpacked, np.uint8)
+        buffer = np.frombuffer(messages.unpacked, np.uint8)
         data = buffer[starts[:, None] + np.arange(MESSAGE.itemsize, MESSAGE.itemsize + size)]
         return MessageRows(headers['log_time'].astype(np.int64), data)
 
     def _indices(self, name: str) -> NDArray[np.int64]:
         for id, channel in self.channels.items():
             if relative_name(channel.topic) == name.lstrip('/'):
-                return np.flatnonzero(self.messages.headers['channel'] == id)
+                return np.flatnonzero(self.sorted_messages.headers['channel'] == id)
         return np.zeros(0, dtype=np.int64)
 
 
-def read_file(path: Path | str) -> EpisodeFile:
-    """Read an episode file with all checks.
+def read_episode(path: Path | str) -> Episode:
+    """Read an episode with all checks.
 
     Args:
         path: The bag directory, or its MCAP file.
@@ -131,14 +180,14 @@ def read_file(path: Path | str) -> EpisodeFile:
                     'bags leave it out'
                 )
         require_contract(records[EPISODE], contents)
-        return EpisodeFile(
+        return Episode(
             path=file,
             metadata=records[EPISODE],
             result=records[EPISODE_RESULT],
-            attachments=contents.attachments,
+            attachments={each.name: each.data for each in contents.attachments},
             schemas=contents.schemas,
             channels=contents.channels,
-            messages=messages,
+            sorted_messages=messages,
             size_bytes=len(data),
         )
 
@@ -246,7 +295,7 @@ def _defines(type_name: str, text: bytes) -> bool:
     return all(name in found and found[name][1] == fields for name, (_, fields) in known.items())
 
 
-# Summaries and whole episodes
+# Summaries
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,102 +328,15 @@ def read_summary(path: Path | str) -> EpisodeSummary:
     Raises:
         EpisodeReadError: If there is no such file, or it is damaged, ambiguous or no episode.
     """
-    file = read_file(path)
-    times = file.messages.headers['log_time']
+    episode = read_episode(path)
+    times = episode.sorted_messages.headers['log_time']
     return EpisodeSummary(
-        path=file.path,
-        metadata=file.metadata,
-        result=file.result,
+        path=episode.path,
+        metadata=episode.metadata,
+        result=episode.result,
         message_count=len(times),
         duration_s=(int(times[-1]) - int(times[0])) / 1e9 if len(times) else 0.0,
-        size_bytes=file.size_bytes,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class LoggedMessage:
-    """One message.
-
-    Attributes:
-        log_time_ns: Simulated time plus rank, see `log_time`.
-        publish_time_ns: The same.
-        sequence: Number of the message in its topic, from 0.
-        data: CDR bytes; `msgs_spec.schemas.deserialize` reads them.
-    """
-
-    log_time_ns: int
-    publish_time_ns: int
-    sequence: int
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class LoggedTopic:
-    """A topic of an episode.
-
-    Attributes:
-        type_name: ROS name of the message type.
-        qos_yaml: Offered quality of service, rosbag2 YAML.
-        type_hash: RIHS01 hash of the type.
-        messages: Messages in order of log time.
-    """
-
-    type_name: str
-    qos_yaml: str
-    type_hash: str
-    messages: list[LoggedMessage] = field(default_factory=list)
-
-
-@dataclass(frozen=True, slots=True)
-class Episode(HasOutcome):
-    """An episode with all its messages.
-
-    Attributes:
-        path: The MCAP file.
-        topics: By resolved name, in order of the first message.
-        metadata: The record `episode`.
-        result: The record `episode_result`.
-        attachments: Contents by file name.
-    """
-
-    path: Path
-    topics: dict[str, LoggedTopic]
-    metadata: dict[str, str]
-    result: dict[str, str]
-    attachments: dict[str, bytes]
-
-
-def read_episode(path: Path | str) -> Episode:
-    """Read an episode with all its messages.
-
-    Args:
-        path: The bag directory, or its MCAP file.
-
-    Raises:
-        EpisodeReadError: If there is no such file, or it is damaged, ambiguous or no episode.
-    """
-    file = read_file(path)
-    found: dict[int, LoggedTopic] = {}
-    for id, sequence, log_time, publish_time, data in file.messages.rows():
-        if id not in found:
-            found[id] = _logged_topic(file, id)
-        found[id].messages.append(LoggedMessage(log_time, publish_time, sequence, data))
-    return Episode(
-        path=file.path,
-        topics={file.channels[id].topic: logged for id, logged in found.items()},
-        metadata=file.metadata,
-        result=file.result,
-        attachments={each.name: each.data for each in file.attachments},
-    )
-
-
-def _logged_topic(file: EpisodeFile, id: int) -> LoggedTopic:
-    channel = file.channels[id]
-    schema = file.schemas.get(channel.schema_id)
-    return LoggedTopic(
-        type_name=schema.name if schema else '',
-        qos_yaml=channel.metadata.get('offered_qos_profiles', ''),
-        type_hash=channel.metadata.get('topic_type_hash', ''),
+        size_bytes=episode.size_bytes,
     )
 
 
@@ -387,23 +349,13 @@ class TickMessage:
 
     Attributes:
         topic: Its topic; the name is relative to the namespace of the robot.
-        logged: The message.
-        number: Number of the message in its topic, from 0.
+        log_time_ns: Log time.
+        data: CDR bytes.
     """
 
     topic: TopicSpec
-    logged: LoggedMessage
-    number: int
-
-    @property
-    def log_time_ns(self) -> int:
-        """Log time in nanoseconds."""
-        return self.logged.log_time_ns
-
-    @property
-    def data(self) -> bytes:
-        """CDR bytes."""
-        return self.logged.data
+    log_time_ns: int
+    data: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -447,13 +399,9 @@ def split_ticks(episode: Episode) -> list[LoggedTick]:
         EpisodeReadError: If the task is unknown, or the messages do not begin with a clock.
     """
     specs = logged_topics(episode)
-    messages = sorted(
-        (
-            TickMessage(specs[name], message, number)
-            for name, logged in episode.topics.items()
-            for number, message in enumerate(logged.messages)
-        ),
-        key=lambda message: message.log_time_ns,
+    messages = (
+        TickMessage(specs[episode.channels[id].topic], log_time, data)
+        for id, _, log_time, _, data in episode.sorted_messages.rows()
     )
     ticks: list[LoggedTick] = []
     for message in messages:

@@ -483,11 +483,14 @@ def _decompress(packed: bytes, compression: str, size: int) -> bytes:
 
 def _without_long_messages(data: bytes) -> bytes:
     kept: list[bytes] = []
-    position, end = 0, len(data)
+    position, end, kept_bytes = 0, len(data), 0
     while position <= end - RECORD.size:
         opcode, size = RECORD.unpack_from(data, position)
         following = position + RECORD.size + size
         if opcode != Opcode.MESSAGE or size - MESSAGE_FIELD_BYTES <= MAX_MESSAGE_BYTES:
             kept.append(data[position:following])
+            kept_bytes += RECORD.size + size
+            if kept_bytes > MAX_UNPACKED_BYTES:
+                raise ValueError(f'more than {MAX_UNPACKED_BYTES} bytes of messages')
         position = following
     return b''.join(kept)

@@ -32,8 +32,8 @@ from fetch_hand_sim.episode_log.bag import (
 from fetch_hand_sim.episode_log.errors import EpisodeInUseError, EpisodeLogError
 from fetch_hand_sim.episode_log.indexes import require_one_meaning
 from fetch_hand_sim.episode_log.limits import MAX_FILE_BYTES
-from fetch_hand_sim.episode_log.metadata import EpisodeOutcome
-from fetch_hand_sim.episode_log.reader import contract_topics, read_file, require_contract
+from fetch_hand_sim.episode_log.metadata import RECOVERED, EpisodeOutcome
+from fetch_hand_sim.episode_log.reader import contract_topics, read_episode, require_contract
 from fetch_hand_sim.episode_log.records import (
     RECORD,
     RECOVERY_LIMITS,
@@ -318,7 +318,7 @@ def _replaced(file: Path, remains: _Remains, aside: Path) -> Iterator[None]:
             files.lock(stream)
             description = _write(stream, file, remains, records)
             files.store(stream, file.parent, description)
-            read_file(rewritten)
+            read_episode(rewritten)
             if remains.unread_bytes > _FEW_BYTES:
                 aside.mkdir(exist_ok=True)
                 shutil.copyfile(file, aside / file.name)
@@ -355,7 +355,7 @@ def _write(
 
 def _outcome(values: dict[str, list[bytes]], specs: dict[str, TopicSpec]) -> EpisodeOutcome:
     """Return steps, return and success up to the last whole tick."""
-    cut_off = EpisodeOutcome(is_complete=False, reason='cut off, recovered later')
+    cut_off = EpisodeOutcome(is_complete=False, reason=RECOVERED)
     rewards, successes, commands = values.values()
     # `applied_command` comes last among the topics with a message per tick.
     steps = len(commands)

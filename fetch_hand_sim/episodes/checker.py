@@ -21,6 +21,7 @@ from fetch_hand_sim.episode_log import (
     read_episode,
 )
 from fetch_hand_sim.episode_log.bag import offered_qos_text
+from fetch_hand_sim.episode_log.metadata import RECOVERED
 from fetch_hand_sim.episode_log.model import former_model_sha256, mjcf_attachment, model_sha256
 from fetch_hand_sim.episode_log.reader import LoggedTick, logged_topics, split_ticks
 from fetch_hand_sim.episodes.inputs import accept_goal, accept_perturbation
@@ -243,6 +244,7 @@ def _compare(
 ) -> None:
     """Simulate the episode and note in `result` how far it equals the recorded one."""
     encoder = TickEncoder(runner.spec)
+    is_recovered = episode.outcome.reason == RECOVERED
     for number, logged in enumerate(ticks):
         command = _applied_command(logged) if number else runner.resting_command()
         if command is None:
@@ -267,7 +269,9 @@ def _compare(
         has_status = logged.find('episode_status') is not None
         expected = encoder.encode(tick, latched=has_status or tick.status.phase != 'running')
         may_be_cut = logged is ticks[-1] and not runner.is_between_episodes
-        result.difference = _tick_difference(number, logged, tick.stamp_ns, expected, may_be_cut)
+        result.difference = _tick_difference(
+            number, logged, tick.stamp_ns, expected, may_be_cut, is_recovered
+        )
         if result.difference is not None:
             return
         result.ticks += 1
@@ -334,8 +338,11 @@ def _tick_difference(
     stamp_ns: int,
     expected: list[tuple[TopicSpec, bytes]],
     may_be_cut: bool,
+    is_recovered: bool,
 ) -> Difference | None:
     stamp = logged.stamp_ns
+    # Recovery may leave out received messages.
+    received = [] if is_recovered else logged.received
     names = [message.topic.name for message in logged.published]
     wanted = [topic.name for topic, _ in expected]
     if may_be_cut:
@@ -349,6 +356,10 @@ def _tick_difference(
         if message.log_time_ns != stamp_ns + rank:
             times = message.log_time_ns, stamp_ns + rank
             return _difference(number, stamp, f'log time of {topic.name}', *times)
+    for rank, message in enumerate(received, start=len(logged.published)):
+        if message.log_time_ns != stamp_ns + rank:
+            times = message.log_time_ns, stamp_ns + rank
+            return _difference(number, stamp, f'log time of {message.topic.name}', *times)
     return None
 
 

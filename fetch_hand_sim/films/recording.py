@@ -11,7 +11,7 @@ import numpy as np
 from fetch_hand_sim.episode_log import EpisodeReadError
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episode
 from fetch_hand_sim.episode_log.files import expand_episodes, holds_no_episode
-from fetch_hand_sim.episode_log.reader import EpisodeFile, read_file
+from fetch_hand_sim.episode_log.reader import Episode, read_episode
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
 from msgs_spec.arrays import Array
@@ -64,7 +64,7 @@ def recording_of(arrays: EpisodeArrays) -> Recording:
     """
     ticks = len(arrays) + 1
     task = arrays.record.task
-    messages = read_file(arrays.path)
+    messages = read_episode(arrays.path)
     joints = _vectors(messages, arrays, 'joint_states')[:, : len(task.robot.joints)]
     poses = _vectors(messages, arrays, 'object_pose') if arrays.spec.has_object else None
     achieved, desired = arrays.observations['achieved_goal'], arrays.goals
@@ -82,7 +82,7 @@ def recording_of(arrays: EpisodeArrays) -> Recording:
     return Recording(arrays, frames, times, arrays.path.stem.removesuffix('_0'))
 
 
-def _vectors(messages: EpisodeFile, arrays: EpisodeArrays, name: str) -> Array:
+def _vectors(messages: Episode, arrays: EpisodeArrays, name: str) -> Array:
     """Return the vectors (N + 1, size) of a topic that has one message per tick."""
     # An interrupted episode may contain a part of one more tick.
     stamps = arrays.stamps

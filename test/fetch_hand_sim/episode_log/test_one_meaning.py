@@ -21,7 +21,6 @@ from fetch_hand_sim.episode_log import (
     read_episode,
     read_summary,
 )
-from fetch_hand_sim.episode_log.reader import read_file
 from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.films.recording import load_recording
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
@@ -297,7 +296,7 @@ def test_an_ambiguous_file_is_rejected_by_all_readers(parts, tmp_path, make):
 
 def assert_same(path, original):
     """The file has the messages of the original for all readers, and checks as identical."""
-    expected, found = read_file(original).messages, read_file(path).messages
+    expected, found = read_episode(original).sorted_messages, read_episode(path).sorted_messages
     assert [row[2:] for row in found.rows()] == [row[2:] for row in expected.rows()]
     (one,), (other,) = load_episodes(original), load_episodes(path)
     assert one.observations['observation'].tobytes() == other.observations['observation'].tobytes()
