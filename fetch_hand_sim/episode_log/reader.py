@@ -139,11 +139,11 @@ class Episode(HasOutcome):
         """
         indices, messages = self._indices(name), self.sorted_messages
         starts, headers = messages.starts[indices], messages.headers[indices]
-        sizes = np.unique(headers['size']).tolist()
-        if len(sizes) != 1:
-            found = f'sizes {sizes[:5]}' if sizes else 'no message'
+        sizes = headers['size']
+        if not sizes.size or (sizes != sizes[0]).any():
+            found = 'messages of several sizes' if sizes.size else 'no message'
             raise EpisodeReadError(f'{self.path}: {found} of {name}; one size is needed')
-        size = sizes[0] - MESSAGE_FIELD_BYTES
+        size = int(sizes[0]) - MESSAGE_FIELD_BYTES
         buffer = np.frombuffer(messages.unpacked, np.uint8)
         data = buffer[starts[:, None] + np.arange(MESSAGE.itemsize, MESSAGE.itemsize + size)]
         return MessageRows(headers['log_time'].astype(np.int64), data)

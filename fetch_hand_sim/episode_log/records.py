@@ -10,6 +10,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import lz4.frame
 import numpy as np
@@ -46,6 +47,8 @@ MESSAGE = np.dtype(
         ('publish_time', '<u8'),
     ]
 )
+# Plain numbers are faster to compare than members of an enumeration.
+_MESSAGE, _MESSAGE_INDEX = int(Opcode.MESSAGE), int(Opcode.MESSAGE_INDEX)
 _DEFINITIONS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL})
 # Times of a chunk, its unpacked size and CRC; channel and size of a message index.
 _CHUNK_HEADER = struct.Struct('<QQQI')
@@ -104,7 +107,11 @@ class Fields:
 
     def text(self) -> str:
         """Read a text, which follows its length."""
-        return self.bytes(self.number(4)).decode()
+        start = self._position + 4
+        self._position = start + int.from_bytes(self._data[start - 4 : start], 'little')
+        if self._position > len(self._data):
+            raise ValueError(f'damaged: a {self._kind} record is shorter than its fields')
+        return self._data[start : self._position].decode()
 
     def strings(self) -> dict[str, str]:
         """Read a map from text to text.
@@ -181,8 +188,7 @@ class Chunk:
     base: int
 
 
-@dataclass(frozen=True, slots=True)
-class MessageIndex:
+class MessageIndex(NamedTuple):
     """A message index, where it is, and the number of its chunk."""
 
     chunk: int
@@ -246,10 +252,10 @@ class Contents:
     def take(self, opcode: int, data: bytes, position: int, end: int) -> None:
         """Take the record that begins at `position` and whose content ends at `end`."""
         start = position + RECORD.size
-        if opcode == Opcode.CHUNK:
-            self._take_chunk(data[start:end], position, end - position)
-        elif opcode == Opcode.MESSAGE_INDEX:
+        if opcode == _MESSAGE_INDEX:
             self._take_message_index(data[start:end], position)
+        elif opcode == Opcode.CHUNK:
+            self._take_chunk(data[start:end], position, end - position)
         elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
             self._unpacked_bytes += end - position
             self._require_room()
@@ -349,7 +355,7 @@ class Contents:
         position, end, base = 0, len(data), self._size
         if base + end > MAX_UNPACKED_BYTES:
             raise ValueError(f'more than {MAX_UNPACKED_BYTES} bytes of messages')
-        read, message = RECORD.unpack_from, int(Opcode.MESSAGE)
+        read = RECORD.unpack_from
         while position < end:
             if end - position < RECORD.size:
                 raise ValueError('damaged: a record is longer than its chunk')
@@ -357,7 +363,7 @@ class Contents:
             following = position + RECORD.size + size
             if following > end:
                 raise ValueError('damaged: a record is longer than its chunk')
-            if opcode == message:
+            if opcode == _MESSAGE:
                 if size < MESSAGE_FIELD_BYTES:
                     raise ValueError('damaged: a message is shorter than its header')
                 starts.append(base + position)
