@@ -1,4 +1,4 @@
-"""Directories that anybody may have filled: one line each, nothing followed, nothing waited for."""
+"""Folders with hostile entries: one line each, no link followed, no pipe waited for."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def assert_one_line_each(text, count):
     assert all(line.isprintable() and len(line) < 500 for line in lines)
 
 
-# What lies beside good episodes hides none of them
+# Bad entries hide no good episode
 
 
 def fifo_inside(directory):
@@ -132,7 +132,7 @@ def test_a_bad_entry_hides_no_good_one(directory, make, capsys):
 
 
 def test_a_bag_that_cannot_be_looked_into_hides_no_good_one(directory, capsys):
-    # A name of the longest length: whatever is looked up in it is too long.
+    # A name of the longest length: every path in it is too long.
     (directory / 'loop').symlink_to(directory / 'loop')
     (directory / 'loop.mcap').symlink_to(directory / 'loop.mcap')
     assert episodes_list.main([str(directory)]) == 1
@@ -161,7 +161,7 @@ def test_links_in_a_leftover_are_not_followed(directory, tmp_path, link):
 
 
 def cut_with(metadata, type_name='std_msgs/msg/Float64', **options):
-    """What a killed robot leaves of a file with one message of `reward`."""
+    """A file with one message of `reward`, as a killed robot leaves it."""
     stream = BytesIO()
     writer = Writer(stream, **options)
     writer.start(profile='ros2')
@@ -373,7 +373,7 @@ def test_a_dataset_keeps_the_name_it_is_given(finished, tmp_path, name, id, monk
 
 
 def test_an_episode_without_a_step_is_left_out_of_a_dataset_by_name(tmp_path, capsys):
-    """Such as that of a robot in lockstep that nobody commanded."""
+    """Such as the episode of a robot in lockstep without commands."""
     pytest.importorskip('minari')
     recorder, episodes = Recorder('FetchReach'), EpisodeDirectory(tmp_path / 'episodes')
     recorder.record(episodes)

@@ -80,7 +80,7 @@ def copy_of(episodes, tmp_path):
 
 
 def rewrite(source, directory, change=lambda tick, name, data: data, result=None, last=None):
-    """Writes an episode again with some messages changed or, where `change` says None, left out."""
+    """Write an episode again with changed messages; `change` returns None to leave one out."""
     episode = read_episode(source)
     writer = EpisodeWriter(directory, source.name, episode.metadata)
     for number, tick in enumerate(split_ticks(episode)[:last]):
@@ -207,7 +207,7 @@ def test_check_notices_a_result_that_is_not_true(reach, tmp_path):
 @pytest.mark.parametrize('complete', ['maybe', 'True', ''])
 def test_check_notices_an_end_that_is_neither(reach, complete, monkeypatch):
     episode = read_episode(min(reach.iterdir()))
-    # What this project writes says one or the other.
+    # Files of this project contain one or the other.
     said = dataclasses.replace(episode, result={**episode.result, 'complete': complete})
     monkeypatch.setattr(checker, 'read_episode', lambda path: said)
     difference = EpisodeChecker().check(episode.path).difference
@@ -448,7 +448,7 @@ def test_list_filters(reach, tmp_path, capsys):
         table = capsys.readouterr().out.splitlines()[1:-1]
         return [line.split()[0] for line in table]
 
-    # Killed, and recovered: nobody knows how it would have ended.
+    # Killed and recovered: its success is unknown.
     writer = EpisodeWriter(directory, 'x2', {'task': 'HandReach', 'seed': '1'})
     writer.write(spec, TopicCodec(spec).encode(0, []), 1)
     writer.abort('killed')

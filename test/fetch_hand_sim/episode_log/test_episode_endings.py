@@ -57,10 +57,10 @@ def test_killed_at_random_moments_a_robot_loses_a_quarter_of_a_second(tmp_path):
 
 
 def lost_seconds(directory, factor, ticks):
-    """Recovers what a killed robot left; returns the wall time it had lived and nobody knows of.
+    """Recover the leftovers of a killed robot; return the lost wall-clock time.
 
-    That is the time from the first lost tick to the last, and no more than so many ticks take: on a
-    busy machine the robot itself may have been asleep between them.
+    It lasts from the first lost tick to the last, and at most as long as these ticks take: on a
+    busy machine the robot may have been suspended between them.
     """
     path = Path(directory)
     if path.exists():
@@ -174,7 +174,7 @@ def test_episodes_that_were_asked_for_and_not_logged_are_a_failure(start_process
     arguments = ros_args(episode_dir=disk, episodes=3, real_time_factor=0.0)
     code, output = finish(start_process(*SIM_NODE, *arguments))
     assert code == 1 and 'Traceback' not in output
-    # What is not logged is still said.
+    # Episodes that are not logged are still reported.
     assert 'episode 2 seed 2: 50 steps, return' in output
     assert output.splitlines()[-1] == f'sim_node: not all episodes are in {disk}'
 

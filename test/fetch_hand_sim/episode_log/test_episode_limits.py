@@ -28,7 +28,7 @@ from msgs_spec.topics import topic, topics
 from support.episode_recorder import Recorder
 
 MIB = 2**20
-# What a robot may be sent while it is paused at its third tick, as sizes of messages on a topic.
+# Topics and sizes of messages that a robot receives while it is paused at its third tick.
 FLOODS = {
     'one of 17.6 MB': [('commands', 17_610_916)],
     'eight of 10 MB': [('commands', 10_000_000)] * 8,
@@ -79,7 +79,7 @@ def test_no_flood_makes_a_file_that_a_reader_refuses(tmp_path, recorder, ticks, 
     commands = counts.pop('/commands')
     assert sum(counts.values()) >= len(published)
     assert all(counts[f'/{spec.name.lstrip("/")}'] for spec, _ in published)
-    # Whatever was refused is counted, beside the result.
+    # The result counts the rejected messages.
     refused = json.loads(episode.result['received_not_logged'])
     assert commands + refused['commands'] >= len([1 for name, _ in flood if name == 'commands'])
     assert read_summary(path).message_count == commands + sum(counts.values())
@@ -164,11 +164,11 @@ def test_metadata_as_long_as_allowed_read_back(tmp_path, ticks):
     assert read_episode(path).metadata['note'] == metadata['note']
 
 
-# What earlier versions wrote
+# Files of earlier versions
 
 
 def write_as_before(stream, recorder, ticks, flood):
-    """What version 0.1 wrote of a flood: everything, in chunks of 128 KiB and a message."""
+    """Write a flood as version 0.1 did: everything, in chunks of 128 KiB and a message."""
     writer = Writer(stream, chunk_size=128 * 1024, compression=CompressionType.LZ4)
     writer.start(profile='ros2')
     writer.add_metadata('episode', {'episode_id': 'episode', **recorder.metadata()})
@@ -237,7 +237,7 @@ def test_small_files_of_very_many_messages_cost_little(tmp_path, read, monkeypat
 
 
 def test_limits_hold_together():
-    """What one topic may take leaves room for the others and for the ticks."""
+    """The allowance of one topic leaves room for the others and for the ticks."""
     assert 4 * limits.MAX_RECEIVED_MESSAGES < limits.MAX_MESSAGES
     assert 4 * limits.MAX_RECEIVED_BYTES < limits.MAX_UNPACKED_BYTES
     assert MAX_MESSAGE_BYTES < limits.MAX_RECEIVED_BYTES

@@ -68,7 +68,7 @@ METADATA_KEYS = {
 
 
 class Bag:
-    """A finished episode beside what went into it."""
+    """A finished episode and its input."""
 
     def __init__(self, directory, task):
         self.recorder = Recorder(task)
@@ -476,7 +476,7 @@ def test_numbers_go_on_whatever_a_task_is_called(tmp_path, task):
     for number, seed in enumerate((5, 0)):
         writer = EpisodeDirectory(tmp_path).begin(task, seed, {})
         assert files.active_path(tmp_path, f'{task}_{number:06d}_seed{seed}').is_dir()
-        # What was cut off has its number too.
+        # A cut-off episode has its number too.
         writer._stream.close()
 
 

@@ -419,7 +419,7 @@ def test_too_little_free_space_is_noticed_before(tmp_path):
 
 @contextmanager
 def unprivileged():
-    """Root may write everywhere; become nobody where that is possible."""
+    """Root may write everywhere; take the user `nobody` where that is possible."""
     if os.geteuid() != 0:
         yield
         return
@@ -522,7 +522,7 @@ def test_a_robot_that_begins_its_file_while_the_rest_is_cleared_away_keeps_it(
         file.write_bytes(b'begun')
         remove(path)
 
-    # A moment after recovery has seen that there is no file.
+    # A moment after recovery has found no file.
     monkeypatch.setattr(recovery, '_remove_empty', begins)
     with pytest.raises(EpisodeInUseError):
         recover_episode(leftover)

@@ -1,4 +1,4 @@
-"""What the records of an episode say, typed: round trips, and what strangers may write."""
+"""The records of an episode, parsed: round trips, and invalid text."""
 
 from __future__ import annotations
 

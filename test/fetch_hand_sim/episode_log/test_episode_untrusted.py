@@ -1,4 +1,4 @@
-"""Files that anybody may have made: a clear error or a partial read, at little cost."""
+"""Hostile files end in a clear error at little cost."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_crafted_files_end_in_one_line_within_two_seconds_and_half_a_gigabyte(ep
     assert sum(report['outcomes'].values()) == READERS * CRAFTED
     assert report['slowest_s'] < 2.0
     assert report['peak_bytes'] < 500 * 10**6
-    # What one process keeps of all readings levels off.
+    # The memory that one process keeps levels off.
     assert report['held_bytes'] < 750 * 10**6
     # Most are found out, and by far not all: what is only strange is read.
     assert 0.2 * CRAFTED < report['outcomes']['episodes check exit 2'] < CRAFTED

@@ -426,7 +426,7 @@ def test_a_converted_bag_without_the_episode_record_is_rejected(episodes, tmp_pa
             read(tmp_path / 'out')
 
 
-# What the check compares
+# The check
 
 
 def later_publish_time(parts):

@@ -142,7 +142,7 @@ def test_metadata_are_those_of_the_moment_in_which_an_episode_begins(
 def test_a_slow_disk_delays_no_tick(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What waits for the disk is the end of a file, and nothing waits for that."""
+    """The end of a file waits for the disk, and the ticks do not wait for that."""
     store = EpisodeWriter.store
 
     def wait(writer: EpisodeWriter) -> Path | None:
@@ -255,7 +255,7 @@ def chunks(path: Path) -> list[Chunk]:
 def test_a_recorder_that_has_failed_idles(
     tmp_path: Path, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What comes into the backlog after it was cleared is not saved, and not waited for."""
+    """Tasks that are queued after the failure are neither run nor waited for."""
 
     def fail(writer: EpisodeWriter) -> Path:
         raise EpisodeLogError('episode log stopped: disk full')

@@ -43,7 +43,7 @@ def test_poses_are_those_of_the_sites(task):
 
 
 def record(simulation, directory, version):
-    """Logs the first ticks of an episode as a robot of an interface version tells them."""
+    """Log the first ticks of an episode as a robot of an interface version publishes them."""
     runner = EpisodeRunner(simulation)
     context = RecordingContext(simulation, with_compiled_model=False)
     encoder = TickEncoder(runner.spec)

@@ -1,4 +1,4 @@
-"""Pushes: off unless asked for, bounded, a tick long, marked in the log, repeated by its check."""
+"""Pushes: off by default, bounded, one tick long, marked in the log, repeated by its check."""
 
 from __future__ import annotations
 

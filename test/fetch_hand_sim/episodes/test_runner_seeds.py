@@ -1,4 +1,4 @@
-"""Seeds of episodes: one after the other, from wherever somebody said."""
+"""Seeds of episodes: one after the other, from the seed that was set."""
 
 from __future__ import annotations
 
