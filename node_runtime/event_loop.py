@@ -48,6 +48,7 @@ class EventLoop:
             limit: Maximum number of callbacks. A number and not a time, so that the result does not
                 depend on the load of the machine.
         """
+        self._announce_after_suspension()
         if not self._is_queue:
             # It reports neither what waits nor whether it ran a callback.
             for _ in range(min(limit, _SERVED_BLINDLY)):

@@ -1,4 +1,4 @@
-"""One codec both ways: what `decode` and `decode_many` make of bytes, whoever wrote them."""
+"""`decode` and `decode_many` agree for messages of any writer."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_other_layouts_are_read_one_by_one_and_refused_in_bulk():
 
 
 @pytest.mark.parametrize('name', ['joint_states', 'desired_goal', 'commands', 'is_success'])
-def test_bytes_that_are_no_message_are_one_line(name):
+def test_invalid_bytes_are_rejected_in_one_line(name):
     codec = TopicCodec(topic(TASKS['FetchReach'], name))
     good = codec.encode(1, np.zeros(codec.topic.size))
     for data in (b'', good[:3], good[: codec.size - 1], b'\xff' * codec.size, good + b'\0' * 8):

@@ -108,7 +108,7 @@ def test_quaternions_are_xyzw_in_messages_and_wxyz_in_vectors():
     assert message.joint_names == ['object:joint']
 
 
-def test_commands_say_what_their_values_are():
+def test_commands_label_their_values():
     spec = topic(TASKS['FetchReach'], 'commands')
     layout = build_message(spec, 0, np.zeros(4)).layout
     (dimension,) = layout.dim

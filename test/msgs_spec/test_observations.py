@@ -20,7 +20,7 @@ TICKS = 5
 
 
 def vectors_of(task, tick):
-    """What a subscriber that joins topics by stamp has."""
+    """Vectors of a subscriber that joins topics by stamp."""
     messages = TickEncoder(task).encode(tick)
     return {spec.name: decode(spec, deserialize(spec.type_name, data)) for spec, data in messages}
 

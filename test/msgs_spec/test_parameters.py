@@ -150,7 +150,7 @@ def test_ros_shows_the_range_that_is_checked(spec, make_node):
         ('real_time_factor', 0.005, 'real_time_factor: 0.005 given; allowed: 0 or 0.01 ... 1000'),
     ],
 )
-def test_a_node_refuses_what_is_not_allowed_in_our_words(name, value, line, make_node):
+def test_a_node_rejects_invalid_values_with_the_allowed_ones(name, value, line, make_node):
     with pytest.raises(ValueError) as error:
         declare_parameters(make_node(**{name: value}), SIM_NODE)
     assert line in str(error.value)
@@ -163,7 +163,7 @@ def test_a_folder_in_the_home_directory_is_found_there(make_node, monkeypatch):
     assert values['episode_dir'] == '/home/somebody/episodes'
 
 
-def test_a_mistyped_parameter_is_named_with_the_nearest(make_node, capfd):
+def test_a_misspelt_parameter_gets_a_suggestion(make_node, capfd):
     node = make_node(tsak='FetchPush', seed=3, nonsense=1, checkpoint='random', use_sim_time=False)
     values = declare_parameters(node, SIM_NODE)
     assert (values['task'], values['seed']) == ('FetchReach', 3)
@@ -174,12 +174,12 @@ def test_a_mistyped_parameter_is_named_with_the_nearest(make_node, capfd):
     assert 'use_sim_time' not in said
 
 
-def test_a_mistyped_former_name_points_to_that_of_today():
+def test_a_misspelt_former_name_leads_to_the_present_name():
     line = unknown_parameter(POLICY_NODE, 'chekpoint')
     assert line == "unknown parameter 'chekpoint'; did you mean 'policy'?"
 
 
-def test_quality_of_service_that_is_fixed_is_not_ignored_without_a_word():
+def test_fixed_quality_of_service_is_reported():
     line = unknown_parameter(SIM_NODE, 'qos_overrides./joint_states.publisher.depth')
     assert line is not None and line.endswith('the quality of service of all topics is fixed')
 
@@ -196,19 +196,19 @@ def test_quality_of_service_that_is_fixed_is_not_ignored_without_a_word():
         ),
     ],
 )
-def test_what_rclpy_ignores_or_does_not_explain_is_one_line(arguments, message):
+def test_arguments_that_rclpy_ignores_or_does_not_explain_are_one_line(arguments, message):
     command = [sys.executable, '-m', 'fetch_hand_sim.sim_node', *arguments]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.startswith(message) and done.stdout == ''
     assert done.stderr.count('\n') == 1
 
 
-def test_only_nothing_at_all_is_no_value():
+def test_only_an_empty_value_is_missing():
     _reject_arguments(['--ros-args', '-p', 'policy:=a:=', '-r', '__ns:='])
 
 
 @pytest.mark.parametrize('name', ['qos_overrides./clock.publisher.depth', 'use_sim_time', 'rate'])
-def test_parameters_of_others_are_no_mistake(name):
+def test_parameters_of_ros_and_other_nodes_are_accepted(name):
     assert unknown_parameter(SIM_NODE, name) is None
 
 

@@ -53,7 +53,7 @@ def test_schema_text_holds_every_type_ros_names(type_name):
     }
 
 
-def test_unknown_type_is_named():
+def test_an_unknown_type_is_rejected_by_name():
     with pytest.raises(ValueError, match=r"unknown message type 'nav/Goal'; allowed: .*Jazzy"):
         schema_text('nav/Goal')
 
@@ -66,7 +66,7 @@ def test_serialisation_round_trip():
 
 
 @pytest.mark.parametrize('spec', [STATE, LATCHED, COMMAND, CLOCK])
-def test_rclpy_profile_says_the_same(spec):
+def test_rclpy_profile_has_the_same_policies(spec):
     pytest.importorskip('rclpy')
     profile = rclpy_profile(spec)
     assert profile.history.short_key == 'keep_last'

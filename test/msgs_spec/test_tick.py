@@ -1,4 +1,4 @@
-"""What a tick says on which topic, in which order."""
+"""Topics, order and contents of the messages of a tick."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_status_survives_exactly():
 
 
 @pytest.mark.parametrize(('said', 'is_success'), [('true', True), ('1', True), ('0', False)])
-def test_robots_of_other_languages_say_success_as_they_do(said, is_success):
+def test_success_is_read_in_the_spelling_of_other_languages(said, is_success):
     values = episode_status(TASKS['HandReach']).to_values() | {'is_success': said}
     assert EpisodeStatus.from_values(values).is_success is is_success
 
@@ -167,6 +167,6 @@ def test_another_robot_is_one_whose_messages_mean_something_else(change, is_same
     assert status.is_of_same_robot(dataclasses.replace(status, **change)) == is_same
 
 
-def test_unknown_topic_is_named():
+def test_an_unknown_topic_is_rejected_by_name():
     with pytest.raises(ValueError, match="FetchReach has no topic 'tf'; allowed: /clock, joint"):
         topic(TASKS['FetchReach'], 'tf')

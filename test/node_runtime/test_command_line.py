@@ -1,4 +1,4 @@
-"""What all commands share: codes, one line per error, Ctrl-C, closed pipes, progress."""
+"""Exit codes, one line per error, Ctrl-C, closed pipes and progress of all commands."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ def test_an_error_is_one_line_without_control_characters(error, code, capsys):
     assert capsys.readouterr().err == 'tool: no luck \\x1b[31m\n'
 
 
-def test_what_is_said_of_strange_names_can_be_printed_anywhere(capsys):
+def test_strange_names_are_printed_with_escapes(capsys):
     say('runs/\udcff\x1b[31m done')
     assert capsys.readouterr().out == 'runs/\\udcff\\x1b[31m done\n'
 
 
-def test_an_error_that_nobody_expects_is_not_hidden():
+def test_an_unexpected_error_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError):
         run_command('tool', lambda: 1 // 0)
 
@@ -97,7 +97,7 @@ def test_a_second_ctrl_c_ends_a_command_that_tidies_for_ever():
     assert process.returncode == -signal.SIGINT
 
 
-def test_a_handler_of_others_stays():
+def test_other_handlers_of_signals_stay():
     before = signal.getsignal(signal.SIGINT)
     seen: list[int] = []
     signal.signal(signal.SIGINT, lambda number, frame: seen.append(number))
@@ -133,7 +133,7 @@ def test_a_full_output_is_one_line():
         ['fetch_hand_sim.sim_node', '--help'],
     ],
 )
-def test_help_that_nobody_reads_ends_as_every_command(words):
+def test_help_on_a_full_or_closed_output_ends_as_every_command(words):
     command = [sys.executable, '-m', *words]
     for output, code, said in (('/dev/full', 1, 'cannot write: No space'), (None, 141, '')):
         reader, writer = os.pipe() if output is None else (None, os.open(output, os.O_WRONLY))
@@ -180,7 +180,7 @@ def test_a_terminal_that_closes_takes_nothing_with_it_but_the_bar():
 # Extras
 
 
-def test_what_an_extra_lacks_is_named_with_how_to_get_it(monkeypatch):
+def test_missing_packages_are_named_with_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, 'pyarrow', None)
     with pytest.raises(UsageError, match=r"pyarrow missing: pip install 'fetch_hand_sim\[data\]'"):
         require_extra('data')
@@ -217,7 +217,7 @@ def test_progress_is_shown_to_a_person_only(is_watched):
         while chunk := os.read(terminal, 4096):
             shown += chunk
     except OSError:
-        pass  # How Linux says that the other end is closed.
+        pass  # Linux reports a closed other end so.
     finally:
         os.close(terminal)
     assert process.communicate(timeout=20)[0] == ''
@@ -236,7 +236,7 @@ def test_numbers_out_of_range_are_one_line(text, capsys):
     assert parser.parse_args(['--count', '6']).count == 6
 
 
-def test_a_mistyped_choice_is_answered_with_what_was_probably_meant(capsys):
+def test_a_misspelt_choice_gets_a_suggestion(capsys):
     parser = CommandParser(prog='tool')
     parser.add_argument('-t', '--task', nargs='+', choices=['FetchPush', 'HandReach'])
     parser.add_argument('--count', type=int, choices=[1, 2])

@@ -1,4 +1,4 @@
-"""Processes that a library does not let go end all the same."""
+"""Processes end in time even if a library holds the interpreter."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import time
 
 import pytest
 
-# A library that spins and holds the interpreter: `PyDLL` does not let go of its lock.
+# A library that spins: `PyDLL` does not release the lock of the interpreter.
 HELD = """
 import ctypes, time
-from node_runtime.exit_watchdog import ends_within
+from node_runtime.node_main import ends_within
 print('done', flush=False)
 with ends_within({limit}, {code}):
     ctypes.PyDLL(None).usleep(ctypes.c_uint({microseconds}))
@@ -34,11 +34,11 @@ def test_a_process_that_is_held_ends_with_its_own_exit_code(code: int) -> None:
     assert seconds < 10.0
 
 
-def test_a_process_that_is_let_go_in_time_goes_on() -> None:
+def test_a_process_continues_after_a_body_in_time() -> None:
     assert run(0.5, 3, held=0.1)[:2] == (0, 'done\nleft\n')
 
 
-def test_output_that_nobody_reads_any_more_is_no_obstacle() -> None:
+def test_a_closed_output_is_no_obstacle() -> None:
     program = HELD.format(limit=5, code=3, microseconds=1000).replace(
         "print('left')", "open('/dev/stderr', 'w').write('left')"
     )

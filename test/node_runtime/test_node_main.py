@@ -43,7 +43,7 @@ def test_logs_of_ros_go_where_they_can(
     assert environment == before | added
 
 
-def test_a_second_signal_is_told_from_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_signal_differs_from_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [10.0]
     monkeypatch.setattr(node_main.time, 'monotonic', lambda: now[0])
     handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}

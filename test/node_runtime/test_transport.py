@@ -1,4 +1,4 @@
-"""Nodes stay on this machine and out of shared memory unless asked."""
+"""By default, nodes stay on this machine and do not use shared memory."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ def test_bad_commands_are_dropped_and_good_ones_clipped(
         for bad in ([0.0] * 3, [0.0] * 5, [], [float('nan'), 0, 0, 0], [0, float('inf'), 0, 0]):
             send(robot, *bad)
             robot.spin(0.1)
-        # While commands are complained of, why a goal was refused is said too.
+        # Warnings about commands do not silence those about goals.
         robot.connect('set_goal')
         far = build_message(topic(REACH, 'set_goal'), 0, [0.0, 0.0, 1e6])
         robot.publish('set_goal', serialize('geometry_msgs/msg/PointStamped', far))
@@ -218,7 +218,7 @@ def test_late_joiner_gets_goal_and_status(start_process: Start) -> None:
         assert robot.received['achieved_goal'] == []
 
 
-def test_goal_set_by_a_person(start_process: Start) -> None:
+def test_set_goal_replaces_the_goal(start_process: Start) -> None:
     start_process(*SIM_NODE)
     wanted = [1.3, 0.7, 0.6]
     with client(REACH) as robot:
@@ -235,7 +235,7 @@ def test_goal_set_by_a_person(start_process: Start) -> None:
         )
 
 
-def test_named_joint_commands_move_only_what_they_name(start_process: Start) -> None:
+def test_named_joint_commands_move_only_these_joints(start_process: Start) -> None:
     spec = task_spec('HandReach')
     start_process(*SIM_NODE, *ros_args(task='HandReach', mode='lockstep', wait_for_commands=True))
     with client(spec) as robot:
@@ -274,7 +274,7 @@ def test_pause_step_and_reset(start_process: Start) -> None:
 
 
 @pytest.mark.parametrize('mode', ['lockstep', pytest.param('realtime', marks=pytest.mark.release)])
-def test_a_robot_that_was_stepped_begins_an_episode_before_anybody_commands(
+def test_a_stepped_robot_starts_an_episode_without_commands(
     start_process: Start, mode: str
 ) -> None:
     start_process(*SIM_NODE, *ros_args(mode=mode, wait_for_commands=True))
@@ -291,7 +291,7 @@ def test_a_robot_that_was_stepped_begins_an_episode_before_anybody_commands(
         )
 
 
-def test_a_robot_that_was_stepped_goes_on_when_told_to_before_anybody_commands(
+def test_a_stepped_robot_resumes_without_commands(
     start_process: Start,
 ) -> None:
     start_process(*SIM_NODE, *ros_args(wait_for_commands=True))
@@ -307,12 +307,12 @@ def test_a_robot_that_was_stepped_goes_on_when_told_to_before_anybody_commands(
         robot.spin_until(lambda: len(robot.stamps('/clock')) > 5, 'ticks')
 
 
-def test_a_seed_set_while_the_robot_waits_is_told(start_process: Start) -> None:
+def test_a_seed_set_while_the_robot_waits_is_published(start_process: Start) -> None:
     start_process(*SIM_NODE, *ros_args(wait_for_commands=True))
     with client(REACH) as robot:
         seed = Parameter(name='seed', value=ParameterValue(type=2, integer_value=9))
         robot.call(SetParameters, 'sim_node/set_parameters', parameters=[seed])
-        # Also whoever comes late.
+        # Late subscribers receive it, too.
         robot.subscribe('episode_status')
         robot.spin_until(lambda: bool(robot.statuses()), 'status')
         assert (robot.statuses()[-1].phase, robot.statuses()[-1].seed) == ('waiting', 9)

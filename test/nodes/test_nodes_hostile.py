@@ -1,4 +1,4 @@
-"""What a graph does to nodes: floods, stops, bad parameters, several robots, Ctrl-C at any time."""
+"""Floods, stops, bad parameters, several robots, and Ctrl-C at any time."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def random_value(generator: np.random.Generator) -> ParameterValue:
             type=ParameterType.PARAMETER_DOUBLE_ARRAY, double_array_value=[number] * 1000
         ),
         ParameterValue(),
-        # No type that there is, which rclpy raises for.
+        # An unknown type, for which rclpy raises an error.
         ParameterValue(type=200, string_value='x'),
     ][generator.integers(7)]
 
@@ -167,7 +167,7 @@ def test_random_parameters_are_answered_and_only_allowed_ones_applied(
 
 
 @pytest.mark.alone
-def test_stopped_simulation_counts_what_it_missed_and_never_makes_up_for_it(
+def test_a_stopped_simulation_counts_missed_ticks_and_never_catches_up(
     start_process: Start,
 ) -> None:
     sim = start_process(*SIM_NODE)
@@ -230,7 +230,7 @@ def test_two_arms_and_two_hands_in_one_graph(start_process: Start, tmp_path: Pat
         end(policy)
 
 
-def test_a_second_source_of_time_is_named(start_process: Start) -> None:
+def test_a_second_source_of_time_is_reported(start_process: Start) -> None:
     first = start_process(*SIM_NODE, *ros_args(), '-r', '__ns:=/a')
     second = start_process(*SIM_NODE, *ros_args(), '-r', '__ns:=/b')
     with client(REACH) as robot:
@@ -253,8 +253,8 @@ def test_a_second_source_of_time_is_named(start_process: Start) -> None:
 def test_memory_stays_flat_at_twenty_times_real_time(
     start_process: Start, soak_seconds: float, tmp_path: Path
 ) -> None:
-    # Ten episodes a second are a line each: a pipe that nobody reads would be full after a minute,
-    # and a process that logs into it stands still.
+    # Each of ten episodes a second prints a line. An unread pipe would be full after a minute and
+    # block the process.
     with (tmp_path / 'log').open('w') as log, client(REACH) as robot:
         said = {'stdout': log, 'stderr': log}
         sim = start_process(*SIM_NODE, *ros_args(real_time_factor=20.0), **said)

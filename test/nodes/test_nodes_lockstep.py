@@ -230,7 +230,7 @@ def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
         again.send_signal(signal.SIGSTOP)
         robot.spin(0.2)
         count = len(ticks)
-        # The robot says what it waits for every five seconds at most, and it may just have said so.
+        # The robot logs the missing command once in five seconds.
         robot.spin(5.2)
         assert len(ticks) == count
         again.send_signal(signal.SIGCONT)
@@ -245,7 +245,7 @@ def test_commander_comes_late_dies_and_returns(start_process: Start) -> None:
 def test_a_listener_that_cannot_be_connected_does_not_hold_the_robot_up(
     start_process: Start,
 ) -> None:
-    """A subscription that asks for more than is offered shows in the graph and never matches."""
+    """An incompatible subscription is in the graph and never connects."""
     profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     with client(REACH) as connection:
         connection.node.create_subscription(JointState, 'joint_states', print, profile)
@@ -255,7 +255,7 @@ def test_a_listener_that_cannot_be_connected_does_not_hold_the_robot_up(
         connection.spin_until(lambda: connection.received['applied_command'], 'tick')
 
 
-def test_two_commanders_are_named_and_health_is_published(start_process: Start) -> None:
+def test_two_commanders_are_reported_and_health_is_published(start_process: Start) -> None:
     sim = start_process(*SIM_NODE, *ros_args(real_time_factor=4.0))
     policy = start_process(*POLICY_NODE, *ros_args(policy='random', use_sim_time=True))
     with client(REACH) as robot:

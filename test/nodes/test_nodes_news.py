@@ -1,4 +1,4 @@
-"""What a robot tells people and latecomers: who commands, what is missing, where it stands."""
+"""Reports, log lines and late subscribers of a robot."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_episodes_after_an_actor_has_left_do_not_bear_its_name(
     assert not any(named[last + 2 :])
 
 
-def test_a_robot_without_a_log_says_what_it_is_and_how_episodes_end(start_process: Start) -> None:
+def test_a_robot_without_a_log_prints_its_settings_and_episodes(start_process: Start) -> None:
     arguments = ros_args(real_time_factor=0.0, episodes=2, seed=5, use_sim_time=True)
     sim = start_process(*SIM_NODE, *arguments, '-r', '__ns:=/arm1')
     output, errors = sim.communicate(timeout=30.0)
@@ -82,7 +82,7 @@ def test_a_robot_without_a_log_says_what_it_is_and_how_episodes_end(start_proces
     ]
 
 
-def test_two_robots_of_one_name_are_both_told_so(start_process: Start) -> None:
+def test_two_robots_of_one_name_both_report_it(start_process: Start) -> None:
     sims = [start_process(*SIM_NODE, *ros_args()) for _ in range(2)]
     line = '2 nodes publish as one robot: /sim_node, /sim_node; give each its own namespace'
     with client(REACH) as robot:
@@ -150,7 +150,7 @@ def test_the_state_after_a_reset_comes_also_while_the_robot_stands_still(
 
 
 @pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
-def test_whoever_joins_a_robot_that_stands_still_sees_its_last_state(
+def test_a_late_subscriber_of_a_standing_robot_receives_its_last_state(
     start_process: Start, mode: str
 ) -> None:
     sim = start_process(*SIM_NODE, *ros_args(mode=mode))

@@ -108,7 +108,7 @@ def test_frames_of_every_tick_are_where_mujoco_has_them(
 
 
 class Simulator:
-    """The services of a robot, called as anybody does."""
+    """The services of a robot, called by a client."""
 
     def __init__(self, connection):
         self.connection = connection
@@ -167,7 +167,7 @@ def test_simulation_interfaces_answer_as_their_definitions_say(start_process: St
         features = simulator('get_simulator_features').features
         known = messages.SimulatorFeatures
         assert set(features.features) == {getattr(known, name) for name in services.FEATURES}
-        # What is offered by a service or an action is in the list, and the other way round.
+        # The list contains exactly the offered services and actions.
         assert known.STEP_SIMULATION_ACTION not in features.features
         assert known.SIMULATION_RESET_TIME not in features.features
         assert list(features.spawn_formats) == []
@@ -220,7 +220,7 @@ def test_simulation_interfaces_answer_as_their_definitions_say(start_process: St
 
 def test_steps_beyond_the_last_episode_are_counted(start_process: Start) -> None:
     needs('simulation_interfaces')
-    # A first reset, which needs no command, and then nobody commands.
+    # The first reset needs no command; no command follows.
     node = start_process(*SIM_NODE, *ros_args(task='FetchReach', mode='lockstep', episodes=2))
     with client(task_spec('FetchReach')) as connection:
         simulator = Simulator(connection)
@@ -244,7 +244,7 @@ def test_a_policy_goes_on_after_others_paused_and_stepped(start_process: Start, 
         simulator = Simulator(connection)
         paused, playing = (messages.SimulationState(state=number) for number in (2, 1))
         for wanted in (paused, playing, paused):
-            # Of several who ask at once one is told that it was done, the others that it was so.
+            # One of several simultaneous calls pauses; the others find the robot paused.
             calls = [simulator.later('set_simulation_state', state=wanted) for _ in range(3)]
             connection.spin_until(lambda calls=calls: all(c.done() for c in calls), 'answers')
             codes = sorted(each.result().result.result for each in calls)

@@ -1,4 +1,4 @@
-"""Lines that may come often and are said now and then."""
+"""Throttled log lines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from node_runtime.ros import seldom
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_a_line_is_said_again_after_its_time_whatever_the_system_clock_does(node):
+def test_a_line_is_throttled_by_the_steady_clock(node):
     assert seldom(0.2)['throttle_time_source_type'].clock_type is ClockType.STEADY_TIME
     said = []
     for pause in (0.0, 0.0, 0.3):

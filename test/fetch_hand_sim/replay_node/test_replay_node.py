@@ -52,7 +52,7 @@ def episode(tmp_path_factory):
 
 
 def collect(listener, name):
-    """Receives a topic without loss, whatever depth its contract has."""
+    """Receive a topic without loss."""
     spec = topic(listener.spec, name)
     received = []
     listener.node.create_subscription(
@@ -122,7 +122,7 @@ def test_generated_episodes_equal_those_of_the_nodes(start_process, tmp_path):
     assert batch.topics == node.topics
     assert batch.result == node.result
     assert batch.attachments == node.attachments
-    # Somebody may commit between the two runs.
+    # A commit may come between the two runs.
     same = [key for key in node.metadata if key not in ('started', 'source_revision')]
     assert list(batch.metadata) == list(node.metadata)
     assert [batch.metadata[key] for key in same] == [node.metadata[key] for key in same]
@@ -152,7 +152,7 @@ def test_every_message_comes_back_as_recorded_with_its_timing(start_process, epi
             if spec.direction == 'published':
                 expected = [m.data for m in logged.topics['/' + spec.name.lstrip('/')].messages]
                 got = [serialize(spec.type_name, from_ros(m)) for m in listener.received[spec.name]]
-                # Latched topics were announced before the start, `/clock` says how long it took.
+                # Latched topics are published once more before the start.
                 extra = len(got) - len(expected)
                 assert extra == (1 if spec.qos.durability == 'transient_local' else 0), spec.name
                 assert got[extra:] == expected, spec.name
@@ -222,7 +222,7 @@ def test_commands_are_published_only_when_asked_for(start_process, episode):
 
 
 def assert_ends_well(replay, said=''):
-    """With 0, and what it said at the start as its only line."""
+    """The process ends with 0 after one line."""
     code, output = finish(replay)
     assert (code, output.count('\n')) == (0, 1), output
     assert 'real time; topics in /' in output and output.endswith(f'{said}\n')
@@ -329,7 +329,7 @@ def test_bad_parameters_end_with_one_line_and_code_2(start_process, episode, par
     assert len(output.strip().splitlines()) == 1
 
 
-def test_schedule_holds_what_the_robot_published_in_order(episode):
+def test_a_schedule_contains_the_published_messages_in_order(episode):
     schedule = ReplaySchedule(episode)
     ticks = split_ticks(read_episode(episode))
     expected = [m.data for tick in ticks for m in tick.published]

@@ -1,4 +1,4 @@
-"""Which commands are applied, and what is said of the others."""
+"""Applied and rejected commands."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_overshoot_of_a_controller_is_clipped_and_counted(value):
     assert (buffer.clipped, buffer.far_out) == (abs(value) > 1.0, 0)
 
 
-def test_degrees_by_mistake_are_clipped_and_named():
+def test_degrees_by_mistake_are_clipped_and_reported():
     buffer = CommandBuffer(HAND, 0.0)
     buffer.accept_named(['robot0:FFJ2'], [100.0])
     assert buffer.take()[NAMES.index('robot0:FFJ2')] == HAND.command[3].upper

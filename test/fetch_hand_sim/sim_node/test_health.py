@@ -1,4 +1,4 @@
-"""What a robot reports about itself."""
+"""Reports of the simulator node."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_report_of_a_healthy_robot(make):
         ),
     ],
 )
-def test_report_says_what_is_wrong_around_the_robot(make, changes, level, text):
+def test_a_report_contains_problems_of_the_surroundings(make, changes, level, text):
     report = report_after(make(), replace(FINE, **changes), ticks=26)
     assert (report.level, report.message) == (level, text)
     message = deserialize(DIAGNOSTICS.type_name, encode_reports(report))
@@ -74,7 +74,7 @@ def test_report_says_what_is_wrong_around_the_robot(make, changes, level, text):
     assert (status.level, status.name, status.message) == (level, '/sim_node', report.message)
 
 
-def test_only_who_publishes_the_clock_minds_others_who_do(make):
+def test_other_clocks_matter_only_to_a_robot_that_publishes_one(make):
     others = replace(FINE, clock_publishers=['/b/sim_node'], publishes_clock=False)
     report = report_after(make(), others, ticks=26)
     assert report.level is Level.OK
@@ -102,7 +102,7 @@ def test_only_who_publishes_the_clock_minds_others_who_do(make):
         ('diverged', Level.ERROR, 'the simulation diverged 1 times'),
     ],
 )
-def test_report_says_what_went_wrong_in_the_robot(make, monkeypatch, problem, level, text):
+def test_a_report_contains_problems_of_the_robot(make, monkeypatch, problem, level, text):
     case = make('lockstep' if problem in ('stalled', 'elsewhere') else 'realtime')
     waiting = ['/policy_node waits for a robot on /episode_status']
     surroundings = {
@@ -158,7 +158,7 @@ def test_a_period_with_a_pause_or_another_pace_in_it_is_not_judged(make):
 
 @pytest.mark.parametrize('factor', [0.01, 0.1])
 def test_slow_motion_is_not_called_slow(make, factor):
-    """A period holds a few ticks, and one more or less of them tells nothing."""
+    """A period contains few ticks, so one more or less is no sign of slowness."""
     case = make()
     health = Health(case.robot, '/sim_node', case.clock.now)
     case.robot.tick_when_due()
@@ -179,7 +179,7 @@ def test_a_report_that_came_late_is_followed_by_a_whole_period():
 
 
 @pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
-def test_a_pause_is_not_a_silence_of_who_commands(make, mode):
+def test_commands_are_not_missing_during_a_pause(make, mode):
     case = make(mode)
     case.robot.tick_when_due()
     case.robot.buffer.accept([0.0] * 4)

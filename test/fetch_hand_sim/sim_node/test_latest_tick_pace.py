@@ -42,19 +42,19 @@ def case(make):
     return case
 
 
-def test_a_fast_robot_is_seen_now_and_then_and_a_slow_one_at_every_tick(case) -> None:
+def test_a_fast_robot_is_published_at_a_limited_rate_and_a_slow_one_at_every_tick(case) -> None:
     for _ in range(50):
         case.tick(0.002)
     assert len(case.output.said) <= 0.1 * LATEST_TICKS_PER_SECOND + 2
     case.output.said.clear()
-    # 25 Hz, of which some come late and the next in time.
+    # 25 Hz; some ticks are late, the next ones in time.
     for late in (0.0, 0.03, 0.0, 0.0, 0.03):
         case.tick(0.04 + late)
         case.tick(0.04 - late)
     assert len(case.output.said) == 10
 
 
-def test_the_last_tick_before_a_robot_stands_still_is_said_once(case) -> None:
+def test_the_last_tick_before_a_standstill_is_published_once(case) -> None:
     for _ in range(3):
         case.tick(0.001)
     case.clock.now += 1.0
@@ -67,7 +67,7 @@ def test_the_last_tick_before_a_robot_stands_still_is_said_once(case) -> None:
     assert case.output.said[-2:] == [2, 2]
 
 
-def test_nothing_is_said_to_nobody_and_who_comes_hears_the_last(case) -> None:
+def test_without_subscribers_nothing_is_published_and_late_ones_receive_the_last_tick(case) -> None:
     case.latest.publish_when_due()
     case.output.listeners = 0
     for _ in range(5):

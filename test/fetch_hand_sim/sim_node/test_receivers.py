@@ -1,4 +1,4 @@
-"""What comes over the network."""
+"""Received messages."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_a_message_is_logged_if_it_can_be_read_and_as_short_as_a_log_allows(list
     }
 
 
-def test_what_a_commander_says_of_itself_is_a_fingerprint_or_nothing(listening):
+def test_policy_status_contains_a_hash_or_nothing(listening):
     for sha256 in ('', 'a' * 64, 'a' * 63, 'x' * 64, '\x1b[31m' * 1000):
         receive(listening, POLICY_STATUS, introduction(sha256))
     receive(listening, POLICY_STATUS, message_without_pairs())

@@ -61,7 +61,7 @@ def test_step_ends_with_the_last_episode(make):
     assert answer.message == 'all episodes are done; 51 of 60 ticks ran'
 
 
-def test_a_running_robot_says_what_follows_a_reset_and_does_it(make):
+def test_a_running_robot_answers_and_resets_at_the_next_tick(make):
     case = make()
     assert case.robot.reset().message == (
         'no episode is running; the next tick starts episode 0 with seed 0; '
@@ -106,7 +106,7 @@ def test_a_robot_in_lockstep_waits_with_a_reset_for_the_command_that_is_on_its_w
     case.robot.tick_when_due()
     assert (case.ticks[-1][0].status.episode, case.ticks[-1][0].status.tick) == (1, 0)
     assert case.robot.wait() == math.inf
-    # Nobody is about to answer any more.
+    # A policy would have answered by now.
     case.clock.now += 10.0
     assert case.robot.reset().success
     assert case.robot.wait() == 0.0
@@ -127,7 +127,7 @@ def test_commands_that_stop_are_missed_in_any_mode(make, factor):
     for _ in range(3):
         case.clock.now += 2.0
         case.robot.tick_when_due()
-        assert not case.robot.misses_commands, 'nobody ever commanded'
+        assert not case.robot.misses_commands, 'no command came yet'
     case.robot.buffer.accept([0.1] * 4)
     case.clock.now += 0.9
     assert not case.robot.misses_commands
@@ -170,7 +170,7 @@ def test_late_ticks_are_counted_and_never_accumulate(make):
         case.clock.now += case.robot.wait() + late
         case.robot.tick_when_due()
     assert case.robot.schedule.missed_ticks == 3 + 1
-    # Whatever was late, the next tick comes on the old grid, less than a period from now.
+    # The next tick stays on the old grid, less than a period from now.
     assert 0.0 < case.robot.wait() <= 0.04
     assert math.remainder(case.clock.now + case.robot.wait() - 100.0, 0.04) == pytest.approx(0.0)
 
@@ -210,7 +210,7 @@ def test_a_robot_that_is_meddled_with_ticks_no_faster_than_asked(make, meddle):
     assert len(case.ticks) == 8
 
 
-def test_the_last_tick_can_be_heard_again_with_the_same_bytes(make):
+def test_the_last_messages_are_kept(make):
     case = make('lockstep')
     assert case.robot.last_messages == []
     case.robot.tick()

@@ -1,7 +1,7 @@
 """The services of a robot.
 
-Those of `simulation_interfaces` against stand-ins with the fields of its releases 1.0.0 to 2.1.0;
-`test_ros_messages.py` has the real ones.
+`simulation_interfaces` is replaced by stand-ins with the fields of its releases 1.0.0 to 2.1.0;
+`test_ros_messages.py` uses the real package.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def test_simulation_interfaces_translate_to_the_robot(make):
         'episode 0 ends; a tick of its own starts episode 1 with seed 1',
     )
     case.robot.tick_when_due()
-    # 0 is defined as all, and all is as after a new start; only time goes on.
+    # Scope 0 means all: as after a new start, except time.
     for scope in (0, 255):
         case.robot.step(10)
         assert call(services.reset_simulation, scope=scope)[1].endswith(

@@ -1,4 +1,4 @@
-"""What standard tools are told is where MuJoCo has it."""
+"""Frames, markers and pictures for standard tools agree with MuJoCo."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_a_compressed_image_is_the_same_picture():
     np.testing.assert_allclose(found.astype(int), picture, atol=16)
 
 
-def test_the_camera_says_where_a_point_is_seen():
+def test_camera_info_projects_points_correctly():
     """Projection by camera_info and transform against the ray of that pixel."""
     view = Scene('FetchReach').view
     width, height, point = 640, 480, np.array([1.3, 0.7, 0.5])
