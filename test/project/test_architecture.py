@@ -79,7 +79,7 @@ def test_a_file_that_moved_is_noticed(path: str) -> None:
 
 
 @pytest.mark.parametrize('package', PACKAGES)
-def test_what_a_package_says_of_its_files_is_true(package: str) -> None:
+def test_package_docstrings_name_existing_files(package: str) -> None:
     paths = (ROOT / package).rglob('__init__.py')
     lost = {str(path): files for path in paths if (files := lost_files(path.read_text()))}
     assert lost == {}

@@ -41,13 +41,13 @@ def test_the_first_evaluation_with_the_target_counts(bench_her: ModuleType) -> N
     assert [row['times_ours'] for row in summary] == [1.0, 5.0, 2.5]
 
 
-def test_what_was_not_reached_is_said(bench_her: ModuleType) -> None:
+def test_a_missed_target_is_reported(bench_her: ModuleType) -> None:
     lines = bench_her.table(bench_her.summarize([*OURS, *SLOW])).splitlines()
     assert '| 20 | 2,000 | 1.0 | 0.95, 2,000 |' in lines[2]
     assert '| > 100 | > 6,000 | > 5.0 | 0.94, 6,000 |' in lines[3]
 
 
-def test_there_is_no_ratio_to_a_run_that_failed(bench_her: ModuleType) -> None:
+def test_a_failed_run_has_no_ratio(bench_her: ModuleType) -> None:
     failed = evaluations('this_project', (100.0, 5000, 0.4))
     summary = bench_her.summarize([*failed, *SLOW])
     assert [row['times_ours'] for row in summary] == [None, None]

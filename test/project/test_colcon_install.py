@@ -143,7 +143,7 @@ def test_package_xml_and_setup_py_say_the_same(distribution):
     assert 'Apache License' in (ROOT / 'LICENSE').read_text()
 
 
-def test_the_licence_is_where_package_xml_says(prefix):
+def test_the_licence_is_at_the_place_in_package_xml(prefix):
     installed = prefix / 'share' / PACKAGE
     licence = ElementTree.parse(installed / 'package.xml').getroot().find('license').get('file')
     assert (installed / licence).read_bytes() == (ROOT / 'LICENSE').read_bytes()
@@ -179,7 +179,7 @@ def test_parameter_file_holds_every_parameter_with_an_allowed_value(node, specs)
         validate(spec, parameters[spec.name])
 
 
-def test_the_install_is_what_python_imports(workspace, prefix, in_install):
+def test_python_imports_the_installed_package(workspace, prefix, in_install):
     files = ', '.join(f'{name}.__file__' for name in PYTHON_PACKAGES)
     code = f'import {", ".join(PYTHON_PACKAGES)}; print({files}, sep="\\n")'
     # Not from the repository, whose folder Python would search first.

@@ -82,7 +82,7 @@ def test_executables_are_the_nodes_view_and_one_for_all_commands():
 @pytest.mark.parametrize(
     ('name', 'module'), [(name, module) for name, needs in NEEDS.items() for module in needs]
 )
-def test_a_missing_extra_is_one_line_that_says_what_to_install(name, module, run, monkeypatch):
+def test_a_missing_extra_is_one_line_with_the_pip_command(name, module, run, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     to = 'minari' if module == 'minari' else 'parquet'
     required = ['x', '--to', to, '--output', 'x'] if name == 'episodes export' else []
@@ -168,7 +168,7 @@ def test_help_loads_no_large_library():
         ('episodes export', ['nosuch', '--to', 'parquet', '--output', 'x']),
     ],
 )
-def test_what_is_not_there_is_bad_usage_in_one_line(name, arguments, run, tmp_path, monkeypatch):
+def test_a_missing_file_is_bad_usage_in_one_line(name, arguments, run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, output, error = run(name, *arguments)
     assert (code, output) == (2, '')
@@ -212,7 +212,7 @@ def test_bad_usage_is_one_line(name, arguments, line, run):
     assert error.startswith(f'{shown_name(name)}: ') and line in error and error.count('\n') == 1
 
 
-def test_ctrl_c_in_an_evaluation_keeps_what_is_finished():
+def test_ctrl_c_in_an_evaluation_keeps_finished_episodes():
     arguments = ['--policy', 'resting', '--task', 'FetchReach', '--episodes', '1000000']
     terminal, end = pty.openpty()
     process = subprocess.Popen(
@@ -242,6 +242,6 @@ def test_ctrl_c_in_an_evaluation_keeps_what_is_finished():
     assert re.search(r'FetchReach: resting, \d+ episodes', output)
 
 
-def test_extras_are_those_of_the_package():
+def test_setup_py_declares_all_extras():
     declared = set(distribution('fetch_hand_sim').metadata.get_all('Provides-Extra'))
     assert set(EXTRAS) <= declared

@@ -100,7 +100,7 @@ def test_a_command_at_any_moment(name, words, imports, programs, tmp_path):
     assert re.fullmatch(rf'{name}( [a-z]+)*: stopping\n', said)
 
 
-def test_a_program_of_somebody_else_keeps_its_own_answer(tmp_path):
+def test_a_third_party_program_keeps_its_handler(tmp_path):
     # Beside a folder of the package's name, as in a checkout.
     (tmp_path / 'fetch_hand_sim').mkdir()
     program = tmp_path / 'view'

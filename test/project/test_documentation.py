@@ -247,7 +247,7 @@ def test_lines_of_a_page_are_found():
     assert found == [['a', 'b'], ['d'], ['e'], ['>', 'f']]
 
 
-def test_what_is_shown_of_episodes_works(episodes, monkeypatch, capsys):
+def test_the_episode_commands_of_the_pages_work(episodes, monkeypatch, capsys):
     monkeypatch.chdir(episodes)
     monkeypatch.setattr(sys, 'argv', [])
     for words in (['list', 'episodes'], ['check', 'episodes'], ['recover', 'episodes']):

@@ -44,7 +44,7 @@ def test_everything_has_its_row():
         assert any(line.startswith(f'| `{spec.name}` |') for line in lines)
 
 
-def test_phases_and_the_limit_of_steps_are_told():
+def test_phases_and_the_limit_of_steps_are_documented():
     text = interface_markdown()
     assert all(f'`{phase}` {when}' in text for phase, when in PHASES.items())
     assert 'Runs the given number of ticks, 1 ... 1000; while paused.' in text

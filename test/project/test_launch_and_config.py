@@ -90,7 +90,7 @@ def test_arguments_that_are_not_given_leave_a_params_file_as_it_is(tmp_path):
     assert {name: values[name] for name in mine} == mine | {'task': 'HandReach', 'episodes': 0}
 
 
-def test_every_argument_replaces_what_it_names():
+def test_every_argument_replaces_its_parameter():
     given = {'task': 'HandReach', 'episodes': '7', 'mode': 'lockstep', 'episode_dir': 'there'}
     values = parameters_of('sim_node', **given, publish_clock='false')
     assert {name: str(values[name]) for name in given} == given
@@ -98,7 +98,7 @@ def test_every_argument_replaces_what_it_names():
     assert parameters_of('policy_node', task='HandReach')['task'] == 'HandReach'
 
 
-def test_launch_file_starts_what_setup_py_installs():
+def test_launch_files_start_installed_executables():
     setup, text = ((ROOT / name).read_text() for name in ('setup.py', 'launch/demo.launch.xml'))
     for name, group in GROUPS.items():
         node = group.find('node')
@@ -144,7 +144,7 @@ def page_of_view(**arguments: str) -> argparse.Namespace:
     return parse(resolved_by_view(node.get('args'), values).split())
 
 
-def test_a_launched_page_is_of_this_machine_and_may_act_unless_told_otherwise():
+def test_a_launched_page_is_local_and_may_command_by_default():
     page = page_of_view()
     assert (page.host, page.port, page.read_only, page.wait) == ('127.0.0.1', 0, False, 60.0)
     page = page_of_view(host='0.0.0.0', port='8090', read_only='true')
@@ -152,7 +152,7 @@ def test_a_launched_page_is_of_this_machine_and_may_act_unless_told_otherwise():
     assert all(arg.get('description') for arg in VIEW_LAUNCH.findall('arg'))
 
 
-def test_what_is_only_looked_at_runs_on_and_is_not_logged():
+def test_a_robot_for_the_page_runs_forever_and_is_not_logged():
     values = parameters_of('sim_node', **given_by_view())
     assert (values['task'], values['episodes'], values['episode_dir']) == (
         'HandManipulateBlockRotateZ',
@@ -165,7 +165,7 @@ def test_what_is_only_looked_at_runs_on_and_is_not_logged():
     assert logged['episode_dir'] == 'there'
 
 
-def test_a_params_file_of_what_is_looked_at_changes_what_it_names_alone(tmp_path):
+def test_a_params_file_changes_only_its_own_parameters(tmp_path):
     path = tmp_path / 'my.yaml'
     path.write_text(yaml.safe_dump({'/**/sim_node': {'ros__parameters': {'task': 'FetchPush'}}}))
     values = parameters_of('sim_node', **given_by_view(params_file=str(path)))
@@ -186,7 +186,7 @@ def test_parameter_file_holds_the_defaults(node):
     }
 
 
-def test_parameter_file_of_the_demo_holds_what_the_node_takes():
+def test_the_parameter_file_of_the_demo_is_valid():
     nodes = yaml.safe_load((ROOT / 'config' / 'demo.yaml').read_text())
     specs = {spec.name: spec for spec in SIM_NODE}
     for name, value in nodes['/**/sim_node']['ros__parameters'].items():
@@ -195,7 +195,7 @@ def test_parameter_file_of_the_demo_holds_what_the_node_takes():
 
 
 @pytest.mark.parametrize('page', ['README.md', 'docs/write_your_own_controller.md'])
-def test_a_page_that_starts_a_robot_and_then_who_commands_it_lets_the_robot_wait(page):
+def test_a_page_lets_its_robot_wait_for_the_policy(page):
     """A policy takes seconds to load, in which a robot that does not wait fails its episodes."""
     robots = re.findall(
         r'ros2 run fetch_hand_sim sim_node(.*)\n.*(?:policy_node|controller)',

@@ -8,7 +8,9 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -163,9 +165,9 @@ def test_there_are_modules_to_check(package):
     assert sum(is_within(module_name(path), package) for path in SOURCES) >= 5
 
 
-@pytest.mark.parametrize('path', SOURCES, ids=module_name)
-def test_module_imports_only_what_its_layer_may(path):
-    assert violations(path.read_text(), module_name(path), _package(path)) == []
+def test_modules_import_only_from_allowed_layers():
+    found = (violations(path.read_text(), module_name(path), _package(path)) for path in SOURCES)
+    assert list(chain.from_iterable(found)) == []
 
 
 # Circles
@@ -207,10 +209,14 @@ def _full_name(path: Path) -> str:
     return '.'.join(path.relative_to(ROOT).with_suffix('').parts)
 
 
+@cache
+def project_graph(late: bool) -> dict[str, set[str]]:
+    return import_graph({_full_name(path): path.read_text() for path in SOURCES}, late)
+
+
 @pytest.mark.parametrize('late', [False, True], ids=['at import', 'in functions'])
 def test_no_modules_import_each_other(late):
-    sources = {_full_name(path): path.read_text() for path in SOURCES}
-    assert circle(import_graph(sources, late)) == []
+    assert circle(project_graph(late)) == []
 
 
 def folders(graph: Mapping[str, set[str]], parent: str) -> dict[str, set[str]]:
@@ -236,8 +242,7 @@ def folders(graph: Mapping[str, set[str]], parent: str) -> dict[str, set[str]]:
     'parent', ['msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node', TRAINING]
 )
 def test_no_folders_import_each_other(parent, late):
-    sources = {_full_name(path): path.read_text() for path in SOURCES}
-    assert circle(folders(import_graph(sources, late), parent)) == []
+    assert circle(folders(project_graph(late), parent)) == []
 
 
 def test_a_circle_of_folders_is_found():
@@ -284,9 +289,10 @@ def _is_node(path: Path) -> bool:
     return any(is_within(module_name(path), node) for node in NODES)
 
 
-@pytest.mark.parametrize('path', [path for path in SOURCES if not _is_node(path)], ids=module_name)
-def test_everything_but_the_nodes_imports_without_ros(path):
-    assert ros_at_import(path.read_text(), _package(path)) == []
+def test_only_nodes_import_ros():
+    others = [path for path in SOURCES if not _is_node(path)]
+    found = {module_name(path): ros_at_import(path.read_text(), _package(path)) for path in others}
+    assert {name: modules for name, modules in found.items() if modules} == {}
 
 
 @pytest.mark.parametrize('node', NODES)

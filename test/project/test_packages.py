@@ -81,7 +81,7 @@ def test_the_sdist_holds_all_that_is_tracked(built: Path) -> None:
     assert all(name.endswith('.training.safetensors') for name in left_out)
 
 
-def test_the_metadata_are_whole(metadata) -> None:
+def test_the_metadata_are_complete(metadata) -> None:
     assert metadata['Requires-Python'] == '>=3.11'
     assert metadata['Description-Content-Type'] == 'text/markdown'
     assert metadata.get_payload().startswith('# fetch_hand_sim')
@@ -139,7 +139,7 @@ def test_package_xml_is_valid() -> None:
     assert [license_.file for license_ in package.licenses] == ['LICENSE']
 
 
-def test_hooks_check_what_make_lint_checks() -> None:
+def test_hooks_run_the_checks_of_make_lint() -> None:
     """The same tools over the same files: a commit that passes the hooks passes `make lint`."""
     hooks = yaml.safe_load((ROOT / '.pre-commit-config.yaml').read_text())['repos'][0]['hooks']
     makefile = (ROOT / 'Makefile').read_text()

@@ -55,7 +55,7 @@ def command_lines(commands: dict[str, Command], before: str = '') -> Iterator[st
         yield from command_lines(command.commands, f'{before}{name} ')
 
 
-def test_nothing_promised_is_gone() -> None:
+def test_every_promised_name_exists() -> None:
     promised = set(PROMISED.read_text(encoding='utf-8').splitlines())
     assert len(promised) > 300
     gone = sorted(promised - set(present()))

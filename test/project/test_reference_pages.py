@@ -22,14 +22,14 @@ def test_every_field_of_training_has_a_row_with_its_meaning() -> None:
         assert meanings.get(field.name), field.name
 
 
-def test_the_recipes_are_those_that_train() -> None:
+def test_the_recipes_on_the_page_equal_those_of_training() -> None:
     recipes = TOOL['train_config_page']().partition('## Recipes')[2]
     gamma = recipe_config('HandReach', 'best').gamma
     (row,) = (line for line in recipes.splitlines() if line.startswith('| `gamma` |'))
     assert row.split(' | ')[4] == f'`{gamma}`'
 
 
-def test_a_command_is_shown_with_what_it_prints() -> None:
+def test_a_command_is_shown_with_its_help() -> None:
     assert ('episodes', 'list') in dict(TOOL['leaves'](TOOL['COMMANDS']))
     assert TOOL['help_of'](('episodes', 'list')).startswith(
         'usage: fetch_hand_sim episodes list [-h]'

@@ -27,7 +27,7 @@ def test_a_tutorial_can_be_followed(
     Reader(tmp_path, ros_environment | {'PATH': path}).follow(page.read_text(encoding='utf-8'))
 
 
-def test_blocks_are_told_apart() -> None:
+def test_blocks_are_distinguished() -> None:
     page = (
         'a\n\n```sh\nx\n```\n```sh second terminal\ny\n```\n```\nout\n```\n```python a.py\nb\n```\n'
     )
@@ -49,7 +49,7 @@ def test_blocks_are_told_apart() -> None:
         ('three', 'three'),
     ],
 )
-def test_what_is_printed_is_compared_with_the_page(expected: str, missing: str | None) -> None:
+def test_output_is_compared_with_the_page(expected: str, missing: str | None) -> None:
     assert missing_line(expected, 'one\ntwo\nthree  3 4\n') == missing
 
 

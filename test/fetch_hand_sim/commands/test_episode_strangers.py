@@ -218,7 +218,7 @@ def test_one_bad_leftover_stops_no_other_and_loses_no_byte(directory, finished, 
         assert (directory / f'.{name}.active' / f'{name}_0.mcap').read_bytes() == data
 
 
-def test_what_recovery_cannot_read_is_kept_aside(directory, finished):
+def test_recovery_keeps_unreadable_files_aside(directory, finished):
     """One flipped bit in the length of a later chunk."""
     whole = (finished / f'{NAME}_0.mcap').read_bytes()[:-2000]
     damaged = flipped(whole, chunks(whole)[2] + 4)
@@ -314,7 +314,7 @@ def test_names_that_are_no_text_and_command_a_terminal(finished, tmp_path):
         assert all(line.isprintable() for line in output.splitlines())
 
 
-def test_what_macos_puts_beside_files_is_none_of_them(finished, tmp_path, capsys):
+def test_companion_files_of_macos_are_ignored(finished, tmp_path, capsys):
     """`tar` there adds a companion to each file, and to each folder."""
     shutil.copytree(finished, tmp_path / NAME)
     shutil.copytree(finished, tmp_path / 'alone')
@@ -328,7 +328,7 @@ def test_what_macos_puts_beside_files_is_none_of_them(finished, tmp_path, capsys
     assert len(load_episodes(tmp_path)) == 2
 
 
-def test_a_folder_that_may_not_be_read_is_said_to_be_that(finished, monkeypatch):
+def test_a_folder_without_permission_is_one_line(finished, monkeypatch):
     """Such as those that root has logged in a container."""
 
     def refuse(path):
@@ -421,7 +421,7 @@ def test_one_unfinished_episode_is_recovered_by_the_path_that_lists_give(
     assert [each.name for each in find_leftovers(directory)] == ['other']
 
 
-def test_a_dry_run_says_by_its_code_what_cannot_be_recovered(directory, capsys):
+def test_a_dry_run_returns_1_for_unrecoverable_episodes(directory, capsys):
     leave(directory, 'strange', b'').joinpath('notes.txt').write_text('hi')
     for options in (['--dry-run'], []):
         assert episodes_recover.main([str(directory), *options]) == 1

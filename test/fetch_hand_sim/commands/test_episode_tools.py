@@ -97,7 +97,7 @@ def rewrite(source, directory, change=lambda tick, name, data: data, result=None
 # fetch_hand_sim episodes generate and fetch_hand_sim episodes check
 
 
-def test_generated_episodes_are_those_of_one_robot(generated):
+def test_generated_episodes_equal_those_of_one_robot(generated):
     """Batch and single robot, bit for bit, with number, seed and stamps of a series."""
     task, paths = generated
     checker = EpisodeChecker()
@@ -111,7 +111,7 @@ def test_generated_episodes_are_those_of_one_robot(generated):
         assert path.name == f'{task}_{index:06d}_seed{11 + index}'
 
 
-def test_generated_bytes_are_those_of_the_node_s_recorder(tmp_path):
+def test_generated_bytes_equal_those_of_the_recorder(tmp_path):
     """The same commands through `EpisodeRunner` and the node's encoder give the same messages."""
     (path, *_) = generate(tmp_path, 'FetchPush', episodes=1)
     ticks = split_ticks(read_episode(path))
@@ -179,7 +179,7 @@ def test_check_names_the_first_tick_and_field_that_differ(reach, tmp_path):
     assert '1.280 s' in str(difference)
 
 
-def test_check_notices_a_changed_command_by_what_it_did(reach, tmp_path):
+def test_check_detects_a_changed_command(reach, tmp_path):
     path = rewrite(min(reach.iterdir()), tmp_path, flip('applied_command', 20, -27))
     difference = EpisodeChecker().check(path).difference
     assert difference is not None and difference.tick == 20
@@ -192,7 +192,7 @@ def test_check_notices_a_changed_command_by_what_it_did(reach, tmp_path):
         (flip('episode_status', 0, -8), 'episode_status'),
     ],
 )
-def test_check_notices_what_is_missing_or_said_wrong(reach, tmp_path, change, field):
+def test_check_detects_missing_and_wrong_values(reach, tmp_path, change, field):
     result = EpisodeChecker().check(rewrite(min(reach.iterdir()), tmp_path, change))
     assert result.difference is not None
     assert result.difference.field.startswith(field)
@@ -273,7 +273,7 @@ def test_check_episode_codes(reach, tmp_path, capsys):
 # load_episodes
 
 
-def test_loaded_observations_are_those_of_the_simulation(generated):
+def test_loaded_observations_equal_those_of_the_simulation(generated):
     task, paths = generated
     for arrays in load_episodes(paths[0].parent):
         spec, steps = arrays.spec, TASKS[task].episode_ticks
@@ -298,7 +298,7 @@ def test_loaded_observations_are_those_of_the_simulation(generated):
 
 @pytest.mark.parametrize('timing', ['seconds', 'ticks'])
 @pytest.mark.parametrize('control_hz', [12.5, 25.0, 50.0])
-def test_the_task_of_a_whole_episode_has_as_many_ticks(control_hz, timing, tmp_path):
+def test_the_task_of_a_complete_episode_has_its_number_of_ticks(control_hz, timing, tmp_path):
     path = Recorder('FetchReach', control_hz, timing=timing).record(EpisodeDirectory(tmp_path))
     (arrays,) = load_episodes(path)
     assert arrays.spec.episode_ticks == len(arrays)
@@ -369,7 +369,7 @@ def test_one_bad_file_does_not_hide_the_others(reach, tmp_path):
 # fetch_hand_sim episodes list and fetch_hand_sim episodes recover
 
 
-def test_list_shows_what_the_files_say(reach, capsys):
+def test_list_shows_the_metadata_of_the_files(reach, capsys):
     assert episodes_list.main([str(reach)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 5
@@ -465,7 +465,7 @@ def test_list_filters(reach, tmp_path, capsys):
     assert len(names('--complete', '--failure', '--task', 'FetchReach')) == 3
 
 
-def test_list_names_and_skips_what_it_cannot_read(reach, tmp_path, capsys):
+def test_list_names_and_skips_unreadable_files(reach, tmp_path, capsys):
     directory = copy_of(reach, tmp_path)
     broken = directory / 'FetchReach_000000_seed11' / 'FetchReach_000000_seed11_0.mcap'
     broken.write_bytes(broken.read_bytes()[:5000])
@@ -494,7 +494,7 @@ def test_list_shows_no_control_characters_of_a_file(tmp_path, capsys):
     assert output.isascii() and all(c.isprintable() or c == '\n' for c in output)
 
 
-def test_what_one_file_says_at_length_leaves_room_for_the_others(reach, tmp_path, capsys):
+def test_long_values_of_one_file_are_shortened(reach, tmp_path, capsys):
     directory = copy_of(reach, tmp_path)
     metadata = read_episode(min(reach.iterdir())).metadata
     writer = EpisodeWriter(directory, 'x', {**metadata, 'seed': '1' * 400, 'task': 'y' * 400})
@@ -527,7 +527,7 @@ def cut_off(source: Path, directory: Path, size: int) -> Path:
     return active
 
 
-def test_recover_makes_bags_of_leftovers_and_says_which_it_cannot(reach, tmp_path, capsys):
+def test_recover_makes_bags_of_leftovers_and_names_failures(reach, tmp_path, capsys):
     sources = sorted(reach.iterdir())
     size = (sources[0] / f'{sources[0].name}_0.mcap').stat().st_size
     cut_off(sources[0], tmp_path, size // 2)
@@ -577,7 +577,7 @@ def test_logged_episodes_become_experience(generated):
             np.testing.assert_array_equal(given[index], expected.astype(np.float32))
 
 
-def test_what_cannot_be_learnt_from_is_left_out_and_named(reach, tmp_path):
+def test_unusable_episodes_are_skipped_and_named(reach, tmp_path):
     source = min(reach.iterdir())
     rewrite(source, tmp_path / 'mixed', last=20)
     shutil.copytree(max(reach.iterdir()), tmp_path / 'mixed' / 'whole')
@@ -625,7 +625,7 @@ def test_a_policy_that_answers_nonsense_on_the_way_is_one_line(tmp_path, monkeyp
     assert 'strange_policy:make fails: actions must be finite' in capsys.readouterr().err
 
 
-def test_what_a_policy_answers_beyond_its_range_is_clipped_as_on_the_robot(tmp_path, monkeypatch):
+def test_actions_beyond_the_range_are_clipped_as_on_the_robot(tmp_path, monkeypatch):
     (tmp_path / 'strong_policy.py').write_text(
         'import numpy as np\ndef make(spec):\n    return lambda _: np.full(4, 1.5)\n'
     )
@@ -649,7 +649,7 @@ def test_arrays_are_as_documented(reach):
     assert {'observations', 'actions', 'rewards', 'terminated', 'truncated', 'success'} <= names
 
 
-def test_loaded_episodes_can_be_looked_up_and_paths_may_be_text(reach, tmp_path):
+def test_loaded_episodes_have_paths_and_paths_may_be_text(reach, tmp_path):
     first, second, *_ = episodes = load_episodes(str(reach))
     assert episodes.index(second) == 1 and len({first, second, first}) == 2
     assert find_episodes(str(reach)) == expand_episodes(str(reach)) == find_episodes(reach)

@@ -57,17 +57,17 @@ def test_an_rclpy_of_another_python_is_one_line(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='Linux tells of a parent that has ended')
-def test_an_executable_whose_parent_is_gone_does_not_start(tmp_path):
+def test_an_executable_whose_parent_has_ended_does_not_start(tmp_path):
     for parent, code in ((os.getpid(), 0), (os.getppid(), -signal.SIGTERM)):
         command = [*executable('fetch_hand_sim', parent), 'episodes', 'list', tmp_path]
         assert subprocess.run(command, capture_output=True).returncode == code
 
 
-def test_an_unknown_executable_is_named_with_those_there_are():
+def test_an_unknown_executable_is_named_with_the_installed_ones():
     with pytest.raises(UnknownExecutableError, match=r"no executable 'sim'; installed: .*sim_node"):
         find_executable('sim')
 
 
-def test_shipped_actors_are_asked_for_by_task():
+def test_shipped_actors_are_found_by_task():
     assert is_actor_shipped('FetchReach')
     assert not is_actor_shipped('SomebodysTask')

@@ -20,7 +20,7 @@ def test_options_and_exit_code_of_a_subcommand(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize('arguments', [[], ['--help'], ['episodes'], ['episodes', '--help']])
-def test_without_a_command_there_is_help(arguments, capsys):
+def test_without_a_command_help_is_printed(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         main(arguments)
     assert caught.value.code == 0
