@@ -32,9 +32,14 @@ def test_the_architecture_page_lists_every_folder_once() -> None:
 
 
 def pages() -> list[Path]:
-    """The documentation, without the history in the changelog."""
-    docs = [path for path in (ROOT / 'docs').rglob('*.md') if path.parent.name != 'generated']
+    """The documentation, without history: the changelog and the lab notes."""
+    docs = [page for page in pages_of_docs() if 'lab_notes' not in page.parts]
     return sorted([ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *docs])
+
+
+def pages_of_docs() -> list[Path]:
+    """All pages in `docs`, also the lab notes."""
+    return sorted(path for path in (ROOT / 'docs').rglob('*.md') if path.parent.name != 'generated')
 
 
 def lost_files(page: str) -> list[str]:
@@ -53,7 +58,7 @@ def test_files_named_by_the_documentation_exist(page: Path) -> None:
     assert lost_files(page.read_text()) == []
 
 
-@pytest.mark.parametrize('page', pages(), ids=lambda path: path.name)
+@pytest.mark.parametrize('page', sorted({*pages(), *pages_of_docs()}), ids=lambda path: path.name)
 def test_links_between_pages_lead_somewhere(page: Path) -> None:
     targets = re.findall(r'\]\(([^)#:\s]+)(?:#[^)]*)?\)', page.read_text())
     assert [each for each in targets if not (page.parent / each).exists()] == []
@@ -62,13 +67,13 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
 def test_every_page_is_in_the_documentation() -> None:
     """Each page is in a table of contents, where readers on GitHub find it."""
     listed: set[Path] = set()
-    for page in pages():
+    for page in pages_of_docs():
         for block in re.findall(
             r'^```{toctree}\n(.*?)^```', page.read_text(), re.DOTALL | re.MULTILINE
         ):
             names = (line for line in block.splitlines() if line and not line.startswith(':'))
             listed |= {(page.parent / f'{name}.md').resolve() for name in names}
-    docs = {page for page in pages() if ROOT / 'docs' in page.parents} - {ROOT / 'docs/index.md'}
+    docs = {*pages_of_docs()} - {ROOT / 'docs/index.md'}
     assert docs - listed == set()
     assert {path for path in listed - docs if path.parent.name != 'generated'} == set()
 
