@@ -49,7 +49,7 @@ TEST = [
 
 setup(
     name=PACKAGE,
-    version='1.1.0',
+    version='2.0.0',
     description='The Fetch and Shadow hand tasks of Plappert et al. 2018 as ROS 2 nodes on MuJoCo',
     # Resolved: `colcon build --symlink-install` links this file alone.
     long_description=Path(__file__).resolve().with_name('README.md').read_text(encoding='utf-8'),
@@ -60,7 +60,7 @@ setup(
     project_urls={'Paper': 'https://arxiv.org/abs/1802.09464'},
     keywords=['robotics', 'reinforcement learning', 'mujoco', 'ros2', 'gymnasium', 'her', 'mcap'],
     classifiers=[
-        'Development Status :: 5 - Production/Stable',
+        'Development Status :: 4 - Beta',
         'Intended Audience :: Science/Research',
         'Operating System :: POSIX :: Linux',
         'Programming Language :: Python :: 3 :: Only',
