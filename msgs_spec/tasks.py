@@ -1,20 +1,18 @@
 """The tasks as data: goals, observations, lengths, thresholds.
 
-Thirteen are those of Plappert et al. 2018; other packages add theirs (`foreign_tasks.py`).
+Thirteen come from Plappert et al. 2018; other packages may add tasks (`foreign_tasks.py`).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from numbers import Real
 from typing import Literal, get_args
 
-# Packages with tasks of their own have it from here.
+# Third-party tasks import it from here.
 from msgs_spec.arrays import Array as Array
 from msgs_spec.foreign_tasks import foreign_tasks
 from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND
-from msgs_spec.task_checks import accept
 from msgs_spec.task_types import GoalKind, TaskFormulas, TaskSpec, VectorPart
 from msgs_spec.text import did_you_mean
 
@@ -40,11 +38,11 @@ __all__ = [
 PHYSICS_TIMESTEP = 0.002
 DEFAULT_CONTROL_HZ = 25.0
 
-# What `GoalMetric` of the simulation says of them.
+# `GoalMetric` of the simulation explains them.
 RewardType = Literal['sparse', 'dense']
 SuccessRule = Literal['gymnasium', 'paper']
-# What an action frequency other than 25 Hz leaves as it is: the seconds of an episode and the speed
-# of a gripper, or the ticks of an episode and the step of a gripper, as robots had it up to 1.0.
+# What stays the same at rates other than 25 Hz: the seconds of an episode and the speed of a
+# gripper, or the ticks of an episode and the step of a gripper (as up to version 1.0).
 Timing = Literal['seconds', 'ticks']
 REWARD_TYPES: tuple[RewardType, ...] = get_args(RewardType)
 SUCCESS_RULES: tuple[SuccessRule, ...] = get_args(SuccessRule)
@@ -203,7 +201,7 @@ def substeps_per_tick(control_hz: float) -> int:
     if smallest <= substeps <= largest and abs(period - substeps) < 1e-6:
         return substeps
     lower = min(max(int(period) if period < 1e9 else largest, smallest), largest)
-    # Above 500 Hz there is none on the other side.
+    # No rate above 500 Hz is valid.
     upper = min(lower + 1, largest) if period > smallest else lower
     rates = sorted({1.0 / (n * PHYSICS_TIMESTEP) for n in (lower, upper)})
     nearest = ' and '.join(f'{rate:.9g}' for rate in rates)
@@ -214,5 +212,5 @@ def substeps_per_tick(control_hz: float) -> int:
     )
 
 
-# Their packages import this module: all that they need of it is above.
-TASKS.update(foreign_tasks(partial(accept, known=dict(TASKS))))
+# Third-party packages import this module, so this line comes last.
+TASKS.update(foreign_tasks(known=TASKS))

@@ -16,14 +16,18 @@ Seed = int | np.random.Generator | None
 Seeds = int | Sequence[Seed] | None
 
 
-def require_whole(name: str, value: object) -> None:
+def require_whole(
+    name: str, value: object, lowest: int | None = None, highest: int = 2**31 - 1
+) -> None:
     """Refuses what is no whole number.
 
     Raises:
         ValueError: If it is none; True and False are none either.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise ValueError(f'{name} must be a whole number, not {value!r}')
+        raise ValueError(f'{name} must be a whole number, not {value!r:.60}')
+    if lowest is not None and not lowest <= value <= highest:
+        raise ValueError(f'{name} must be {lowest} ... {highest}, not {value!s:.60}')
 
 
 def numbers(values: ArrayLike, what: str, shape: str) -> NDArray[Any]:

@@ -6,9 +6,6 @@ it on MuJoCo >= 3.17 registers environments that do not start.
 
 from __future__ import annotations
 
-import ctypes
-import functools
-import logging
 from importlib import util
 from pathlib import Path
 
@@ -17,7 +14,6 @@ import numpy as np
 
 from msgs_spec.arrays import Array
 
-_LOGGER = logging.getLogger(__name__)
 # That of a geom whose MJCF says none (`rgba` in MuJoCo's XML reference).
 _NO_COLOR = np.array([0.5, 0.5, 0.5, 1.0])
 
@@ -59,33 +55,3 @@ def geom_color(model: mujoco.MjModel, geom: int) -> Array:
     if material < 0 or not np.array_equal(own, _NO_COLOR):
         return own
     return np.array(model.mat_rgba[material], dtype=np.float64)
-
-
-@functools.cache
-def prepare_engine() -> None:
-    """Sends MuJoCo's warnings to `logging` and stops its step timers; repeated calls do nothing.
-
-    A warning handler that somebody else has installed stays.
-    """
-    if mujoco.get_mju_user_warning() is None:
-        # The default handler writes MUJOCO_LOG.TXT into the working directory.
-        mujoco.set_mju_user_warning(_log_warning)
-    _stop_timers()
-
-
-def _log_warning(message: str) -> None:
-    _LOGGER.debug('MuJoCo: %s', message)
-
-
-def _stop_timers() -> None:
-    """Removes the clock that the Python bindings install to fill `MjData.timer`.
-
-    MuJoCo reads it some twenty times per substep, 4-7 % of a step of these small models, and the
-    bindings offer no way to switch it off. Trajectories do not depend on it.
-    """
-    for library in Path(mujoco.__file__).parent.glob('libmujoco*'):
-        try:
-            clock = ctypes.c_void_p.in_dll(ctypes.CDLL(str(library)), 'mjcb_time')
-        except (OSError, ValueError):
-            continue
-        clock.value = None

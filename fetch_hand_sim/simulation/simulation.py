@@ -1,7 +1,11 @@
 """`Simulation`: any number of copies of one task, stepped together.
 
-One copy serves the ROS node and `gymnasium.make`; sixty-four and more serve the trainer. It counts
-no steps and ends no episodes: whoever drives it decides.
+The ROS node and `gymnasium.make` use one copy, the trainer 64 and more. A `Simulation` counts no
+steps and ends no episodes; its user does. A step passes three places, in this order:
+
+- `_start` begins episodes: state, physics and goals of the copies that are reset.
+- `_apply` is the action path: commands as they reach MuJoCo.
+- `_sensed` is the sensing path: the observation of the true state.
 """
 
 from __future__ import annotations
@@ -31,16 +35,9 @@ from fetch_hand_sim.simulation.arguments import (
     selected_simulations,
 )
 from fetch_hand_sim.simulation.disturber import Disturber
-from fetch_hand_sim.simulation.divergence import DivergenceWatch
-from fetch_hand_sim.simulation.first_reset import (
-    require_as_declared,
-    require_goals,
-    require_metric,
-)
+from fetch_hand_sim.simulation.engine import DivergenceWatch
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
-from fetch_hand_sim.simulation.trial import TRIED, try_out
-from msgs_spec.actions import command_from_action
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import Disturbances, read_disturbances
 from msgs_spec.observations import Readings
@@ -60,14 +57,14 @@ _LOGGER = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """What one tick of N simulations gave.
+    """Result of one step of N simulations; fresh arrays.
 
     Attributes:
-        observation: `observation`, `achieved_goal`, `desired_goal`, each (N, ...), fresh arrays.
+        observation: `observation`, `achieved_goal`, `desired_goal`, each (N, ...).
         reward: (N,), sparse -1 or 0, dense minus the distance (m; poses 10 x m + rad).
-        success: (N,) booleans, of this tick.
-        diverged: (N,) booleans: MuJoCo lost this simulation during the tick and it was reset, so
-            that its observation, reward and success are of a new episode.
+        success: (N,) booleans, at this step.
+        diverged: (N,) booleans: MuJoCo diverged and the simulation was reset. Observation, reward
+            and success are then those of the new episode.
     """
 
     observation: Observation
@@ -77,39 +74,35 @@ class StepResult:
 
 
 class Simulation:
-    """N copies of one task on a pool of threads; pickled and copied with its state.
+    """N copies of one task on a pool of threads; pickles and copies include the state.
 
-    Call `reset` before `step`. A forked process has no threads but its own: a batch of several
-    refuses to go on there, and a copy of it goes on.
+    Call `reset` before `step`. A forked process has no worker threads: a batch with several threads
+    raises an error there, but a deep copy of it works.
 
     Args:
-        task: One of the thirteen tasks (`msgs_spec.tasks.TASKS`).
-        num_envs: Number of copies N.
-        num_threads: Threads that step them; 0 for all processors that the process may use
-            (`taskset`, `os.sched_setaffinity`). There are never more than copies.
+        task: One of the tasks (`msgs_spec.tasks.TASKS`).
+        num_envs: Number of copies N, 1 or more.
+        num_threads: Threads that step them; 0 for one per processor that the process may use
+            (`taskset`, `os.sched_setaffinity`). At most N threads are started.
         reward_type: `sparse` or `dense`.
         success_rule: `gymnasium` (released code) or `paper` (its text).
         control_hz: Actions per simulated second: 500/n for n = 1 ... 40.
-        keeps_data: Whether each copy keeps an `MjData` of its own, which `read_data` then
-            gives as MuJoCo left it.
-        timing: What another rate than 25 Hz leaves as it is: `seconds` of an episode and the speed
-            of the Fetch gripper, or `ticks` and its step, as up to 1.0 and as the reference does.
+        keeps_data: Whether each copy keeps its own `MjData`; `read_data` then includes all that
+            MuJoCo derives from the state.
+        timing: What stays the same at rates other than 25 Hz. `seconds`: the duration of an episode
+            and the speed of the Fetch gripper. `ticks`: the steps of an episode and the gripper's
+            distance per step, as in the reference.
         disturbances: Delays, noise, other physics (`msgs_spec.disturbances.read_disturbances`).
             `observation` is then what the disturbed sensors measure. `achieved_goal`, rewards and
             success follow the true state.
 
     Attributes:
-        spec: The task as data, `episode_ticks` at this rate.
-        num_envs: Number of copies N.
-        control_hz: Actions per simulated second.
-        timing: As given.
-        metric: What rewards and success are; it may be replaced between steps.
-        goals: (N, goal size) the desired goals, live: what is written counts from the next step.
-            World frame; points and fingertips in m, poses in m and as quaternion wxyz.
-        divergences: How often MuJoCo has lost a simulation.
+        spec: The task as data, with `episode_ticks` at this rate.
+        metric: Rewards and success; it may be replaced between steps.
+        divergences: Number of divergences so far.
 
     Raises:
-        ValueError: If an argument is not allowed; the message says what is.
+        ValueError: If an argument is not allowed; the message lists what is.
     """
 
     def __init__(
@@ -124,14 +117,10 @@ class Simulation:
         timing: Timing = 'seconds',
         disturbances: Disturbances | Mapping[str, Any] | str | None = None,
     ) -> None:
-        require_whole('num_envs', num_envs)
-        require_whole('num_threads', num_threads)
-        if num_envs < 1:
-            raise ValueError(f'num_envs must be at least 1, not {num_envs}')
+        require_whole('num_envs', num_envs, lowest=1)
+        require_whole('num_threads', num_threads, lowest=0)
         if timing not in TIMINGS:
-            raise ValueError(f'timing {timing!r}; allowed: {", ".join(TIMINGS)}')
-        if num_threads < 0:
-            raise ValueError(f'num_threads must be 0 (all processors) or more, not {num_threads}')
+            raise ValueError(f'timing {timing!r} is unknown; allowed: {", ".join(TIMINGS)}')
         self._arguments: dict[str, Any] = {
             'num_envs': num_envs,
             'num_threads': num_threads,
@@ -145,9 +134,7 @@ class Simulation:
         self.num_envs = num_envs
         self.control_hz = control_hz
         self.timing = timing
-        self.metric = require_metric(
-            self.spec, self._task.goal_metric(success_rule, reward_type), success_rule, reward_type
-        )
+        self.metric = self._task.goal_metric(success_rule, reward_type)
         self.divergences = 0
         self._divergence = DivergenceWatch(self._task.batch)
         self.goals = np.zeros((num_envs, self.spec.goal.size))
@@ -158,16 +145,17 @@ class Simulation:
         self._process = os.getpid()
         self._disturber: Disturber | None = None
         self.disturbances = disturbances
-        # The thirteen are held to their specification by tests.
-        self._is_as_declared = self.spec.reference_id is not None
 
     def __repr__(self) -> str:
-        """Task and number of copies."""
+        """Return task and number of copies."""
         return f'{type(self).__name__}({self.spec.name!r}, num_envs={self.num_envs})'
 
     @property
     def goals(self) -> Array:
-        """The desired goals, (N, goal size), live; of another shape a `ValueError`."""
+        """The desired goals, (N, goal size), live: values written here count from the next step.
+
+        World frame; points and fingertips in m, poses in m and as quaternion wxyz.
+        """
         return self._goals
 
     @goals.setter
@@ -184,7 +172,7 @@ class Simulation:
 
     @property
     def model(self) -> Any:
-        """The compiled `mujoco.MjModel`."""
+        """The compiled `mujoco.MjModel`; call `apply_model_changes` after writing into it."""
         return self._task.model
 
     @property
@@ -192,61 +180,60 @@ class Simulation:
         """The MJCF file of the model."""
         return asset_path(self._task.asset)
 
-    def data(self, index: int) -> Any:
-        """A copy of simulation `index` as a `mujoco.MjData`, to render or inspect."""
-        return self._task.batch.get_data(index)
-
-    def read_data(self, index: int, data: Any) -> None:
-        """Writes simulation `index` into a `mujoco.MjData`; what is derived needs `keeps_data`.
-
-        Goals, generators and counters of divergences are no part of it, here and in `write_data`.
-        """
-        self._task.read_data(index, data)
-
-    def write_data(self, index: int, data: Any) -> None:
-        """Lets simulation `index` go on from a `mujoco.MjData`, changed by whoever had it."""
-        self._task.write_data(index, data)
-
-    def apply_model_changes(self) -> None:
-        """Steps with `model` as it is now; the simulation keeps a copy of its own."""
-        self._model_may_change = True
-        self._task.follow_model()
-
     @property
     def is_started(self) -> NDArray[np.bool_]:
         """Which simulations have been reset before, (N,)."""
         return self._is_started.copy()
-
-    def generator(self, index: int) -> np.random.Generator:
-        """The random generator of simulation `index`, live: starts and goals are drawn from it."""
-        generator = self._generators[index]
-        if generator is None:
-            generator = self._generators[index] = seeding.np_random(None)[0]
-        return generator
 
     @property
     def tick_duration(self) -> float:
         """Simulated seconds per step."""
         return self._task.tick_duration
 
+    def data(self, index: int) -> Any:
+        """Return a copy of simulation `index` as a `mujoco.MjData`, to render or inspect."""
+        return self._task.batch.get_data(self._index(index))
+
+    def read_data(self, index: int, data: Any) -> None:
+        """Write simulation `index` into a `mujoco.MjData`; derived fields need `keeps_data`.
+
+        Goals, random generators and divergence counters are not included, nor in `write_data`.
+        """
+        self._task.read_data(self._index(index), data)
+
+    def write_data(self, index: int, data: Any) -> None:
+        """Continue simulation `index` from a `mujoco.MjData`."""
+        self._task.write_data(self._index(index), data)
+
+    def apply_model_changes(self) -> None:
+        """Step with `model` as it is now; the simulation keeps its own copy."""
+        self._model_may_change = True
+        self._task.follow_model()
+
+    def generator(self, index: int) -> np.random.Generator:
+        """Return the random generator of simulation `index`, live; it draws starts and goals."""
+        generator = self._generators[index]
+        if generator is None:
+            generator = self._generators[index] = seeding.np_random(None)[0]
+        return generator
+
     def reset(self, seed: Seeds = None, ids: ArrayLike | None = None) -> Observation:
-        """Starts simulations again.
+        """Start new episodes.
 
         Args:
-            seed: One seed (simulation i takes seed + i), one per simulation of `ids`, in their
-                order, or None: the random generators go on. The same seed gives the reference's
-                draws. Instead of a seed there may be a generator, which is used from then on.
-            ids: Which simulations: indices or a boolean mask (N,); None for all.
+            seed: One seed (simulation i takes seed + i), one per simulation of `ids` in their
+                order, or None to continue the random generators. The same seed gives the
+                reference's draws. A generator in place of a seed is used from then on.
+            ids: Indices or a boolean mask (N,) of the simulations; None for all.
 
         Returns:
             The observations of all N simulations.
 
         Raises:
-            ValueError: If a seed is negative, or ids or seeds do not fit; the first time also if
-                a task of another package does not give what its specification says.
+            ValueError: If a seed is negative, or ids or seeds do not match the simulations.
             TypeError: If a seed is not an integer.
-            RuntimeError: If an object never stays on the palm, or this process was forked and has
-                no threads of the batch.
+            RuntimeError: If the object never stays on the palm, or this process was forked and
+                lacks the threads of the batch.
         """
         selected = self._select(ids)
         fresh = generators(seed, selected)
@@ -257,16 +244,16 @@ class Simulation:
         return self.observe()
 
     def step(self, actions: ArrayLike) -> StepResult:
-        """Advances every simulation by one tick.
+        """Advance every simulation by one step.
 
         Args:
             actions: (N, action size) in [-1, 1], float32 or float64.
 
         Raises:
-            ValueError: If the shape is wrong, or a value is not finite or out of range; nothing has
-                moved then.
+            ValueError: If the shape is wrong, or a value is not finite or out of range; the state
+                is unchanged then.
             gymnasium.error.ResetNeeded: If a simulation has never been reset.
-            RuntimeError: If this process was forked and has no threads of the batch.
+            RuntimeError: If this process was forked and lacks the threads of the batch.
         """
         checked = self._finite('actions', actions)
         if checked.size and (np.abs(checked) > 1.0).any():
@@ -274,42 +261,32 @@ class Simulation:
             raise ValueError(
                 f'actions must lie in [-1, 1]; actions[{env}, {part}] is {checked[env, part]}'
             )
-        return self._result(self._advance(command_from_action(self.spec.robot, checked)))
+        return self._result(self._advance(self._task.commands_from_actions(checked)))
 
     def step_commands(self, commands: ArrayLike) -> StepResult:
-        """Advances every simulation by one tick, with commands in ROS units.
+        """Advance every simulation by one step, with commands in ROS units.
 
         Args:
-            commands: (N, action size): Fetch as actions; hand absolute joint positions in radians.
-                What lies beyond a limit must have been clipped (`msgs_spec.actions`).
+            commands: (N, action size), clipped to the limits (`msgs_spec.actions.clip_command`).
+                Fetch: as actions. Hand: absolute joint positions in radians.
 
         Raises:
             ValueError: If the shape is wrong or a value is not finite.
             gymnasium.error.ResetNeeded: If a simulation has never been reset.
-            RuntimeError: If this process was forked and has no threads of the batch.
+            RuntimeError: If this process was forked and lacks the threads of the batch.
         """
         return self._result(self.advance(commands))
 
     def advance(self, commands: ArrayLike) -> NDArray[np.bool_]:
-        """Does what `step_commands` does, for those who read the sensors themselves.
-
-        Returns:
-            Which simulations diverged, (N,).
-        """
+        """Advance like `step_commands` without observing; return which diverged, (N,)."""
         return self._advance(self._finite('commands', commands))
 
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None
     ) -> Array:
-        """Reward of goals, as `step` gives it.
+        """Return rewards (...,) of goals (..., goal size) of any batch shape.
 
-        Args:
-            achieved_goal: (..., goal size), any batch shape.
-            desired_goal: Likewise, of the same shape.
-            info: Of no account; Gymnasium's interface has it.
-
-        Returns:
-            (...,) rewards.
+        `info` is ignored; it is part of Gymnasium's interface.
 
         Raises:
             ValueError: If the last axis is not the goal's, or the shapes differ.
@@ -319,19 +296,18 @@ class Simulation:
     def compute_success(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike
     ) -> NDArray[np.bool_]:
-        """Success of goals of any batch shape, (..., goal size) -> (...,); as `compute_reward`."""
+        """Return success (...,) of goals (..., goal size) of any batch shape."""
         return self.metric.success(achieved_goal, desired_goal)
 
     def set_goal(self, goals: ArrayLike, ids: ArrayLike | None = None) -> None:
-        """Replaces desired goals.
+        """Replace desired goals.
 
-        Quaternions are normalised and taken in the hemisphere nearest to the object's, because the
-        `gymnasium` success rule tells q from -q.
+        Quaternions are normalised and moved to the hemisphere nearest to the object's quaternion,
+        because the `gymnasium` success rule distinguishes q from -q.
 
         Args:
-            goals: (n, goal size) for the n simulations of `ids`, in their order; units and frame as
-                `Simulation.goals` has them.
-            ids: Which simulations; None for all.
+            goals: (n, goal size), in the order of `ids`; units and frame as `goals`.
+            ids: The n simulations; None for all.
 
         Raises:
             ValueError: If the shape is wrong, a value is not finite or a quaternion is zero.
@@ -343,28 +319,30 @@ class Simulation:
         self.goals[selected] = wanted
 
     def perturb(self, body: str, wrench: ArrayLike, index: int = 0) -> None:
-        """Pushes a body of one simulation during the next step.
+        """Push a body of one simulation during the next step.
 
         Args:
-            body: Its name in the model.
+            body: Name of a movable body of the model.
             wrench: (6,) force in N and torque in N m, world axes, at the centre of mass.
-            index: Which simulation.
+            index: The simulation.
 
         Raises:
-            ValueError: If there is no such simulation, no such body that can move, or a value is
-                not finite.
+            ValueError: If the simulation or body does not exist, the body cannot move, or a value
+                is not finite.
         """
+        if not isinstance(body, str):
+            raise ValueError(f'body {body!r:.60} is not a name; allowed: a movable body')
         values = np.asarray(wrench, dtype=np.float64)
         if values.shape != (6,) or not np.isfinite(values).all():
-            raise ValueError(f'a wrench is six finite numbers, not {values.tolist()}')
+            raise ValueError(f'wrench {values.tolist()!s:.60}; allowed: six finite numbers')
         number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY.value, body)
         if number < 1 or not self.model.body_weldid[number]:
             raise ValueError(f'no body {body[:40]!r} that can move')
-        self._pushes[selected_simulations([index], self.num_envs), number] = values
+        self._pushes[self._index(index), number] = values
         self._is_pushed = True
 
     def resting_commands(self) -> Array:
-        """Commands (N, action size) that let the robots stay as they are."""
+        """Return the commands (N, action size) that keep the robots as they are."""
         return self._task.resting_commands()
 
     @property
@@ -388,7 +366,7 @@ class Simulation:
         return {name: float(values[index]) for name, values in self._disturber.variations.items()}
 
     def readings(self) -> Readings:
-        """Return what the sensors measure, (N, topic.size) for each topic, fresh arrays."""
+        """Return what the sensors measure now, (N, topic.size) for each topic, fresh arrays."""
         return self.true_readings() if self._disturber is None else self._disturber.readings()
 
     def true_readings(self) -> Readings:
@@ -396,18 +374,22 @@ class Simulation:
         return self._task.readings()
 
     def observe(self) -> Observation:
-        """Return the present observation, fresh arrays."""
+        """Return the observation now, fresh arrays."""
         if self._disturber is None:
-            return self._observation(*self._task.observe())
+            return self._sensed(*self._task.observe())
         sensed, _ = self._task.observe_from(self._disturber.readings())
-        return self._observation(sensed, self._task.observe()[1])
+        return self._sensed(sensed, self._task.observe()[1])
+
+    def observe_from(self, readings: Readings) -> Observation:
+        """Return the observation that follows from the result of `readings`."""
+        return self._sensed(*self._task.observe_from(readings))
 
     def __copy__(self) -> Simulation:
-        """As `copy.deepcopy`: two simulations have no physics or generators in common."""
+        """Copy like `copy.deepcopy`: copies share neither physics nor generators."""
         return copy.deepcopy(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Arguments and everything that decides the future, for `pickle` and `copy.deepcopy`."""
+        """Return arguments and complete state, for `pickle` and `copy.deepcopy`."""
         return {
             'arguments': {
                 'task': self.spec.name,
@@ -427,7 +409,7 @@ class Simulation:
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Compiles the model again and goes on from the state, to the same bits."""
+        """Compile the model again and restore the state, bit for bit."""
         Simulation.__init__(self, **state['arguments'])
         if state['model'] is not None:
             self._task.take_model(state['model'], state.get('pairs'))
@@ -440,24 +422,39 @@ class Simulation:
         self.goals[:] = state['goals']
         self._generators = state['generators']
         self.divergences = state['divergences']
-        # The push itself is part of the physics; copies made by 1.0 do not say that it ends.
+        # The push itself is part of the physics. Pickles of version 1.0 lack both flags.
         self._is_pushed = state.get('is_pushed', False)
         self._is_started[:] = state.get('is_started', True)
 
-    def observe_from(self, readings: Readings) -> Observation:
-        """The observation of what `readings` returned."""
-        return self._observation(*self._task.observe_from(readings))
+    def _start(self, ids: NDArray[np.intp]) -> None:
+        """Begin episodes of simulations `ids`: state and physics first, then goals."""
+        self._require_threads()
+        own = [self.generator(i) for i in ids.tolist()]
+        # A far part of each generator's own sequence: start and goal draw the same without it.
+        streams = [np.random.Generator(_jumped(each)) for each in own] if self._disturber else []
+        if self._disturber is not None:
+            self._disturber.start_nominal(ids)
+        self.goals[ids] = self._task.reset(ids, own)
+        if self._disturber is not None:
+            self._disturber.start(ids, streams)
+        self._divergence.forget()
+        self._is_started[ids] = True
 
-    @property
-    def _pushes(self) -> Array:
-        """What bodies are pushed by, (N, bodies, 6), live."""
-        pushes: Array = self._task.batch.bind('xfrc_applied')
-        return pushes
+    def _sensed(self, observation: Array, achieved_goal: Array) -> Observation:
+        """Return the observation as a dictionary of fresh arrays."""
+        return {
+            'observation': observation,
+            'achieved_goal': achieved_goal,
+            'desired_goal': self.goals.copy(),
+        }
 
     def _advance(self, commands: NDArray[np.floating]) -> NDArray[np.bool_]:
         if not self._is_started.all():
             waiting = np.flatnonzero(~self._is_started).tolist()
-            raise ResetNeeded(f'reset comes before the first step: simulations {waiting!s:.60}')
+            raise ResetNeeded(f'call reset before step: simulations {waiting!s:.60} never were')
+        if not np.isfinite(self._goals).all():
+            env, part = np.argwhere(~np.isfinite(self._goals))[0]
+            raise ValueError(f'goals[{env}, {part}] is {self._goals[env, part]}; allowed: finite')
         self._require_threads()
         if self._disturber is not None:
             commands = self._disturber.command(commands)
@@ -479,6 +476,7 @@ class Simulation:
         return diverged
 
     def _result(self, diverged: NDArray[np.bool_]) -> StepResult:
+        """Observe and evaluate; reward and success follow from the true state."""
         observation = self.observe()
         reward, success = self.metric.evaluate(observation['achieved_goal'], self.goals)
         return StepResult(observation, reward, success, diverged)
@@ -493,55 +491,28 @@ class Simulation:
         )
         self._start(ids)
 
-    def _start(self, ids: NDArray[np.intp]) -> None:
-        """Begins episodes; what MuJoCo warned of before counts no more."""
-        self._require_threads()
-        own = [self.generator(i) for i in ids.tolist()]
-        # A far part of each generator's own sequence: start and goal draw the same without it.
-        streams = [np.random.Generator(_jumped(each)) for each in own] if self._disturber else []
-        if self._disturber is not None:
-            self._disturber.start_nominal(ids)
-        goals = self._task.reset(ids, own)
-        if self._disturber is not None:
-            self._disturber.start(ids, streams)
-        if not self._is_as_declared:
-            require_goals(self.spec, goals, ids.size)
-            require_as_declared(self._task, self.metric, goals, ids)
-            self._try_out()
-            self._is_as_declared = True
-        self.goals[ids] = goals
-        self._divergence.forget()
-        self._is_started[ids] = True
-
-    def _try_out(self) -> None:
-        """Tries the task out once in a process, with two simulations of its own."""
-        tried = self.spec.name, type(self._task)
-        if tried in TRIED:
-            return
-        trial = Simulation(self.spec.name, 2, 1, control_hz=self.control_hz, timing=self.timing)
-        trial._is_as_declared = True
-        for wrong in try_out(trial):
-            _LOGGER.warning('%s: %s', self.spec.name, wrong)
-        TRIED.add(tried)
+    @property
+    def _pushes(self) -> Array:
+        """External wrenches on the bodies, (N, bodies, 6), live."""
+        pushes: Array = self._task.batch.bind('xfrc_applied')
+        return pushes
 
     def _require_threads(self) -> None:
-        """Refuses to wait for ever for threads that a forked process does not have."""
+        """Raise an error in a forked process, where waiting for the threads would never end."""
         if self._process != os.getpid() and self._task.batch.nthread > 1:
             raise RuntimeError(
-                'this process was forked, and the threads of a batch stay behind: make the batch '
-                'here, copy it (copy.deepcopy), or give it num_threads=1'
+                'this process was forked and lacks the threads of the batch: create the batch '
+                'here, copy it (copy.deepcopy), or use num_threads=1'
             )
-
-    def _observation(self, observation: Array, achieved_goal: Array) -> Observation:
-        return {
-            'observation': observation,
-            'achieved_goal': achieved_goal,
-            'desired_goal': self.goals.copy(),
-        }
 
     def _finite(self, name: str, values: ArrayLike) -> NDArray[np.floating]:
         shape = (self.num_envs, self.spec.robot.action_size)
         return finite_numbers(name, values, shape, owner=self.spec.name)
+
+    def _index(self, index: int) -> int:
+        """Return `index` if a simulation has it; raise `ValueError` otherwise."""
+        require_whole('index', index, lowest=0, highest=self.num_envs - 1)
+        return index
 
     def _select(self, ids: ArrayLike | None) -> NDArray[np.intp]:
         return self._all if ids is None else selected_simulations(ids, self.num_envs)

@@ -8,13 +8,13 @@ lagged gripper pose at each action.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation.gripper_speed import lead_scale
 from fetch_hand_sim.simulation.model_tuning import (
     FETCH_NEVER_TOUCHING,
     exclude_body_pairs,
@@ -33,7 +33,7 @@ from fetch_hand_sim.simulation.tasks.task import (
 from msgs_spec.arrays import Array
 from msgs_spec.robots import GRIPPER_STEP
 from msgs_spec.rotations import quaternion_multiply
-from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule, TaskSpec
 
 # The gripper is held in this (unnormalised) orientation: fetch_env.py adds it to the mocap
 # quaternion.
@@ -41,6 +41,8 @@ _GRIPPER_ROTATION = np.array([1.0, 0.0, 1.0, 0.0])
 # Where the gripper starts, relative to where the compiled model has it, metres.
 _GRIPPER_START = np.array([-0.498, 0.005, -0.431])
 _SETTLING_SUBSTEPS = 200
+# Time constant of the weld between mocap body and gripper (`fetch/shared.xml`), seconds.
+_TIME_CONSTANT = 0.02
 # No object starts closer to the gripper than this, metres.
 _OBJECT_CLEARANCE = 0.1
 
@@ -327,3 +329,20 @@ def _chain_dofs(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
         dofs.extend(range(first, first + count))
         body = int(model.body_parentid[body])
     return np.array(sorted(dofs), dtype=np.intp)
+
+
+def lead_scale(control_hz: float) -> float:
+    """What leads are multiplied by at an action frequency in Hz; exactly 1 at 25 Hz."""
+    return _steady_speed(DEFAULT_CONTROL_HZ) / _steady_speed(control_hz)
+
+
+def _steady_speed(control_hz: float) -> float:
+    """Mean speed per metre of lead, 1/s, where every command leads as much as the one before.
+
+    With x = w T, a spring let go at a distance of 1 with a speed of w u is at
+    (1 - (u - 1) x) exp(-x) after T; u is the speed at which it begins as fast as it ends.
+    """
+    x = 1.0 / (control_hz * _TIME_CONSTANT)
+    decay = math.exp(-x)
+    u = x * decay / (1.0 - (1.0 - x) * decay)
+    return (1.0 - (1.0 - (u - 1.0) * x) * decay) * control_hz

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.model_tuning import list_geom_pairs, skip_unread_stages
 from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task, weakly
+from msgs_spec.actions import command_from_action
 from msgs_spec.arrays import Array
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import TaskSpec
@@ -35,11 +38,27 @@ class HandTask(Task):
         """Binds controls and fingertip positions."""
         super().__init__(spec, model, batch)
         self._ctrl: Array = self.batch.bind('ctrl')
+        self._scaled_robot = spec.robot
+        self._compiled_ranges = model.actuator_ctrlrange.copy()
         self._site_xpos: Array = self.output('site_xpos')
         self._xquat = self.output('xquat')
         self._fingertip_sites = fingertip_sites(model)
         self._fingertip_bodies = model.site_bodyid[self._fingertip_sites]
         self._sensors['fingertip_poses'] = weakly(self._fingertip_poses)
+
+    def follow_model(self) -> None:
+        """Follow the model; actions span `actuator_ctrlrange` once it was written to."""
+        super().follow_model()
+        ranges = self.model.actuator_ctrlrange
+        self._scaled_robot = self.spec.robot
+        if (ranges != self._compiled_ranges).any():
+            parts = zip(self.spec.robot.command, ranges.tolist(), strict=True)
+            command = tuple(replace(part, lower=low, upper=high) for part, (low, high) in parts)
+            self._scaled_robot = replace(self.spec.robot, command=command)
+
+    def commands_from_actions(self, actions: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Return joint angles (N, 20), radians, of actions in [-1, 1]."""
+        return command_from_action(self._scaled_robot, actions)
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
         """Sets the position actuators to absolute joint angles, radians."""

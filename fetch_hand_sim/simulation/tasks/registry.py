@@ -7,7 +7,6 @@ from typing import Any
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
 from fetch_hand_sim.simulation.tasks.hand_reach import REACH_ASSET, HandReachTask
-from fetch_hand_sim.simulation.tasks.offered import require_offered
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task
 from msgs_spec.foreign_tasks import foreign_simulation
 from msgs_spec.tasks import (
@@ -18,7 +17,6 @@ from msgs_spec.tasks import (
     substeps_per_tick,
     task_spec,
 )
-from msgs_spec.text import one_line
 
 
 def make_task(
@@ -48,7 +46,7 @@ def make_task(
     """
     spec = task_spec(name, control_hz=control_hz if timing == 'seconds' else DEFAULT_CONTROL_HZ)
     batch = BatchConfig(num_envs, num_threads, substeps_per_tick(control_hz), keeps_data, timing)
-    task = _made(spec, batch)
+    task: Task = _family(spec)(spec, batch)
     if str(task.asset) != (named := task_asset(name)):
         raise ValueError(f'{name} simulates {task.asset}; its ASSET, which is drawn, is {named}')
     if (timestep := float(task.model.opt.timestep)) != PHYSICS_TIMESTEP:
@@ -56,17 +54,6 @@ def make_task(
             f'{name}: {task.asset} steps by {timestep:g} s; rates, stamps and logs take '
             f'{PHYSICS_TIMESTEP:g} s (<option timestep="{PHYSICS_TIMESTEP:g}"/>)'
         )
-    if spec.reference_id is None:
-        require_offered(task)
-    return task
-
-
-def _made(spec: TaskSpec, batch: BatchConfig) -> Task:
-    """Starts the simulations of a task; what its model does not name is one line."""
-    try:
-        task: Task = _family(spec)(spec, batch)
-    except KeyError as error:
-        raise ValueError(f'{spec.name} cannot be made: {one_line(error, longest=400)}') from error
     return task
 
 

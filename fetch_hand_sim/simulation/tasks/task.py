@@ -15,10 +15,10 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation.contact_pairs import ListedPairs
-from fetch_hand_sim.simulation.forked import keep_in_forks
-from fetch_hand_sim.simulation.models import prepare_engine
+from fetch_hand_sim.simulation.engine import keep_in_forks, prepare_engine
+from fetch_hand_sim.simulation.model_tuning import ListedPairs
 from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.actions import command_from_action
 from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
 from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec, Timing
@@ -153,6 +153,10 @@ class Task(ABC):
             return np.zeros((ids.size, self.spec.goal.size))
         pairs = zip(ids.tolist(), generators, strict=True)
         return np.array([self.sample_goal(index, generator) for index, generator in pairs])
+
+    def commands_from_actions(self, actions: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Return the commands of actions (N, action size) in [-1, 1]."""
+        return command_from_action(self.spec.robot, actions)
 
     @abstractmethod
     def apply_commands(self, commands: NDArray[np.floating]) -> None:

@@ -11,7 +11,7 @@ import pytest
 import fetch_hand_sim
 from fetch_hand_sim.gym_envs.registration import environment_id
 from fetch_hand_sim.simulation import Simulation
-from fetch_hand_sim.simulation.gripper_speed import lead_scale
+from fetch_hand_sim.simulation.tasks.fetch import lead_scale
 from msgs_spec.tasks import TASKS
 
 RATES = [12.5, 125.0, 250.0, 500.0]
@@ -91,7 +91,7 @@ def test_a_pickled_simulation_keeps_its_timing():
 
 
 def test_an_unknown_timing_is_refused():
-    with pytest.raises(ValueError, match="timing 'minutes'; allowed: seconds, ticks"):
+    with pytest.raises(ValueError, match="timing 'minutes' is unknown; allowed: seconds, ticks"):
         Simulation('FetchReach', timing='minutes')
 
 

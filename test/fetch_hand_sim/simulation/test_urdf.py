@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation.scene import Scene
-from fetch_hand_sim.simulation.urdf import ROOT, RobotDescription
-from fetch_hand_sim.simulation.urdf_shapes import roll_pitch_yaw
+from fetch_hand_sim.simulation.urdf import ROOT, RobotDescription, roll_pitch_yaw
 from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TASKS, task_spec
 
