@@ -214,7 +214,7 @@ def test_it_is_trained_run_by_the_nodes_logged_checked_and_replayed(
 
 BROKEN = {
     'raises': ("raise RuntimeError('no such\\nrobot')\n", 'Mine', 'no such robot'),
-    'no task': ('Mine = 3\n', 'Mine', 'no TaskSpec but int'),
+    'no task': ('Mine = 3\n', 'Mine', 'int given; allowed: a TaskSpec'),
     'taken': (
         'from msgs_spec.tasks import TASKS\nFetchPush = TASKS["FetchPush"]\n',
         'FetchPush',
@@ -224,12 +224,12 @@ BROKEN = {
         'from dataclasses import replace\nfrom msgs_spec.tasks import TASKS\n'
         'near = replace(TASKS["FetchPush"], name="Push (near)")\n',
         'Push (near)',
-        "a name has letters, digits, _, - and . only, 64 at most, not 'Push (near)'",
+        "name 'Push (near)'; allowed: up to 64 letters, digits, _, - and .",
     ),
     'another name': (
         'from msgs_spec.tasks import TASKS\nMine = TASKS["FetchPush"]\n',
         'Mine',
-        "the task calls itself 'FetchPush'",
+        "its TaskSpec has the name 'FetchPush'; allowed: 'Mine'",
     ),
 }
 

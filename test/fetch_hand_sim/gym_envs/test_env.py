@@ -262,7 +262,7 @@ def test_a_goal_stays_that_of_its_episode():
 def test_looking_at_the_data_starts_no_episode():
     env = make('FetchPush').unwrapped
     assert env.data.time > 0.0
-    with pytest.raises(gymnasium.error.ResetNeeded, match='reset comes before the first step'):
+    with pytest.raises(gymnasium.error.ResetNeeded, match='call reset before step'):
         env.step(np.zeros(4))
     env.data.qpos[:] += 0.01
     with pytest.raises(gymnasium.error.ResetNeeded):
