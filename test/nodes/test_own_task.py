@@ -218,7 +218,7 @@ BROKEN = {
     'taken': (
         'from msgs_spec.tasks import TASKS\nFetchPush = TASKS["FetchPush"]\n',
         'FetchPush',
-        'one of the thirteen has this name',
+        'another task has this name',
     ),
     'a name that no id can have': (
         'from dataclasses import replace\nfrom msgs_spec.tasks import TASKS\n'
