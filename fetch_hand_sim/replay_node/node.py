@@ -123,8 +123,9 @@ class ReplayNode(Node):
                 full_name(info.node_namespace, info.node_name)
                 for info in self.get_publishers_info_by_topic(topic)
             ]
-            # A second replay has the same name as this one.
-            found.remove(self.get_fully_qualified_name())
+            # Another replay has the same name as this one.
+            if self.get_fully_qualified_name() in found:
+                found.remove(self.get_fully_qualified_name())
             if found:
                 raise UsageError(
                     f'{topic} is already published by {", ".join(sorted(found))}; stop that node, '

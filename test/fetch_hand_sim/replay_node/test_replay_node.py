@@ -33,8 +33,8 @@ from support.ros_messages import from_ros
 REPLAY_NODE = (*SIM_NODE[:2], 'fetch_hand_sim.replay_node')
 LISTENER = Path(__file__).parents[2] / 'support' / 'topic_listener.py'
 REACH = task_spec('FetchReach')
-# Real time: a slow machine may fall 0.4 s behind, ten messages, before one is lost.
-RATE = 1.0
+# At half speed, a slow machine may fall 0.8 s behind, ten messages, before one is lost.
+RATE = 0.5
 
 
 def finish(process, timeout=TIMEOUT):
