@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import subprocess
 import sys
@@ -14,10 +13,14 @@ from pathlib import Path
 
 from fetch_hand_sim.__main__ import COMMANDS, Command
 from msgs_spec.tasks import TASKS
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.config_fields import ConfigFields
-from policy_node.training.configuration.config_options import field_docstrings
-from policy_node.training.configuration.config_rules import CHOICES, RANGES
+from policy_node.training.configuration.flat import (
+    DEFAULTS,
+    FIELDS,
+    RESEARCH,
+    Field,
+    to_flat,
+    value_text,
+)
 from policy_node.training.configuration.recipes import recipe_config
 
 _COLUMNS = '88'
@@ -71,60 +74,45 @@ def help_of(path: tuple[str, ...]) -> str:
 
 
 def train_config_page() -> str:
-    """Returns the fields of `TrainConfig`, and where the recipes differ from their defaults."""
-    documented = field_docstrings(ConfigFields)
-    ranges = {name: _range(low, high) for name, low, high in RANGES}
-    choices = {name: ', '.join(map(_code, values)) for name, values in CHOICES.items()}
-    allowed = {'task': f'one of the {len(TASKS)} tasks'} | ranges | choices
-    rows = []
-    for field in dataclasses.fields(TrainConfig):
-        meaning = documented[field.name]
-        default = '' if field.default is dataclasses.MISSING else _code(_value(field.default))
-        rows.append((_code(field.name), default, allowed.get(field.name, ''), meaning))
-    return (
-        '\n\n'.join(
-            [
-                '# Fields of training',
-                'Everything that decides what `fetch_hand_sim train` learns: '
-                '`policy_node.training.configuration.config.TrainConfig`. Any field is an option, '
-                '`--learning-rate 1e-4`, or `--set learning_rate=1e-4`; each is in the JSON of the '
-                'actor. [Training](../training.md) '
-                'says what they bought.',
-                _table(('field', 'default', 'allowed', 'meaning'), rows),
-                '## Recipes\n\nWhere a recipe differs from the default. `paper` is given for '
-                'FetchPush; hand manipulation has episodes of twice as many ticks.',
-                _recipes(),
-            ]
-        )
-        + '\n'
+    """Return the fields of `TrainConfig` by group, and the values of the recipes."""
+    parts = [
+        '# Fields of training',
+        'Fields that decide what `fetch_hand_sim train` learns: '
+        '`policy_node.training.configuration.config.TrainConfig`. Any field is an option, '
+        '`--learning-rate 1e-4`, or `--set learning_rate=1e-4`; each is in the JSON of the actor. '
+        '[Training](../training.md) says how much they help.',
+    ]
+    for is_research, prefix in ((False, ''), (True, 'For studies: ')):
+        fields = [each for each in FIELDS.values() if (each.name in RESEARCH) == is_research]
+        for title in dict.fromkeys(each.group for each in fields):
+            rows = [_row(each) for each in fields if each.group == title]
+            parts.append(f'## {prefix}{title}')
+            parts.append(_table(('field', 'default', 'allowed', 'meaning'), rows))
+    parts.append(
+        '## Recipes\n\nValues that differ from the default. `paper` is given for FetchPush; hand '
+        'manipulation has episodes of twice as many ticks.'
     )
+    parts.append(_recipes())
+    return '\n\n'.join(parts) + '\n'
+
+
+def _row(field: Field) -> tuple[str, ...]:
+    allowed = ', '.join(map(_code, field.choices)) or str(field.limits or '')
+    if field.name == 'task':
+        return _code('task'), '', f'one of the {len(TASKS)} tasks', field.meaning
+    return _code(field.name), _code(value_text(field.default)), allowed, field.meaning
 
 
 def _recipes() -> str:
-    columns = [('paper', recipe_config('FetchPush', 'paper'))]
-    columns += [(f'best, {task}', recipe_config(task, 'best')) for task in _EXAMPLES]
+    columns = [('paper', to_flat(recipe_config('FetchPush', 'paper')))]
+    columns += [(f'best, {task}', to_flat(recipe_config(task, 'best'))) for task in _EXAMPLES]
     rows = []
-    for field in dataclasses.fields(TrainConfig):
-        values = [getattr(each, field.name) for _, each in columns]
-        if field.name not in ('task', 'recipe') and any(v != field.default for v in values):
-            cells = ['' if v == field.default else _code(_value(v)) for v in values]
-            rows.append((_code(field.name), *cells))
+    for name, default in DEFAULTS.items():
+        values = [each[name] for _, each in columns]
+        if name != 'recipe' and any(value != default for value in values):
+            cells = ['' if value == default else _code(value_text(value)) for value in values]
+            rows.append((_code(name), *cells))
     return _table(('field', *(name for name, _ in columns)), rows)
-
-
-def _range(low: float, high: float) -> str:
-    if high == float('inf'):
-        return f'{_value(low)} or more'
-    return f'{_value(low)} ... {_value(high)}'
-
-
-def _value(value: object) -> str:
-    """A value as `--set` takes it."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return ','.join(map(str, value))
-    return f'{value:.6g}' if isinstance(value, float) else str(value)
 
 
 def _code(text: str) -> str:

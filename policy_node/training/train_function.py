@@ -13,7 +13,7 @@ import torch
 
 from node_runtime.command_line import CommandError, UsageError
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.config_values import typed_fields
+from policy_node.training.configuration.flat import typed_fields
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.runs.resumed_config import resumed_config
 from policy_node.training.runs.run import Caller, Ending, OnCycle, train_run

@@ -20,13 +20,13 @@ from node_runtime.command_line import (
     say,
 )
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.config_options import (
+from policy_node.training.configuration.flat import (
     add_field_options,
     given_fields,
     with_assignments,
 )
-from policy_node.training.configuration.config_rules import RECIPES
-from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.configuration.groups import Held, Hierarchical, Ppo
+from policy_node.training.configuration.recipes import RECIPES, recipe_config
 
 if TYPE_CHECKING:
     from policy_node.training.replay.episode_replay import Episodes
@@ -70,7 +70,7 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
             raise ValueError(f'--no-her excludes --strategy {overrides["strategy"]}')
         overrides['strategy'] = 'none'
     config = _configured(options, overrides)
-    if options.her and config.strategy == 'none':
+    if options.her and config.goals.strategy == 'none':
         raise ValueError('--her excludes strategy none: give another --strategy')
     return config
 
@@ -142,24 +142,25 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
     """
     if directory is None:
         return None
-    if config.algorithm == 'ppo':
+    if isinstance(config.learner, Ppo):
         raise ValueError('algorithm ppo excludes --from-episodes: it learns from its own alone')
-    if config.longest_hold > 1:
+    if config.find(Held):
         raise ValueError(
             'longest_hold above 1 excludes --from-episodes: their actions have no length'
         )
-    if config.subgoal_every:
+    if config.find(Hierarchical):
         raise ValueError('subgoal_every excludes --from-episodes: nobody gave them subgoals')
-    if config.gamble:
+    if config.collect.gamble:
         raise ValueError('gamble excludes --from-episodes: gambles in them ended nothing')
     from policy_node.training.replay.logged_episodes import read_experience
 
-    task = task_spec(config.task, control_hz=config.control_hz)
-    episodes, skipped = read_experience(directory, task, config.control_hz)
+    task = task_spec(config.task, control_hz=config.collect.control_hz)
+    episodes, skipped = read_experience(directory, task, config.collect.control_hz)
     transitions = len(episodes) * episodes.ticks
-    if transitions > config.replay_transitions:
+    if transitions > config.replay.replay_transitions:
         raise ValueError(
-            f'{directory} holds {transitions} transitions, the replay {config.replay_transitions}; '
+            f'{directory} holds {transitions} transitions, '
+            f'the replay {config.replay.replay_transitions}; '
             f'allow more with --set replay_transitions={transitions}'
         )
     left_out = f'; {len(skipped)} left out, first: {skipped[0]}' if skipped else ''

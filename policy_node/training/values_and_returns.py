@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation import Simulation
 from policy_node.training.collection.simulations import make_simulation
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.config_rules import DEFAULTS
-from policy_node.training.configuration.config_values import config_from_dict
+from policy_node.training.configuration.flat import DEFAULTS, changed, config_from_dict, to_flat
 from policy_node.training.evaluation.episodes import FIRST_SEED
 from policy_node.training.experience.sampling import make_sampler
 from policy_node.training.goals.hindsight import RewardFunction
@@ -80,13 +79,14 @@ def _read_config(file: Path) -> tuple[TrainConfig, float]:
     """The configuration of a run, and how far its goals have narrowed."""
     state = read_state(file)
     config = config_from_dict(state.extra['config'])
-    found = {name: getattr(config, name) for name in _OTHER_VALUES}
+    flat = to_flat(config)
+    found = {name: flat[name] for name in _OTHER_VALUES}
     odd = [f'{name} {value}' for name, value in found.items() if value != DEFAULTS[name]]
     if odd:
         raise ValueError(f'{file.parent} has other values than of actions: {", ".join(odd)}')
     # Nothing is learnt from here.
-    config = replace(config, replay_transitions=1, learning_starts=0, device='cpu')
-    return config, state.counters.narrowing_steps / config.total_steps
+    config = changed(config, replay_transitions=1, learning_starts=0, device='cpu')
+    return config, state.counters.env_steps / config.run.total_steps
 
 
 def _play(

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import ast
-import dataclasses
 import runpy
 from collections.abc import Iterator
 
-from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.flat import FIELDS
 from policy_node.training.configuration.recipes import recipe_config
 from support import ROOT
 
@@ -18,13 +17,13 @@ def test_every_field_of_training_has_a_row_with_its_meaning() -> None:
     page = TOOL['train_config_page']()
     rows = [line.split(' | ') for line in page.partition('## Recipes')[0].splitlines()]
     meanings = {row[0].strip('| `'): row[-1].strip(' |') for row in rows if len(row) >= 4}
-    for field in dataclasses.fields(TrainConfig):
-        assert meanings.get(field.name), field.name
+    for name in FIELDS:
+        assert meanings.get(name), name
 
 
 def test_the_recipes_on_the_page_equal_those_of_training() -> None:
     recipes = TOOL['train_config_page']().partition('## Recipes')[2]
-    gamma = recipe_config('HandReach', 'best').gamma
+    gamma = recipe_config('HandReach', 'best').learner.gamma
     (row,) = (line for line in recipes.splitlines() if line.startswith('| `gamma` |'))
     assert row.split(' | ')[4] == f'`{gamma}`'
 

@@ -13,7 +13,7 @@ from policy_node.policies.policy import Policy
 from policy_node.training.collection.exploration import ActionNoise, ParameterNoise
 from policy_node.training.collection.frame_skip import Holder
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.goals.failed_goals import FailedGoals
+from policy_node.training.configuration.groups import Held, Hierarchical
 from policy_node.training.goals.subgoals import Guide, Proposer, subgoal_columns
 from policy_node.training.replay.episode_replay import Episodes
 
@@ -40,27 +40,25 @@ class Collector:
         self.exploration = 1.0
         self.proposer: Proposer | None = None
         generator = np.random.default_rng(seeds[0])
-        longest, every, spec = config.longest_hold, config.subgoal_every, simulation.spec
-        std, epsilon = config.noise_std, config.random_epsilon
+        held, guided = config.find(Held), config.find(Hierarchical)
+        longest = held.longest_hold if held else 1
+        every = guided.subgoal_every if guided else 0
+        spec, noise = simulation.spec, config.learner.exploration
+        std, epsilon = noise.noise_std, noise.random_epsilon
         size = spec.robot.action_size + (longest > 1)
-        self._past_size = config.past_actions * spec.robot.action_size
+        self._past_size = config.network.past_actions * spec.robot.action_size
         self._inputs = spec.observation_size + self._past_size
         self._columns = size + subgoal_columns(every, spec.goal.size)
         self._holder = Holder(longest) if longest > 1 else None
-        self._parameters = ParameterNoise(generator, std) if config.parameter_noise else None
+        self._parameters = ParameterNoise(generator, std) if noise.parameter_noise else None
         self._noise = ActionNoise(
             generator,
             (simulation.num_envs, size),
-            0.0 if config.parameter_noise else std,
+            0.0 if noise.parameter_noise else std,
             epsilon,
-            config.noise_spread,
-            config.noise_ticks,
+            noise.noise_ticks(config.collect.control_hz),
         )
         self._guide = Guide(every, generator, std, epsilon) if every else None
-        self._failed: FailedGoals | None = None
-        if config.retry_failed > 0:
-            # A generator of its own, so that exploration is the same with and without.
-            self._failed = FailedGoals(np.random.default_rng(seeds[:2]), config.retry_failed)
         self._seeds: list[int] | None = seeds
 
     def collect(self, policy: Policy, random: bool = False) -> tuple[Episodes, float]:
@@ -79,10 +77,6 @@ class Collector:
         ticks, count = spec.episode_ticks, simulation.num_envs
         observation = simulation.reset(seed=self._seeds)
         self._seeds = None
-        retried = np.zeros(count, dtype=np.bool_)
-        if self._failed is not None:
-            retried = self._failed.give(simulation)
-            observation = simulation.observe()
         episodes = Episodes(
             observation=np.empty((count, ticks + 1, self._inputs), np.float32),
             achieved_goal=np.empty((count, ticks + 1, spec.goal.size), np.float32),
@@ -109,8 +103,6 @@ class Collector:
         episodes.achieved_goal[:, ticks] = observation['achieved_goal']
         if not random:
             self._adapt(policy, acting, episodes)
-        if self._failed is not None:
-            self._failed.remember(simulation, whole & ~success & ~retried)
         return episodes.select(whole), float(success[whole].mean()) if whole.any() else 0.0
 
     def _acting(self, policy: Policy) -> Policy:

@@ -24,8 +24,6 @@ class ActionNoise:
         shape: (simulations, action size).
         std: Standard deviation of the Gaussian noise.
         epsilon: Probability of a random action.
-        spread: The first simulation has 1 - spread times both, the last 1 + spread; one alone has
-            both as they are.
         ticks: For how many ticks whatever was drawn holds.
 
     Attributes:
@@ -38,14 +36,11 @@ class ActionNoise:
         shape: tuple[int, int],
         std: float,
         epsilon: float,
-        spread: float = 0.0,
         ticks: int = 1,
     ) -> None:
         self._generator = generator
         self._shape = shape
         self._std, self._epsilon = std, epsilon
-        places = np.linspace(-1.0, 1.0, shape[0]) if shape[0] > 1 else np.zeros(1)
-        self._shares = 1.0 + spread * places
         self._ticks = ticks
         self.share = 1.0
         self._uniform, self._noise = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -59,12 +54,12 @@ class ActionNoise:
 
     def around(self, action: NDArray[Any], tick: int) -> Actions:
         """Actions (N, action size) with noise for a tick of an episode."""
-        share = self.share * self._shares
+        share = self.share
         if tick % self._ticks == 0:
             self.random(tick)
             self._noise = self._generator.standard_normal(self._shape, dtype=np.float32)
             self._replaced = self._generator.random(self._shape[0]) < share * self._epsilon
-        noisy = action + (self._std * share[:, None]).astype(np.float32) * self._noise
+        noisy = action + np.float32(self._std * share) * self._noise
         noisy = np.clip(noisy, -1.0, 1.0)
         return np.where(self._replaced[:, None], self._uniform, noisy)
 

@@ -18,7 +18,6 @@ from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.arguments import Seeds
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import TaskSpec
-from policy_node.training.configuration.config_rules import require_idle_gripper
 from policy_node.training.replay.episode_replay import Episodes
 
 # The idle part of the action, and the value above which it is the gamble.
@@ -46,7 +45,6 @@ class GambleSimulation(Simulation):
     """
 
     def __init__(self, task: str, **options: Any) -> None:
-        require_idle_gripper(task)
         super().__init__(task, **options)
         self._prepare()
 

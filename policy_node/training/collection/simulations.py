@@ -7,6 +7,7 @@ from typing import Any
 from fetch_hand_sim.simulation import Simulation
 from policy_node.training.collection.gamble import GambleSimulation
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Dense
 
 
 def make_simulation(config: TrainConfig, num_envs: int, num_threads: int) -> Simulation:
@@ -14,9 +15,9 @@ def make_simulation(config: TrainConfig, num_envs: int, num_threads: int) -> Sim
     options: dict[str, Any] = {
         'num_envs': num_envs,
         'num_threads': num_threads,
-        'reward_type': config.reward_type,
-        'success_rule': config.success_rule,
-        'control_hz': config.control_hz,
-        'disturbances': config.disturbances,
+        'reward_type': 'dense' if config.find(Dense) else 'sparse',
+        'success_rule': config.collect.success_rule,
+        'control_hz': config.collect.control_hz,
+        'disturbances': config.collect.disturbances,
     }
-    return (GambleSimulation if config.gamble else Simulation)(config.task, **options)
+    return (GambleSimulation if config.collect.gamble else Simulation)(config.task, **options)

@@ -10,14 +10,17 @@ from typing import Any
 from msgs_spec.disturbances import PRESETS
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.config_rules import DEFAULTS, RECIPES
+from policy_node.training.configuration.flat import DEFAULTS, from_flat
 
+# Recipes of runs that start from nothing.
+FROM_NOTHING = ('paper', 'best', 'robust')
+RECIPES = (*FROM_NOTHING, 'finetune')
 # Fields that count steps, which are ticks.
 STEP_COUNTS = ('total_steps', 'evaluate_every')
 # Who sets one of these at another rate than 25 Hz decides what happens there.
 _DECIDE_AT_RATES = (
     'algorithm discount n_step noise_seconds parameter_noise longest_hold advantage condition '
-    'importance subgoal_every goal_choice temporal_smoothness'
+    'importance subgoal_every goal_choice'
 ).split()
 
 # Who sets one of these does without imagined subgoals, which exclude other values of them.
@@ -58,7 +61,7 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     if recipe in ('best', 'robust'):
         values |= _at_rate(task, values, overrides)
         values |= _imagined(task, overrides)
-    return TrainConfig(**{'task': task, 'recipe': recipe, **values, **overrides})
+    return from_flat({'task': task, 'recipe': recipe, **values}, **overrides)
 
 
 def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:

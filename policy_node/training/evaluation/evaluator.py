@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Hierarchical
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, wilson_interval
 from policy_node.training.goals.subgoals import GuidedPolicy, Proposer
 
@@ -34,13 +35,13 @@ class Evaluator:
 
         "Cannot" means that it lies above the 95 % interval of the episodes so far.
         """
-        rule = self._config.success_rule
+        rule = self._config.collect.success_rule
 
         def hopeless(outcomes: EpisodeOutcomes) -> bool:
             count = int(successes(outcomes, rule).sum())
             return wilson_interval(count, len(outcomes))[1] < best_success
 
-        episodes = self._config.evaluation_episodes
+        episodes = self._config.run.evaluation_episodes
         return evaluate(self._simulation, actor, episodes, EVALUATION_SEED, hopeless)
 
     def evaluate_guided(self, actor: Actor) -> EpisodeOutcomes | None:
@@ -49,12 +50,13 @@ class Evaluator:
             return None
         config, simulation = self._config, self._simulation
         ticks = simulation.spec.episode_ticks
-        both = GuidedPolicy(actor, self.proposer, config.subgoal_every, ticks)
-        return evaluate(simulation, both, config.evaluation_episodes, EVALUATION_SEED)
+        assert isinstance(config.learner, Hierarchical)
+        both = GuidedPolicy(actor, self.proposer, config.learner.subgoal_every, ticks)
+        return evaluate(simulation, both, config.run.evaluation_episodes, EVALUATION_SEED)
 
     def is_complete(self, outcomes: EpisodeOutcomes) -> bool:
         """Whether an evaluation ran all its episodes; only then it may decide what is best."""
-        return len(outcomes) >= self._config.evaluation_episodes
+        return len(outcomes) >= self._config.run.evaluation_episodes
 
 
 def successes(outcomes: EpisodeOutcomes, success_rule: str) -> NDArray[np.bool_]:

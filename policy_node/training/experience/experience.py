@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from msgs_spec.tasks import TaskSpec
 from policy_node.policies.actor import Actor
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Drop, Held, Hierarchical
 from policy_node.training.experience.episode_weights import episode_weights, ticks_until_dropped
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.goals.goal_choice import Judge
-from policy_node.training.goals.hindsight import SuccessFunction, goal_mixture, parse_mixture
+from policy_node.training.goals.hindsight import complete_mixture, goal_mixture
 from policy_node.training.goals.subgoals import subgoal_columns
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.networks.normalizer import RunningStatistics
@@ -50,27 +51,28 @@ class Experience:
         self.config = config
         self._spec = spec
         self._workers = workers
-        self._sampler = self._first_sampler = sampler
+        self._sampler = sampler
         self.judge: Judge | None = None
         self.generator = generator
-        self.batch_size = workers.share(config.batch_size)
+        self.batch_size = workers.share(config.learner.batch_size)
         self.statistics = {
             'observation_statistics': RunningStatistics(network_shape(config).input_size),
             'goal_statistics': RunningStatistics(spec.goal.size),
         }
-        self._count_ticks = ticks_until_dropped(spec, config.ticks_after_drop)
+        drop, guided = config.find(Drop), config.find(Hierarchical)
+        self._count_ticks = ticks_until_dropped(spec, drop.ticks_after_drop if drop else -1)
         self._weigh = episode_weights(
-            config.episode_weights, spec, config.control_hz, config.gamble
+            config.replay.episode_weights, spec, config.collect.control_hz, config.collect.gamble
         )
-        capacity = max(workers.share(config.replay_transitions) // spec.episode_ticks, 1)
+        capacity = max(workers.share(config.replay.replay_transitions) // spec.episode_ticks, 1)
         self.replay = EpisodeReplay(
-            max(capacity, workers.share(config.num_envs)),
+            max(capacity, workers.share(config.collect.num_envs)),
             spec.episode_ticks,
             network_shape(config).input_size,
             spec.goal.size,
             spec.robot.action_size
-            + (config.longest_hold > 1)
-            + subgoal_columns(config.subgoal_every, spec.goal.size),
+            + (config.find(Held) is not None)
+            + subgoal_columns(guided.subgoal_every if guided else 0, spec.goal.size),
             self._weigh,
             self._count_ticks,
         )
@@ -80,7 +82,7 @@ class Experience:
         """Transitions held."""
         return len(self.replay) * self._spec.episode_ticks
 
-    def normalize(self, episodes: Episodes, actor: Actor, env_steps: int) -> None:
+    def normalize(self, episodes: Episodes, actor: Actor) -> None:
         """Adds episodes to the statistics and gives these to the actor; all workers together.
 
         Goals count as the networks will see them: relabelled.
@@ -89,7 +91,7 @@ class Experience:
         if len(episodes):
             row = np.repeat(np.arange(len(episodes)), episodes.ticks)
             valid = None if self._count_ticks is None else self._count_ticks(episodes)
-            mixture = self.mixture(env_steps)
+            mixture = self.mixture()
             goal = self._sampler.sample(episodes, row, mixture, self.generator, valid).goal
         for name, values, normalizer in (
             ('observation_statistics', observation, actor.observation_normalizer),
@@ -100,19 +102,12 @@ class Experience:
 
     def narrow(self, progress: float) -> None:
         """Rewards goals as a run does in which they have narrowed this far, 0 ... 1."""
-        self._sampler = self._first_sampler.at(progress)
-
-    def count_met(self, episodes: Episodes, success: SuccessFunction) -> int:
-        """How many episodes end in `success`; lost ones do not."""
-        last, desired = episodes.achieved_goal[:, -1], episodes.desired_goal
-        met = success(last.astype(np.float64), desired.astype(np.float64))
-        if self.config.drop_is_lost and self._count_ticks is not None:
-            met &= self._count_ticks(episodes) == episodes.ticks
-        return int(met.sum())
+        self._sampler = self._sampler.at(progress)
 
     def batch(self, env_steps: int) -> Transitions:
         """Draws the transitions of one update, after `env_steps` environment steps."""
-        return self._draw(self.mixture(env_steps))
+        del env_steps
+        return self._draw(self.mixture())
 
     def _draw(self, mixture: dict[str, float]) -> Transitions:
         """Draws transitions with goals from the sources of a mixture, and rewards of now."""
@@ -124,13 +119,9 @@ class Experience:
 
     def _draw_rows(self) -> NDArray[np.int64]:
         """Draws the episode of each transition of a batch."""
-        return self.replay.draw(self.batch_size, self.config.moved_share, self.generator)
+        return self.replay.draw(self.batch_size, self.config.replay.moved_share, self.generator)
 
-    def mixture(self, env_steps: int) -> dict[str, float]:
-        """Probability of each goal source after `env_steps` environment steps."""
-        config = self.config
-        if config.goals:
-            return parse_mixture(config.goals)
-        early = env_steps < config.future_only_steps
-        strategy = 'future' if early and config.strategy == 'futureactual' else config.strategy
-        return goal_mixture(strategy, config.hindsight_k)
+    def mixture(self) -> dict[str, float]:
+        """Return the probability of each goal source."""
+        goals = self.config.goals
+        return complete_mixture(goals.goals) or goal_mixture(goals.strategy, goals.hindsight_k)

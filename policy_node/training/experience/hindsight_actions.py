@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from policy_node.training.configuration.groups import Hierarchical
 from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.goals.hindsight import draw_sources, goals_of, with_subgoals
@@ -101,10 +102,13 @@ class HierarchicalExperience(Experience):
 
     def batch(self, env_steps: int) -> HierarchicalTransitions:
         """Draws the transitions of one update of both levels."""
-        config, mixture = self.config, self.mixture(env_steps)
+        del env_steps
+        config, mixture = self.config, self.mixture()
+        assert isinstance(config.learner, Hierarchical)
+        every = config.learner.subgoal_every
         low = self._draw(with_subgoals(mixture))
         rows = self._draw_rows()
-        subgoals = SubgoalSampler(self._sampler, config.subgoal_every, config.lowest_value)
+        subgoals = SubgoalSampler(self._sampler, every, config.lowest_value)
         high = subgoals.sample(self.replay.episodes, rows, mixture, self.generator)
         values = {name: getattr(low, name) for name in Transitions.__slots__}
         values['action'] = low.action[:, : self._spec.robot.action_size]

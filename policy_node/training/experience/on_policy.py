@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from msgs_spec.tasks import TaskSpec
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Ppo
 from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.rollouts import (
     Critique,
@@ -44,10 +45,11 @@ class OnPolicyExperience(Experience):
         critique: Critique,
     ) -> None:
         super().__init__(config, spec, workers, sampler, generator)
-        limits = config.gamma, config.trace, config.importance == 'decision'
+        options = config.find(Ppo) or Ppo()
+        limits = options.gamma, options.trace, options.importance == 'decision'
         self._maker = RolloutMaker(critique, sampler.compute_reward, *limits)
         self._metric = sampler.metric
-        self._newest = workers.share(config.num_envs)
+        self._newest = workers.share(config.collect.num_envs)
         self._rollouts: Rollouts | None = None
         self._made_after = -1
         self._weight_up_to = np.zeros(0)
@@ -55,29 +57,29 @@ class OnPolicyExperience(Experience):
     def batch(self, env_steps: int) -> Transitions:
         """Draws from the rollouts of the newest cycle; the first call after it makes them."""
         if self._rollouts is None or env_steps != self._made_after:
-            self._rollouts, self._made_after = self._roll_out(env_steps), env_steps
+            self._rollouts, self._made_after = self._roll_out(), env_steps
             self._weight_up_to = np.cumsum(self._weigh(self._rollouts.episodes))
-        return self._rollouts.draw(self._draw_rows(), self.config.gamma, self.generator)
+        return self._rollouts.draw(self._draw_rows(), self.config.learner.gamma, self.generator)
 
     def _draw_rows(self) -> NDArray[np.int64]:
         """Draws the rollout of each transition of a batch."""
-        generator, count, share = self.generator, self.batch_size, self.config.moved_share
+        generator, count, share = self.generator, self.batch_size, self.config.replay.moved_share
         row = generator.integers(len(self._weight_up_to), size=count)
         if share > 0.0 and self._weight_up_to[-1] > 0.0:
             chosen = np.flatnonzero(generator.random(count) < share)
             row[chosen] = draw_by(self._weight_up_to, len(chosen), generator)
         return row
 
-    def mixture(self, env_steps: int) -> dict[str, float]:
+    def mixture(self) -> dict[str, float]:
         """Probability of each goal source of single transitions."""
-        return with_outcomes_achieved(super().mixture(env_steps))
+        return with_outcomes_achieved(super().mixture())
 
-    def _roll_out(self, env_steps: int) -> Rollouts:
+    def _roll_out(self) -> Rollouts:
         # Fewer where MuJoCo lost some: those before are of another actor.
         episodes = self.replay.newest(min(self._newest, self.replay.last_added))
-        mixture = super().mixture(env_steps)
+        mixture = super().mixture()
         mixture.pop('real', None)
-        copies, outcomes = self.config.hindsight_k if mixture else 0, None
+        copies, outcomes = self.config.goals.hindsight_k if mixture else 0, None
         if OUTCOME in mixture and self._metric is not None:
             past = self.replay.newest(EPISODES)
             outcomes = Outcomes.of(past, self._metric, self.generator)

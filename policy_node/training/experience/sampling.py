@@ -12,8 +12,16 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array32
 from policy_node.training.collection.frame_skip import HeldSteps
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import (
+    Chosen,
+    Drop,
+    Held,
+    Returns,
+    Sparse,
+    Threshold,
+)
 from policy_node.training.goals.goal_choice import CANDIDATES, GOAL_CHOICES, Judge
-from policy_node.training.goals.graded import GradedReward, parse_grades
+from policy_node.training.goals.graded import GradedReward
 from policy_node.training.goals.hindsight import RewardFunction, draw_sources, flat, goals_of
 from policy_node.training.networks.conditions import Condition, make_condition
 from policy_node.training.replay.episode_replay import Episodes
@@ -53,7 +61,7 @@ class TransitionSampler:
     metric: GoalMetric | None = None
 
     def at(self, progress: float) -> TransitionSampler:
-        """The sampler of a run in which goals have narrowed this far, 0 ... 1."""
+        """Return the sampler of a run in which goals have narrowed this far, 0 ... 1."""
         if self.reward_at is None:
             return self
         return replace(self, compute_reward=self.reward_at(progress))
@@ -197,29 +205,28 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
     """
     _require_reward_kept(config, metric)
 
+    sparse = config.find(Sparse) or Sparse()
+
     def reward_at(progress: float) -> RewardFunction:
-        then = narrowed(metric, config, progress)
-        if not config.reward_grades:
-            return then.reward
-        return GradedReward(then, parse_grades(config.reward_grades), config.reward_apart)
+        then = narrowed(metric, sparse, progress)
+        return GradedReward(then, sparse.reward_grades) if sparse.reward_grades else then.reward
 
     counter: StepCounter | HeldSteps | None = None
-    if config.longest_hold > 1:
-        counter = HeldSteps(config.longest_hold)
-    if config.n_step > 1:
-        limits = config.correction, config.trace, config.cut_distance
-        counter = StepCounter(config.n_step, *limits)
-    finest = narrowed(metric, config, progress=1.0)
-    condition = make_condition(config.condition, finest, config.widest_threshold)
+    if held := config.find(Held):
+        counter = HeldSteps(held.longest_hold)
+    if returns := config.find(Returns):
+        limits = returns.correction, returns.trace, returns.cut_distance
+        counter = StepCounter(returns.n_step, *limits)
+    chosen, drop = config.find(Chosen), config.find(Drop)
     return TransitionSampler(
         reward_at(1.0),
         config.tick_gamma,
         counter,
-        condition,
-        config.goal_choice,
+        make_condition(config, narrowed(metric, sparse, 1.0)),
+        chosen.goal_choice if chosen else 'uniform',
         config.tick_share,
-        config.lowest_value if config.drop_is_lost else None,
-        reward_at if config.narrows else None,
+        config.lowest_value if drop and drop.drop_is_lost else None,
+        reward_at if sparse.narrows else None,
         metric,
     )
 
@@ -228,24 +235,25 @@ def _require_reward_kept(config: TrainConfig, metric: GoalMetric) -> None:
     if not metric.has_own_reward:
         return
     owner = f'that of {metric.spec.name} itself ({type(metric).__name__})'
-    if config.reward_grades:
+    sparse = config.find(Sparse)
+    if sparse and sparse.reward_grades:
         raise ValueError(
-            f'reward_grades {config.reward_grades} is a reward in the place of {owner}; allowed: '
+            f'reward_grades {sparse.reward_grades} is a reward in the place of {owner}; allowed: '
             'none (--set reward_grades=)'
         )
-    if config.condition == 'threshold':
+    if config.find(Threshold):
         raise ValueError(
             f'condition threshold has a reward in the place of {owner}; allowed: none, horizon'
         )
 
 
-def narrowed(metric: GoalMetric, config: TrainConfig, progress: float) -> GoalMetric:
-    """The metric by which a run rewards goals that have narrowed this far, 0 ... 1."""
+def narrowed(metric: GoalMetric, reward: Sparse, progress: float) -> GoalMetric:
+    """Return the metric that rewards goals which have narrowed this far, 0 ... 1."""
     left = max(1.0 - 1.5 * progress, 0.0)
     return scale_thresholds(
         metric,
-        config.reward_distance * config.first_distance**left,
-        config.reward_rotation * config.first_rotation**left,
+        reward.reward_distance * reward.first_distance**left,
+        reward.reward_rotation * reward.first_rotation**left,
     )
 
 

@@ -15,22 +15,13 @@ from numpy.typing import NDArray
 from msgs_spec.arrays import Array32
 from msgs_spec.rotations import quaternion_conjugate, quaternion_multiply
 from msgs_spec.tasks import GoalKind
+from policy_node.training.configuration.config import STRATEGIES
 from policy_node.training.goals.subgoals import subgoals_of
 from policy_node.training.replay.transitions import Starts
 
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-SuccessFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
 
 OUTCOME = 'outcome'
-# Sources of goals that are a strategy by themselves.
-_STRATEGIES = ('future', 'final', 'episode', 'random')
-# Where the goal of a transition comes from: the episode's own; a later achieved goal of the
-# episode; its last; any of it; any achieved goal of the replay; a desired goal of any episode; what
-# this very step achieved; what one of the next ten achieved; what the state before it achieved,
-# displaced; of whole episodes, what another one brought about (`outcomes.py`).
-SOURCES = ('real', *_STRATEGIES, 'actual', 'next', 'near', 'displaced', OUTCOME)
-# Sources of goals that the transition itself may have led to.
-FROM_THE_EPISODE = ('future', 'final', 'episode', 'next', 'near')
 _NEAR_TICKS = 10
 # One more, where there is a high level: what it had the actor pursue.
 _SUBGOAL = 'subgoal'
@@ -52,35 +43,18 @@ def goal_mixture(strategy: str, k: int = 4) -> dict[str, float]:
     share = k / (k + 1)
     if strategy == 'futureactual':
         return {'future': share / 2, 'actual': share / 2, 'real': 1.0 - share}
-    if strategy not in _STRATEGIES:
-        allowed = ', '.join(('none', 'futureactual', *_STRATEGIES))
+    if strategy not in STRATEGIES:
+        allowed = ', '.join(('none', 'futureactual', *STRATEGIES))
         raise ValueError(f'strategy {strategy!r}; allowed: {allowed}')
     return {strategy: share, 'real': 1.0 - share}
 
 
-def parse_mixture(text: str) -> dict[str, float]:
-    """Parses `future=.4,actual=.4` into the probability of each goal source; the rest is real.
-
-    Raises:
-        ValueError: If a source is unknown or named twice, or shares are not in (0, 1] in all.
-    """
-    mixture: dict[str, float] = {}
-    for part in text.split(','):
-        source, _, share = part.strip().partition('=')
-        if source not in SOURCES or source in mixture:
-            allowed = ', '.join(SOURCES)
-            raise ValueError(f'goals {text!r}: {source!r}; allowed, once each: {allowed}')
-        try:
-            mixture[source] = float(share)
-        except ValueError:
-            raise ValueError(f'goals {text!r}: {part!r} is not source=share') from None
-    total = sum(mixture.values())
-    if not (min(mixture.values()) > 0.0 and total <= 1.0 + 1e-9):
-        raise ValueError(f'goals {text!r}: shares above 0 that add up to at most 1 are allowed')
-    left = 1.0 - total
-    if left > 1e-9:
-        mixture['real'] = mixture.get('real', 0.0) + left
-    return mixture
+def complete_mixture(goals: dict[str, float]) -> dict[str, float]:
+    """Return the mixture with the rest up to 1 for the goals of episodes; empty stays empty."""
+    left = 1.0 - sum(goals.values())
+    if not goals or left <= 1e-9:
+        return dict(goals)
+    return {**goals, 'real': goals.get('real', 0.0) + left}
 
 
 def with_subgoals(mixture: dict[str, float]) -> dict[str, float]:

@@ -69,11 +69,11 @@ class ActorCritic:
         self.average_actor = copy.deepcopy(self.actor.network)
         self.actor_optimizer = self._adam(self.actor_parameters)
         self.critic_optimizer = self._adam(self.critic_parameters)
-        self.critic_first = config.critic_first
+        self.critic_first = config.learner.critic_first
         self.updates = 0
 
     def _adam(self, parameters: list[nn.Parameter]) -> torch.optim.Adam:
-        return torch.optim.Adam(parameters, lr=self.config.learning_rate, fused=True)
+        return torch.optim.Adam(parameters, lr=self.config.learner.learning_rate, fused=True)
 
     def update(self, batch: Transitions) -> Losses:
         """Improves the networks on a batch."""
@@ -92,7 +92,7 @@ class ActorCritic:
     @torch.no_grad()
     def average(self) -> None:
         """Moves the averaged actor towards the actor; the trainer calls it once per cycle."""
-        weight = 1.0 - self.config.actor_average
+        weight = 1.0 - self.config.learner.actor_average
         averaged: list[Tensor] = list(self.average_actor.parameters())
         torch._foreach_lerp_(averaged, [*self.actor_parameters], weight)
 
@@ -129,7 +129,9 @@ class ActorCritic:
     def set_progress(self, progress: float) -> None:
         """Sets the learning rate for a run of which the share `progress` is over."""
         config, share = self.config, min(max(progress, 0.0), 1.0)
-        rate = config.learning_rate * (1.0 - share * (1.0 - config.final_learning_rate))
+        rate = config.learner.learning_rate * (
+            1.0 - share * (1.0 - config.learner.final_learning_rate)
+        )
         for optimizer in (self.actor_optimizer, self.critic_optimizer):
             optimizer.param_groups[0]['lr'] = rate
 

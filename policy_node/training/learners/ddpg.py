@@ -15,11 +15,12 @@ from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.collection.frame_skip import plain_actor
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Density, Held, OffPolicy
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
 from policy_node.training.learners.density_ratio import DensityRatio, GoalView
 from policy_node.training.machine.devices import uses_bfloat16
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.networks.conditions import ACTING_INPUT, fold
+from policy_node.training.networks.conditions import acting_input, fold
 from policy_node.training.networks.critics import (
     AGGREGATES,
     AdvantageCritic,
@@ -32,9 +33,6 @@ from policy_node.training.replay.transitions import Transitions
 
 # Fields of `Transitions` that every batch has.
 _ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'discount')
-
-# TD3 clips noise of 0.2 at 0.5 (arXiv 1802.09477, appendix C).
-_NOISE_CUT = 2.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +62,10 @@ class DDPG(ActorCritic):
     def __init__(
         self, shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
     ) -> None:
-        conditioned = config.condition != 'none'
+        assert isinstance(config.learner, OffPolicy)
+        self.options = config.learner
+        self.acting_input = acting_input(config)
+        conditioned = self.acting_input is not None
         inputs = shape.feature_size + conditioned
         actor = Actor(shape)
         if conditioned:
@@ -73,16 +74,16 @@ class DDPG(ActorCritic):
         # A batch normalisation learns its statistics where values are learnt, nowhere else.
         super().__init__(actor, critic.eval(), config, device, workers)
         self.target_actor, self.target_critic = self.actor.network, self.critic
-        if config.target == 'polyak':
+        if self.options.target == 'polyak':
             self.target_actor = copy.deepcopy(self.actor.network)
             self.target_critic = copy.deepcopy(self.critic)
         self._ratio: DensityRatio | None = None
-        if config.importance == 'density':
+        if config.find(Density):
             sizes = shape.feature_size, shape.goal_size, shape.action_size
             self._ratio = DensityRatio(*sizes).to(device)
             self._achieved_start = task_spec(config.task).achieved_goal_start
-        self._action_size = shape.action_size - (config.longest_hold > 1)
-        self._bfloat16 = uses_bfloat16(config.precision, device)
+        self._action_size = shape.action_size - (config.find(Held) is not None)
+        self._bfloat16 = uses_bfloat16(config.machine.precision, device)
         zero = torch.zeros((), device=device)
         # Loss and value at the actor's last update.
         self._of_actor = zero, zero
@@ -92,11 +93,11 @@ class DDPG(ActorCritic):
         known = self._known(batch)
         weight = None if self._ratio is None else self._weights(self._ratio, known)
         critic_loss = self._update_critic(known, weight)
-        if self.updates % self.config.policy_delay == 0:
+        if self.updates % self.options.policy_delay == 0:
             self._of_actor = self._update_actor(known)
         actor_loss, value = self._of_actor
         self.updates += 1
-        if self.updates % self.config.target_update_interval == 0:
+        if self.updates % self.options.target_update_interval == 0:
             self._move_targets()
         return Losses(critic_loss.detach(), actor_loss, value)
 
@@ -107,20 +108,15 @@ class DDPG(ActorCritic):
 
     def _target_action(self, next_features: Tensor) -> Tensor:
         """The slow actor's actions, with the noise that makes values smooth (TD3, equation 14)."""
-        action = torch.tanh(self.target_actor(next_features))
-        scale = self.config.target_noise
-        if scale == 0.0:
-            return action
-        noise = scale * torch.randn_like(action).clamp(-_NOISE_CUT, _NOISE_CUT)
-        return (action + noise).clamp(-1.0, 1.0)
+        return torch.tanh(self.target_actor(next_features))
 
     def _bootstrap(self, reward: Tensor, discount: Tensor, next_value: Tensor) -> Tensor:
         """Targets (batch,), clipped to the range of returns of rewards in [-1, 0].
 
         Episodes are cut, never terminated, so every next state is bootstrapped from.
         """
-        config = self.config
-        value = next_value if config.critics == 1 else AGGREGATES[config.aggregate](next_value)
+        critic = self.options.critic
+        value = next_value if critic.critics == 1 else AGGREGATES[critic.aggregate](next_value)
         return self._clipped(reward + discount * value)
 
     def _clipped(self, target: Tensor) -> Tensor:
@@ -149,7 +145,7 @@ class DDPG(ActorCritic):
 
     def _costs(self, known: Known) -> Tensor:
         """What the critic's errors cost: (batch,), of several critics (critics, batch)."""
-        if self.config.quantiles > 1:
+        if self.options.critic.quantiles > 1:
             return self._costs_of_quantiles(known)
         return self._errors(known).square()
 
@@ -161,14 +157,14 @@ class DDPG(ActorCritic):
             following = slow.quantiles(
                 known.next_features, self._target_action(known.next_features)
             )
-            following = pooled(following, self.config.aggregate == 'truncated')
+            following = pooled(following, self.options.critic.aggregate == 'truncated')
             target = known.reward[:, None] + known.discount[:, None] * following
         quantiles = critic.quantiles(known.features, known.action)
         return quantile_costs(quantiles, self._clipped(target))
 
     def _errors(self, known: Known) -> Tensor:
         """Values less targets: (batch,), of several critics (critics, batch)."""
-        if self.config.norm == 'batch':
+        if self.options.critic.norm == 'batch':
             return self._joint_errors(known)
         if isinstance(self.critic, AdvantageCritic):
             return self._advantage_errors(known, self.critic)
@@ -242,18 +238,14 @@ class DDPG(ActorCritic):
         """What the actor's actions cost beside their value."""
         # How long an action holds costs nothing.
         moved = action[..., : self._action_size].float()
-        cost: Tensor = self.config.action_l2 * moved.square().mean()
-        if self.config.temporal_smoothness == 0.0:
-            return cost
-        then = self.actor(known.next_features)[..., : self._action_size].float()
-        change: Tensor = (then - moved).square().mean()
-        return cost + self.config.temporal_smoothness * change
+        cost: Tensor = self.options.action_l2 * moved.square().mean()
+        return cost
 
     @torch.no_grad()
     def _move_targets(self) -> None:
-        if self.config.target == 'none':
+        if self.options.target == 'none':
             return
-        weight = 1.0 - self.config.polyak
+        weight = 1.0 - self.options.polyak
         old: list[Tensor] = [*self.target_actor.parameters(), *self.target_critic.parameters()]
         new: list[Tensor] = [*self.actor_parameters, *self.critic_parameters]
         torch._foreach_lerp_(old, new, weight)
@@ -264,10 +256,10 @@ class DDPG(ActorCritic):
 
     def plain(self, network: MLP) -> Actor:
         """A copy of the actor with this network, at the condition under which it acts."""
-        if self.config.condition == 'none':
+        if self.acting_input is None:
             return super().plain(network)
         actor = copy.deepcopy(self.actor)
-        actor.network = fold(network, actor.shape, ACTING_INPUT[self.config.condition])
+        actor.network = fold(network, actor.shape, self.acting_input)
         return actor.cpu().eval()
 
     @torch.no_grad()
@@ -275,8 +267,8 @@ class DDPG(ActorCritic):
         """Actions (batch, action_size) of the actor, without noise."""
         inputs = self.tensor(observation), self.tensor(goal)
         features = self.actor.features(*inputs)
-        if self.config.condition != 'none':
-            acting = features.new_full((len(features), 1), ACTING_INPUT[self.config.condition])
+        if self.acting_input is not None:
+            acting = features.new_full((len(features), 1), self.acting_input)
             features = torch.cat([features, acting], dim=-1)
         action: Array32 = self.actor(features).cpu().numpy()
         return action
@@ -306,7 +298,7 @@ class DDPG(ActorCritic):
             ValueError: If the configuration has none.
         """
         if self._ratio is None:
-            raise ValueError(f'importance {self.config.importance!r} has no weights of its own')
+            raise ValueError('only importance density has weights of its own')
         weight: Array32 = self._weights(self._ratio, self._known(batch)).cpu().numpy()
         return weight
 
@@ -314,7 +306,7 @@ class DDPG(ActorCritic):
         """What a training state holds, by name."""
         modules = super().modules()
         # Without targets these are actor and critic themselves.
-        if self.config.target != 'none':
+        if self.options.target != 'none':
             targets = {'target_actor': self.target_actor, 'target_critic': self.target_critic}
             modules = {**modules, **targets}
         return modules if self._ratio is None else {**modules, 'ratio': self._ratio}

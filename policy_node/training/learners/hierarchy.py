@@ -47,7 +47,7 @@ class HighLevel(DDPG):
     ) -> None:
         shape = replace(shape, action_size=shape.goal_size)
         # A penalty of large actions would prefer goals in the middle of all; subgoals may jump.
-        config = replace(config, action_l2=0.0, temporal_smoothness=0.0)
+        config = replace(config, learner=replace(config.learner, action_l2=0.0))
         super().__init__(shape, config, device, workers)
         self.actor.observation_normalizer = actor.observation_normalizer
         self.actor.goal_normalizer = actor.goal_normalizer

@@ -22,6 +22,7 @@ from msgs_spec.tasks import GoalKind, task_spec
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Imagined
 from policy_node.training.learners.ddpg import DDPG, Known
 from policy_node.training.machine.distributed import Workers
 
@@ -50,6 +51,7 @@ class ImaginingDDPG(DDPG):
         self, shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
     ) -> None:
         super().__init__(shape, config, device, workers)
+        self._imagined = config.find(Imagined) or Imagined()
         self.imagination = MLP(shape.feature_size, shape.goal_size, shape).to(device)
         self._imagination_parameters = list(self.imagination.parameters())
         workers.broadcast(self._imagination_parameters)
@@ -60,8 +62,8 @@ class ImaginingDDPG(DDPG):
         self._is_pose = spec.goal is GoalKind.POSE
 
     def _update_actor(self, known: Known) -> tuple[Tensor, Tensor]:
-        actor_updates = self.updates // self.config.policy_delay
-        if actor_updates % self.config.imagination_interval == 0:
+        actor_updates = self.updates // self.options.policy_delay
+        if actor_updates % self._imagined.imagination_interval == 0:
             self._update_imagination(known)
         return super()._update_actor(known)
 
@@ -100,7 +102,7 @@ class ImaginingDDPG(DDPG):
             features = self.actor.features(known.observation, self.imagine(known.features))
             prior = torch.tanh(self.target_actor(features))
         distance: Tensor = (action - prior).float().square().mean()
-        return super()._penalty(known, action) + self.config.subgoal_prior * distance
+        return super()._penalty(known, action) + self._imagined.subgoal_prior * distance
 
     def imagine(self, features: Tensor) -> Tensor:
         """Subgoals (batch, goal_size) in units of the task for the features of states and goals."""

@@ -7,6 +7,7 @@ import torch
 
 from msgs_spec.tasks import TaskSpec
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Hierarchical, Imagined, Ppo
 from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.hindsight_actions import HierarchicalExperience
 from policy_node.training.experience.on_policy import OnPolicyExperience
@@ -38,13 +39,13 @@ def make_learner(
         sampler: Makes transitions.
         generator: Source of relabelling and drawing.
     """
-    if config.algorithm == 'ppo':
+    if config.find(Ppo):
         ppo = PPO(network_shape(config), config, device, workers)
         return ppo, OnPolicyExperience(config, spec, workers, sampler, generator, ppo)
-    if config.subgoal_every:
+    if config.find(Hierarchical):
         levels = HierarchicalDDPG(network_shape(config), config, device, workers)
         return levels, HierarchicalExperience(config, spec, workers, sampler, generator)
-    kind = ImaginingDDPG if config.subgoal_prior else DDPG
+    kind = ImaginingDDPG if config.find(Imagined) else DDPG
     ddpg = kind(network_shape(config), config, device, workers)
     experience = Experience(config, spec, workers, sampler, generator)
     experience.judge = ddpg

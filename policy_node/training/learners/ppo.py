@@ -17,6 +17,7 @@ from msgs_spec.arrays import Array32
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Ppo
 from policy_node.training.experience.rollouts import RolloutTransitions
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
 from policy_node.training.machine.distributed import Workers
@@ -42,10 +43,12 @@ class PPO(ActorCritic):
     def __init__(
         self, shape: NetworkShape, config: TrainConfig, device: torch.device, workers: Workers
     ) -> None:
+        options = config.find(Ppo) or Ppo()
+        self._noise_std = options.noise_std
         actor, critic = Actor(shape), MLP(shape.feature_size, 1, shape)
-        torch.nn.init.constant_(critic.output.bias, config.first_value)
+        torch.nn.init.constant_(critic.output.bias, options.first_value)
         with torch.no_grad():
-            actor.network.output.weight.mul_(config.first_action_gain)
+            actor.network.output.weight.mul_(options.first_action_gain)
         super().__init__(actor, critic, config, device, workers)
 
     def update(self, batch: Transitions) -> Losses:
@@ -69,14 +72,16 @@ class PPO(ActorCritic):
 
     def _actor_loss(self, batch: RolloutTransitions, features: Tensor, weight: Tensor) -> Tensor:
         mean = self.actor(features)
-        logs = log_probability(mean, self.config.noise_std, self.tensor(batch.action))
+        logs = log_probability(mean, self._noise_std, self.tensor(batch.action))
         # Beyond the bound an action is so much more or less likely that float32 has no gradient.
         difference = logs - self.tensor(batch.log_probability)
         ratio = difference.clamp(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO).exp()
         advantage = self.tensor(batch.advantage)
         bounded = ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
         gain = torch.minimum(ratio * advantage, bounded * advantage)
-        loss: Tensor = -(weight * gain).mean() + self.config.action_l2 * mean.square().mean()
+        loss: Tensor = (
+            -(weight * gain).mean() + self.config.learner.action_l2 * mean.square().mean()
+        )
         return loss
 
     @torch.no_grad()
@@ -90,7 +95,7 @@ class PPO(ActorCritic):
     def log_probabilities(self, observation: Array32, goal: Array32, action: Array32) -> Array32:
         """Logarithms (...,) of the densities of actions (..., action_size)."""
         mean = self.actor(self.actor.features(self.tensor(observation), self.tensor(goal)))
-        logs = log_probability(mean, self.config.noise_std, self.tensor(action))
+        logs = log_probability(mean, self._noise_std, self.tensor(action))
         found: Array32 = logs.cpu().numpy()
         return found
 

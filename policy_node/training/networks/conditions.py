@@ -19,6 +19,8 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array32
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.configuration import groups
+from policy_node.training.configuration.config import TrainConfig
 
 Goals = NDArray[np.float64]
 # Names of the layer that takes the inputs, in actors and critics alike.
@@ -108,15 +110,22 @@ class Horizon:
 Condition = Threshold | Horizon
 """What a value is conditioned on, beside state, action and goal."""
 
-# The input at which an actor acts: the threshold that is trained for; a whole episode left.
-ACTING_INPUT = {'threshold': 0.0, 'horizon': 1.0}
+
+def acting_input(config: TrainConfig) -> float | None:
+    """Return the input at which an actor acts; None without a condition.
+
+    That is the threshold that is trained for, or a whole episode left.
+    """
+    if config.find(groups.Threshold):
+        return 0.0
+    return 1.0 if config.find(groups.Horizon) else None
 
 
-def make_condition(kind: str, metric: GoalMetric, widest: float) -> Condition | None:
-    """Returns the condition called `kind`; None for `none`."""
-    if kind == 'threshold':
-        return Threshold(metric, widest)
-    if kind == 'horizon':
+def make_condition(config: TrainConfig, metric: GoalMetric) -> Condition | None:
+    """Return the condition of a run, or None."""
+    if threshold := config.find(groups.Threshold):
+        return Threshold(metric, threshold.widest_threshold)
+    if config.find(groups.Horizon):
         return Horizon(metric.spec.episode_ticks, metric.reward)
     return None
 

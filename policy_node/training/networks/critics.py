@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Advantages, Critics
 
 # Share of the running statistics that one batch replaces (CrossQ, arXiv 1902.05605: 0.01).
 _MOMENTUM = 0.01
@@ -167,11 +168,14 @@ def make_critic(config: TrainConfig, features: int, shape: NetworkShape) -> nn.M
         features: Length of the features, a condition included.
         shape: Of the actor; hidden layers are the same.
     """
-    if config.advantage:
-        return AdvantageCritic(features, shape, config.norm, config.tick_share)
+    options = config.find(Critics) or Critics()
+    if config.find(Advantages):
+        return AdvantageCritic(features, shape, options.norm, config.tick_share)
     inputs = features + shape.action_size
-    members = [Critic(inputs, shape, config.norm, config.quantiles) for _ in range(config.critics)]
-    return members[0] if config.critics == 1 else Ensemble(members)
+    members = [
+        Critic(inputs, shape, options.norm, options.quantiles) for _ in range(options.critics)
+    ]
+    return members[0] if options.critics == 1 else Ensemble(members)
 
 
 def _add_batch_norm(network: MLP) -> None:

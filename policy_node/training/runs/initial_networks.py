@@ -10,8 +10,10 @@ from torch import Tensor
 from msgs_spec.tasks import task_spec
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.flat import to_flat
+from policy_node.training.configuration.groups import Critics
 from policy_node.training.learners.actor_critic import ActorCritic
-from policy_node.training.networks.conditions import first_weights, with_input
+from policy_node.training.networks.conditions import acting_input, first_weights, with_input
 from policy_node.training.networks.critics import (
     Ensemble,
     count_critics,
@@ -78,10 +80,10 @@ class InitialNetworks:
         Raises:
             ValueError: One line names the sizes of both.
         """
-        ours = described(network_shape(config), config.goal_features)
+        ours = described(network_shape(config), config.network.goal_features)
         theirs = described(self.shape, self.goal_features)
-        if can_widen(self.shape.hidden_sizes, config.hidden_sizes):
-            theirs['hidden_sizes'] = config.hidden_sizes
+        if can_widen(self.shape.hidden_sizes, config.network.hidden_sizes):
+            theirs['hidden_sizes'] = config.network.hidden_sizes
         differing = [
             f'{name} {old}, now {ours[name]}' for name, old in theirs.items() if old != ours[name]
         ]
@@ -116,18 +118,19 @@ class InitialNetworks:
             for weight in changed.values():
                 weight[:, inputs] = 0.0
             fitted = replace(self, tensors=self.tensors | changed)
-        if config.condition != 'none':
+        if acting_input(config) is not None:
             tensors = with_input(fitted.tensors, shape.feature_size)
             fitted = replace(fitted, tensors=tensors)
-        values = {name: getattr(config, name) for name in self.valued_by}
-        if config.norm != self.norm or values != self.valued_by:
+        critic = config.find(Critics) or Critics()
+        values = {name: to_flat(config)[name] for name in self.valued_by}
+        if critic.norm != self.norm or values != self.valued_by:
             fitted = fitted.without_critic()
         else:
-            fitted = fitted.with_critics(config.critics)
-        if config.hidden_sizes == shape.hidden_sizes:
+            fitted = fitted.with_critics(critic.critics)
+        if config.network.hidden_sizes == shape.hidden_sizes:
             return fitted
-        wider = replace(shape, hidden_sizes=config.hidden_sizes)
-        tensors = widened(fitted.tensors, config.hidden_sizes)
+        wider = replace(shape, hidden_sizes=config.network.hidden_sizes)
+        tensors = widened(fitted.tensors, config.network.hidden_sizes)
         return replace(fitted, tensors=tensors, shape=wider)
 
     def without_critic(self) -> InitialNetworks:

@@ -12,10 +12,10 @@ from torch import Tensor
 from policy_node.policies import checkpoint
 from policy_node.policies.checkpoint import ActorInfo
 from policy_node.policies.shipped import actor_path
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.config_rules import unusual_networks
-from policy_node.training.configuration.config_values import config_from_dict
-from policy_node.training.networks.conditions import ACTING_INPUT, without_input
+from policy_node.training.configuration.config import TrainConfig, unusual_networks
+from policy_node.training.configuration.flat import config_from_dict, to_flat
+from policy_node.training.configuration.groups import Critics
+from policy_node.training.networks.conditions import acting_input, without_input
 from policy_node.training.networks.shape_from_config import network_shape
 from policy_node.training.runs.initial_networks import VALUED_BY, InitialNetworks
 from policy_node.training.runs.mean_networks import mean_of
@@ -69,7 +69,7 @@ def _of_run(folder: Path) -> InitialNetworks:
         'init_from': state.extra.get('init_from', {}),
     }
     shape = network_shape(config)
-    kind = config.goal_features, config.norm
+    kind = config.network.goal_features, _norm(config)
     return InitialNetworks(tensors, shape, *kind, origin, _valued_by(config))
 
 
@@ -99,7 +99,7 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         config = config_from_dict(state.extra['config'])
         _require_usual(config, str(source))
         _require_critic_of(info, path, config, source)
-        norm, valued_by = config.norm, _valued_by(config)
+        norm, valued_by = _norm(config), _valued_by(config)
         critic = _unconditioned(part_of(state.tensors, 'critic'), config)
         tensors |= {f'critic.{key}': value for key, value in critic.items()}
     origin = {
@@ -117,7 +117,7 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
 def _require_critic_of(info: ActorInfo, path: Path, config: TrainConfig, source: Path) -> None:
     """Refuses a critic that was not trained with the actor it lies beside."""
     for name in _SHARED:
-        of_actor, of_critic = getattr(info, name), getattr(config, name)
+        of_actor, of_critic = getattr(info, name), to_flat(config)[name]
         if of_actor != of_critic:
             raise ValueError(
                 f'{source} is the critic of another actor than {path}: '
@@ -126,15 +126,20 @@ def _require_critic_of(info: ActorInfo, path: Path, config: TrainConfig, source:
 
 
 def _valued_by(config: TrainConfig) -> dict[str, Any]:
-    return {name: getattr(config, name) for name in VALUED_BY}
+    return {name: to_flat(config)[name] for name in VALUED_BY}
+
+
+def _norm(config: TrainConfig) -> str:
+    return (config.find(Critics) or Critics()).norm
 
 
 def _unconditioned(tensors: dict[str, Tensor], config: TrainConfig) -> dict[str, Tensor]:
     """Networks of a run as they are at the condition under which its actor acts."""
-    if config.condition == 'none':
+    value = acting_input(config)
+    if value is None:
         return tensors
     column = network_shape(config).feature_size
-    return without_input(tensors, column, ACTING_INPUT[config.condition])
+    return without_input(tensors, column, value)
 
 
 def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:

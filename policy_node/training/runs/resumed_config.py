@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.config_values import config_from_dict
+from policy_node.training.configuration.flat import config_from_dict, to_flat
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.runs.training_state import read_state
 
@@ -40,11 +40,11 @@ def resumed_config(
     for name, chosen in (('task', task), ('recipe', recipe)):
         if chosen not in (None, stored.get(name)):
             raise ValueError(f'{folder} is a run of {stored.get(name)}, not of {chosen}')
-    before, config = config_from_dict(stored), config_from_dict({**stored, **changes})
+    before, config = config_from_dict(stored), config_from_dict(stored, **changes)
     fixed = {name: 'networks' for name in _NETWORK_FIELDS}
     fixed |= {name: 'experience' for name in _EXPERIENCE_FIELDS}
     for name, kind in fixed.items():
-        old, new = getattr(before, name), getattr(config, name)
+        old, new = to_flat(before)[name], to_flat(config)[name]
         if old != new:
             raise ValueError(f'{folder} has {kind} of {name} {old!r}, which stay; not {new!r}')
     return config

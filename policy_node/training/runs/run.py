@@ -113,12 +113,12 @@ def train_run(
         CommandError: If training failed; the last checkpoint is kept.
     """
     require_extra('train')
-    networks = _initial_networks(config) if config.init_from and not resume else None
+    networks = _initial_networks(config) if config.network.init_from and not resume else None
     with lock_run(output) if is_first_worker() else contextlib.nullcontext():
         if not resume and (output / STATE_FILE).exists():
             raise UsageError(f'{output} holds a run; continue it with --resume or choose another')
         try:
-            workers = join_workers(choose_device(config.device))
+            workers = join_workers(choose_device(config.machine.device))
             trainer = Trainer(config, output, workers, command, source_revision(), networks)
             if resume:
                 trainer.resume(output / STATE_FILE)
@@ -174,7 +174,7 @@ def _without_memory(error: MemoryError | RuntimeError) -> Exception:
 def _too_large(trainer: Trainer) -> str:
     """Warns of a replay that this worker's memory will not hold, which ends a run hours later."""
     replay = trainer.experience.replay
-    left = max(trainer.config.total_steps - trainer.counters.env_steps, 0)
+    left = max(trainer.config.run.total_steps - trainer.counters.env_steps, 0)
     episodes = len(replay) + trainer.workers.share(left) // replay.ticks
     needed = replay.bytes_of(episodes) - replay.bytes_of(len(replay))
     return why_too_large(needed, available_memory())
@@ -200,10 +200,10 @@ def _train(
         if not resume and (said := set_former_run_aside(output)):
             complain(NAME, said)
         # One line for each part; of a run that was killed before anything was saved there is none.
-        if not resume or counters.env_steps < config.total_steps:
+        if not resume or counters.env_steps < config.run.total_steps:
             with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
                 file.write(command + '\n')
-        limits = config.total_steps, config.time_limit
+        limits = config.run.total_steps, config.run.time_limit
         quiet = caller is not None and caller.quiet
         log = RunLog(output, *limits, counters.env_steps, quiet=quiet, on_row=tell)
     try:
@@ -249,11 +249,13 @@ def lock_run(folder: Path) -> Iterator[None]:
 def _initial_networks(config: TrainConfig) -> InitialNetworks:
     """Reads the networks to start from."""
     try:
-        networks = read_initial_networks(config.init_from).fitted(config)
+        networks = read_initial_networks(config.network.init_from).fitted(config)
     except ValueError as error:
         raise UsageError(str(error)) from None
     if not networks.has_critic:
-        complain(NAME, f'{config.init_from} has no critic for this run: a new one learns first')
+        complain(
+            NAME, f'{config.network.init_from} has no critic for this run: a new one learns first'
+        )
     return networks
 
 

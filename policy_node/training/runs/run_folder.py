@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo
 from policy_node.training.collection.frame_skip import plain_actor
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.flat import to_flat
 from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.networks.normalizer import RunningStatistics
 from policy_node.training.runs.training_state import Counters, save_state
@@ -109,18 +109,18 @@ class RunFolder:
             observation_layout=checkpoint.observation_layout(spec),
             goal_size=spec.goal.size,
             action_size=spec.robot.action_size,
-            hidden_sizes=config.hidden_sizes,
-            layer_norm=config.layer_norm,
-            control_hz=config.control_hz,
+            hidden_sizes=config.network.hidden_sizes,
+            layer_norm=config.network.layer_norm,
+            control_hz=config.collect.control_hz,
             seed=config.seed,
             command=self.command,
             source_revision=self.source_revision,
             env_steps=env_steps,
-            config=dataclasses.asdict(config),
+            config=to_flat(config),
             success=success or {},
-            goal_features=config.goal_features,
+            goal_features=config.network.goal_features,
             init_from=self.init_from,
-            past_actions=config.past_actions,
+            past_actions=config.network.past_actions,
         )
         checkpoint.save(self.path / name, plain_actor(actor, config), info)
 
@@ -132,6 +132,6 @@ class RunFolder:
         self, learner: ActorCritic, statistics: dict[str, RunningStatistics], counters: Counters
     ) -> None:
         """Writes everything that a resumed run needs but the replay."""
-        config = dataclasses.asdict(self.config)
+        config = to_flat(self.config)
         extra = {'config': config, 'command': self.command, 'init_from': self.init_from}
         save_state(self.path / STATE_FILE, learner, statistics, counters, extra)

@@ -57,7 +57,7 @@ class Saver:
             counters: How far the run is, with the best evaluation so far.
             env_steps: Environment steps behind the actor; None are those of the run.
         """
-        rule = self._config.success_rule
+        rule = self._config.collect.success_rule
         success = success_rate(outcomes, rule)
         mean_return = float(outcomes.episode_return.mean())
         if (success, mean_return) > (counters.best_success, counters.best_return):
@@ -107,8 +107,10 @@ class Saver:
     def _is_measured_otherwise(self, found: Mapping[str, Any]) -> bool:
         """Whether evaluations of this run say something else than this one, or say it better."""
         config, episodes = self._config, found.get('episodes')
-        fewer = is_finite(episodes) and episodes < config.evaluation_episodes
-        return fewer or found.get('rule', config.success_rule) != config.success_rule
+        fewer = is_finite(episodes) and episodes < config.run.evaluation_episodes
+        return (
+            fewer or found.get('rule', config.collect.success_rule) != config.collect.success_rule
+        )
 
     def _decided_by(self, found: Mapping[str, Any]) -> tuple[float, float] | None:
         """Success and return of an evaluation as those of this run; None if it was none."""
@@ -124,7 +126,7 @@ class Saver:
     ) -> None:
         """Writes a checkpoint now and then, the replay more seldom; a full disk may empty."""
         now = time.monotonic()
-        if now - self._last_checkpoint < self._config.checkpoint_seconds:
+        if now - self._last_checkpoint < self._config.run.checkpoint_seconds:
             return
         try:
             due = now - self._last_replay >= REPLAY_SECONDS
@@ -147,7 +149,7 @@ class Saver:
         self._last_checkpoint = time.monotonic()
         if with_replay:
             self._last_replay = self._last_checkpoint
-            kept = self._workers.share(self._config.kept_transitions)
+            kept = self._workers.share(self._config.replay.kept_transitions)
             save_replay(self.folder.replay_file(self._workers.rank), experience.replay, kept)
         if self._workers.is_first:
             self.folder.save_actor(LATEST_FILE, learner.evaluation_actor(), counters.env_steps)

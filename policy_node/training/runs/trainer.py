@@ -18,6 +18,7 @@ from policy_node.policies.actor import Actor
 from policy_node.training.collection.collector import Collector
 from policy_node.training.collection.simulations import make_simulation
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Critics, Ppo
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator, success_rate
 from policy_node.training.experience.sampling import make_sampler
@@ -34,7 +35,6 @@ from policy_node.training.runs.finite_checks import (
     require_finite_networks,
 )
 from policy_node.training.runs.initial_networks import CRITIC_FIRST, InitialNetworks
-from policy_node.training.runs.narrowing import Narrowing
 from policy_node.training.runs.progress_row import progress_row
 from policy_node.training.runs.run_clock import RunClock
 from policy_node.training.runs.run_folder import RunFolder
@@ -89,7 +89,7 @@ class Trainer:
         origin = {} if init_from is None else init_from.origin
         folder = RunFolder(output, config, command, source_revision, origin)
         self._saver = Saver(folder, workers)
-        self.device = choose_device(config.device)
+        self.device = choose_device(config.machine.device)
         self._simulation_threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
         torch.manual_seed(config.seed)
@@ -107,9 +107,9 @@ class Trainer:
 
     def _build_simulations(self) -> None:
         config, share = self.config, self.workers.share
-        threads, num_envs = self._simulation_threads, share(config.num_envs)
+        threads, num_envs = self._simulation_threads, share(config.collect.num_envs)
         self.simulation = make_simulation(config, num_envs, threads)
-        count = min(num_envs, config.evaluation_episodes)
+        count = min(num_envs, config.run.evaluation_episodes)
         self._evaluator = Evaluator(make_simulation(config, count, threads), config)
         self.spec = self.simulation.spec
 
@@ -132,7 +132,6 @@ class Trainer:
             config, spec, self.device, self.workers, sampler, generator
         )
         require_readable(self.learner)
-        self._narrowing = Narrowing(config, self.simulation.metric, self.experience, self.workers)
 
     def _part_noise(self) -> None:
         """Lets workers that began with the same networks draw noise of their own."""
@@ -157,10 +156,10 @@ class Trainer:
         state = load_state(path, self.learner, self.experience.statistics)
         self.counters = counters = state.counters
         # Sooner where evaluations come more often from now on; else it is due before that anyway.
-        soonest = counters.env_steps + self.config.evaluate_every
+        soonest = counters.env_steps + self.config.run.evaluate_every
         counters.next_evaluation = min(counters.next_evaluation, soonest)
         self._part_noise()
-        self._narrowing.resume(self.counters)
+        self._narrow()
         origin = state.extra.get('init_from', {})
         self._saver.folder = replace(self._saver.folder, init_from=origin)
         self._let_critic_learn_first()
@@ -171,7 +170,7 @@ class Trainer:
             self._saver.keep_best(outcomes, actor, self.counters, info.env_steps)
         # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
         self.experience.generator = self._seed(self.counters.env_steps)
-        limits = (self.counters.env_steps, self.config.replay_transitions, MOST_REFILLED)
+        limits = (self.counters.env_steps, self.config.replay.replay_transitions, MOST_REFILLED)
         held = self.experience.replay.capacity * self.spec.episode_ticks
         self._steps_to_refill = min(self.workers.share(min(limits)), held)
         file = self._saver.folder.replay_file(self.workers.rank)
@@ -186,9 +185,10 @@ class Trainer:
 
     def _let_critic_learn_first(self) -> None:
         """Holds an actor back that began without all its critics."""
-        origin, critics = self._saver.folder.init_from, self.config.critics
+        origin = self._saver.folder.init_from
+        critics = (self.config.find(Critics) or Critics()).critics
         known = origin.get('critics', critics if origin.get('critic', True) else 0)
-        if known < critics and self.config.critic_first == 0:
+        if known < critics and self.config.learner.critic_first == 0:
             self.learner.critic_first = CRITIC_FIRST
 
     def add_experience(self, episodes: Episodes) -> None:
@@ -204,7 +204,7 @@ class Trainer:
         share = episodes.select(rows)
         self.experience.replay.add(share)
         if self.counters.env_steps == 0:
-            self.experience.normalize(share, self.learner.actor, env_steps=0)
+            self.experience.normalize(share, self.learner.actor)
 
     def train(self, log: RunLog | None = None) -> str:
         """Runs until a limit is reached or `stop` is called; returns why it ended.
@@ -219,7 +219,7 @@ class Trainer:
             return f'{reason} before; give another {field} to go on'
         clock = RunClock(self.counters)
         with _collecting_thread() as executor:
-            submit = executor.submit if self.config.overlap else _run_now
+            submit = executor.submit if self.config.machine.overlap else _run_now
             collected = self._collect_first(submit)
             if collected is None:
                 self.save()
@@ -229,7 +229,7 @@ class Trainer:
                 before = time.monotonic()
                 self._absorb(collected)
                 job = None
-                if self.config.overlap:
+                if self.config.machine.overlap:
                     # At the end the actor after this cycle is evaluated, not the one before it.
                     is_last = self._ended() is not None
                     job = submit(self._collect, *self._prepare_collection(may_evaluate=not is_last))
@@ -238,7 +238,7 @@ class Trainer:
                     job = submit(self._collect, *self._prepare_collection())
                 collected = self._collect_or_explain(job)
                 clock.write(self.counters)
-                knows = self.counters.updates > 0 or bool(self.config.init_from)
+                knows = self.counters.updates > 0 or bool(self.config.network.init_from)
                 if collected.evaluation is None and knows and self._ended():
                     # Noise and learning rate have fallen, and nothing else would measure it.
                     last = self._actor_to_evaluate()
@@ -255,7 +255,7 @@ class Trainer:
     def _warn_of_rewards(self, episodes: Episodes) -> None:
         """Says that values of a task's own rewards are clipped where these are above 0."""
         metric = self.simulation.metric
-        if self.config.algorithm == 'ppo' or not metric.has_own_reward:
+        if isinstance(self.config.learner, Ppo) or not metric.has_own_reward:
             return
         achieved = episodes.achieved_goal[:, -1].astype(np.float64)
         highest = metric.reward(achieved, episodes.desired_goal.astype(np.float64)).max()
@@ -288,9 +288,9 @@ class Trainer:
         self.collector.proposer = self.learner.proposer()
         actor, evaluated = self.learner.acting_actor(), None
         if may_evaluate and counters.updates > 0 and steps >= counters.next_evaluation:
-            counters.next_evaluation = steps + self.config.evaluate_every
+            counters.next_evaluation = steps + self.config.run.evaluate_every
             evaluated = self._actor_to_evaluate()
-        return actor, steps < self.config.random_steps, evaluated
+        return actor, steps < self.config.learner.exploration.random_steps, evaluated
 
     def _actor_to_evaluate(self) -> Actor | None:
         """The actor as it is evaluated now; None where another worker does it."""
@@ -311,8 +311,8 @@ class Trainer:
 
     def _exploration(self) -> float:
         """Share of noise and random actions for a run as far as this one."""
-        left = 3.0 * (1.0 - self.counters.env_steps / self.config.total_steps)
-        final = self.config.final_exploration
+        left = 3.0 * (1.0 - self.counters.env_steps / self.config.run.total_steps)
+        final = self.config.learner.exploration.final_exploration
         return final + (1.0 - final) * min(max(left, 0.0), 1.0)
 
     def _collect_or_explain(self, job: Future[Collected]) -> Collected:
@@ -328,20 +328,28 @@ class Trainer:
         count = self.workers.sum(torch.tensor([len(episodes)])).item()
         self.counters.episodes += int(count)
         self.counters.env_steps += int(count) * self.spec.episode_ticks
-        self.experience.normalize(episodes, self.learner.actor, self.counters.env_steps)
-        self._narrowing.go_on(episodes, int(count), self.counters)
+        self.experience.normalize(episodes, self.learner.actor)
+        self._narrow()
+
+    def _narrow(self) -> None:
+        """Lets goals that are rewarded become as narrow as they are now."""
+        self.experience.narrow(self.counters.env_steps / self.config.run.total_steps)
 
     def _learn(self) -> list[Losses]:
-        first = self.workers.share(self.config.learning_starts) if self.counters.updates == 0 else 0
+        first = (
+            self.workers.share(self.config.replay.learning_starts)
+            if self.counters.updates == 0
+            else 0
+        )
         # The replay holds whole episodes.
         first = min(first, self.experience.replay.capacity * self.spec.episode_ticks)
         if self.workers.any(self.experience.transitions < max(first, 1)):
             return []
         steps = self.counters.env_steps
-        self.learner.set_progress(steps / self.config.total_steps)
+        self.learner.set_progress(steps / self.config.run.total_steps)
         losses = [
             self.learner.update(self.experience.batch(steps))
-            for _ in range(self.config.updates_per_cycle)
+            for _ in range(self.config.learner.updates_per_cycle)
         ]
         self.learner.average()
         self.counters.updates = self.learner.updates
@@ -358,12 +366,12 @@ class Trainer:
     def _ended(self) -> tuple[str, str] | None:
         """The field by which the run is over, and why in words; None if it is not."""
         config, counters = self.config, self.counters
-        if 0 < config.success_target <= counters.best_success:
-            return 'success_target', f'success target {config.success_target:g} reached'
-        if counters.env_steps >= config.total_steps:
-            return 'total_steps', f'{config.total_steps:,} environment steps done'
-        if 0 < config.time_limit <= counters.seconds:
-            return 'time_limit', f'time limit of {config.time_limit:g} s reached'
+        if 0 < config.run.success_target <= counters.best_success:
+            return 'success_target', f'success target {config.run.success_target:g} reached'
+        if counters.env_steps >= config.run.total_steps:
+            return 'total_steps', f'{config.run.total_steps:,} environment steps done'
+        if 0 < config.run.time_limit <= counters.seconds:
+            return 'time_limit', f'time limit of {config.run.time_limit:g} s reached'
         return None
 
     def _reason_to_stop(self) -> str:
@@ -385,7 +393,7 @@ class Trainer:
         workers, batch = self.workers.world_size, self.experience.batch_size
         steps = self.simulation.num_envs * self.spec.episode_ticks * workers
         success, outcomes = collected.train_success, collected.evaluation
-        rule = self.config.success_rule
+        rule = self.config.collect.success_rule
         row = progress_row(self.counters, success, outcomes, rule, losses)
         row['steps_per_second'] = steps / seconds
         row['samples_per_second'] = len(losses) * batch * workers / seconds

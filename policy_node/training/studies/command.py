@@ -45,9 +45,8 @@ from node_runtime.command_line import (
 )
 from policy_node.policies.files import write_file
 from policy_node.policies.python_policy import is_python_name, working_directory_first
-from policy_node.training.configuration.config_options import with_assignments
-from policy_node.training.configuration.config_rules import FROM_NOTHING
-from policy_node.training.configuration.config_values import whole
+from policy_node.training.configuration.flat import whole, with_assignments
+from policy_node.training.configuration.recipes import FROM_NOTHING
 from policy_node.training.runs.run_folder import BEST_FILE
 from policy_node.training.runs.shipping import ship
 from policy_node.training.studies.paper import ARMS, PAPER, best_jobs, reduced_budget

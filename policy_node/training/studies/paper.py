@@ -85,7 +85,7 @@ def reduced_budget(task: str) -> dict[str, Any]:
     updates instead of 40, because there are so few.
     """
     small = task == 'FetchReach'
-    full = recipe_config(task, 'paper').total_steps
+    full = recipe_config(task, 'paper').run.total_steps
     return {
         'total_steps': full * 12 // (1000 if small else 100),
         'num_envs': 76,

@@ -6,7 +6,6 @@ an ordinary training: on one thread the same seed gives the same bits.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from typing import Any
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.config_values import config_from_dict
+from policy_node.training.configuration.flat import changed, config_from_dict, to_flat
 from policy_node.training.configuration.recipes import recipe_config, steps_at_rate
 from policy_node.training.runs.run_folder import PROGRESS_FILE, STATE_FILE
 from policy_node.training.runs.run_log import read_progress
@@ -142,7 +141,7 @@ class Job:
         """Whether the budget is spent and saved. The log may be ahead of the saved state."""
         if not self.has_checkpoint:
             return False
-        return read_counters(self.folder / STATE_FILE).env_steps >= self.config.total_steps
+        return read_counters(self.folder / STATE_FILE).env_steps >= self.config.run.total_steps
 
     @property
     def is_ready(self) -> bool:
@@ -152,7 +151,7 @@ class Job:
     @property
     def status(self) -> str:
         """One line of progress."""
-        log, total = self.folder / PROGRESS_FILE, self.config.total_steps
+        log, total = self.folder / PROGRESS_FILE, self.config.run.total_steps
         rows = read_progress(log) if log.is_file() else []
         evaluated = [row['eval_success'] for row in rows if 'eval_success' in row]
         success = f'{evaluated[-1]:.3f}' if evaluated else '-'
@@ -187,7 +186,7 @@ def run_name(task: str, arm: str, seed: int) -> str:
 
 def to_settings(config: TrainConfig) -> dict[str, Any]:
     """Return a configuration as JSON values."""
-    values: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
+    values: dict[str, Any] = json.loads(json.dumps(to_flat(config)))
     return values
 
 
@@ -234,8 +233,8 @@ def make_jobs(
     for seed in seeds:
         for arm in arms:
             config = recipe_config(task, **_at_rate({**values, **arm.changes, 'seed': seed}))
-            factors = {name: getattr(config, name) * by for name, by in arm.factors.items()}
-            config = dataclasses.replace(config, **factors)
+            factors = {name: to_flat(config)[name] * by for name, by in arm.factors.items()}
+            config = changed(config, **factors)
             folder = output / task / arm.name / f'seed{seed}'
             jobs.append(Job(arm, config, folder, final_episodes=episodes))
     return jobs

@@ -24,6 +24,7 @@ from node_runtime.command_line import (
     complain_from_handler,
 )
 from node_runtime.signals import discard_unread_output, end_with_parent
+from policy_node.training.configuration.flat import changed
 from policy_node.training.runs.run import RunTakenError, lock_run, train_run
 from policy_node.training.studies.measures import measure_run
 from policy_node.training.studies.store import add_run, holds, read_runs
@@ -291,11 +292,11 @@ class Ray:
 
     def start(self, job: Job) -> None:
         """Submit the job to the cluster."""
-        cores = max(job.config.simulation_threads, job.config.torch_threads, 1)
-        config, start = job.config, job.config.init_from
+        cores = max(job.config.machine.simulation_threads, job.config.machine.torch_threads, 1)
+        config, start = job.config, job.config.network.init_from
         # Paths must hold in every working directory; shipped actors keep their names.
         if start and Path(start).exists():
-            config = dataclasses.replace(config, init_from=str(Path(start).resolve()))
+            config = changed(config, init_from=str(Path(start).resolve()))
         absolute = dataclasses.replace(job, config=config, folder=job.folder.resolve())
         remote = self._attempt.options(num_cpus=cores)
         self._running[remote.remote(absolute, self._report, self._command)] = job

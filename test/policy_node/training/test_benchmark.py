@@ -68,7 +68,7 @@ def test_jobs_come_seed_by_seed_with_all_variants(tmp_path: Path) -> None:
     ]
     assert len({job.folder for job in jobs}) == len(jobs) == 16
     assert jobs[-1].folder == tmp_path / 'FetchPush' / 'ddpg_dense' / 'seed4'
-    arms = {(job.arm.name, job.config.reward_type, job.config.strategy) for job in jobs}
+    arms = {(job.arm.name, job.config.reward_type, job.config.goals.strategy) for job in jobs}
     assert arms == {
         ('her_sparse', 'sparse', 'future'),
         ('her_dense', 'dense', 'future'),
@@ -86,7 +86,9 @@ def test_all_jobs_but_for_arm_and_seed_have_one_configuration(tmp_path: Path) ->
         return [getattr(config, name) for name in TrainConfig.__slots__ if name not in own]
 
     assert all(shared(job.config) == shared(jobs[0].config) for job in jobs)
-    assert jobs[0].config.evaluation_episodes <= jobs[0].config.num_envs, 'else cut short'
+    assert jobs[0].config.run.evaluation_episodes <= jobs[0].config.collect.num_envs, (
+        'else cut short'
+    )
 
 
 def test_the_page_of_the_paper_shows_a_budget_for_two_cores_on_every_task() -> None:

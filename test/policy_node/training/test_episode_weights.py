@@ -129,7 +129,7 @@ def test_a_batch_follows_the_configuration() -> None:
     achieved[..., 0] = np.arange(3)[:, None]
     episodes = pen_episodes(achieved)
     reward = lambda achieved, desired: -np.ones(len(achieved))  # noqa: E731
-    sampler = TransitionSampler(reward, config.gamma)
+    sampler = TransitionSampler(reward, config.learner.gamma)
     experience = Experience(config, PEN, Workers(), sampler, np.random.default_rng(0))
     experience.replay.add(episodes)
     batch = experience.batch(env_steps=0)

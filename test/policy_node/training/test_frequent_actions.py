@@ -319,7 +319,11 @@ def test_the_best_recipe_adds_no_longer_returns_to_what_is_of_one_tick(
     changes: dict[str, object],
 ) -> None:
     config = recipe_config('FetchPush', 'best', control_hz=250.0, **changes)
-    assert (config.discount, config.noise_seconds, config.n_step) == ('tick', 0.0, 1)
+    assert (config.learner.discount, config.learner.exploration.noise_seconds, config.n_step) == (
+        'tick',
+        0.0,
+        1,
+    )
 
 
 @pytest.mark.parametrize('control_hz', [0.0, -25.0, float('nan'), float('inf'), 60.0])

@@ -185,8 +185,8 @@ def test_a_best_actor_that_was_measured_otherwise_is_measured_anew(
     assert trainer.counters.best_success == found.success['last_step'] < 1.0
     assert trainer.counters.best_return == found.success['mean_return'] < -1.0
     assert (found.success['episodes'], found.success['rule']) == (
-        trainer.config.evaluation_episodes,
-        trainer.config.success_rule,
+        trainer.config.run.evaluation_episodes,
+        trainer.config.collect.success_rule,
     )
     assert found.env_steps == info.env_steps, 'it is the actor that it was'
 

@@ -312,7 +312,7 @@ def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_p
     trainer = Trainer(config, tmp_path, Workers())
     trainer.experience.replay.add(trainer.collector.collect(trainer.learner.actor, random=True)[0])
     for env_steps, threshold in ((0, 0.2), (1_000, 0.1), (2_000, 0.05), (3_000, 0.05)):
-        trainer.experience.narrow(env_steps / config.total_steps)
+        trainer.experience.narrow(env_steps / config.run.total_steps)
         batch = trainer.experience.batch(env_steps)
         position = batch.next_observation[:, :3].astype(np.float64)
         distance = np.linalg.norm(position - batch.goal, axis=-1)
@@ -346,7 +346,7 @@ def test_goals_narrow_on_only_after_cycles_that_met_them(
     changes = {'first_distance': first_distance, 'narrow_above': above, 'reward_grades': grades}
     config = small_config(total_steps=1_200, **changes)
     trainer = Trainer(config, tmp_path, Workers())
-    log = RunLog(tmp_path, config.total_steps, config.time_limit)
+    log = RunLog(tmp_path, config.run.total_steps, config.run.time_limit)
     trainer.train(log)
     log.close()
     assert trainer.counters.narrowing_steps == narrowing_steps
@@ -437,7 +437,7 @@ def test_weights_that_a_step_has_ruined_stop_the_run_before_they_act_or_are_save
         nonlocal count
         count += 1
         losses = update(batch)  # type: ignore[arg-type]
-        if count == 3 * config.updates_per_cycle:
+        if count == 3 * config.learner.updates_per_cycle:
             with torch.no_grad():
                 trainer.learner.actor.network.output.weight.fill_(float('inf'))
         return losses

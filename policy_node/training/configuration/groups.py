@@ -1,0 +1,271 @@
+"""Learners, rewards and what studies add to them: a group exists only where it is switched on.
+
+`marks` are the flat fields that stand for a group: `condition=threshold` selects `Threshold`. A
+group without marks is selected by its first field, where that differs from its default.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+from policy_node.training.configuration.checked import Below1, Checked, Range, Share, Total
+
+
+@dataclass(frozen=True, slots=True)
+class Sparse(Checked):
+    """-1 until success, then 0."""
+
+    reward_distance: Annotated[float, Range(1e-3, 1000)] = 1.0
+    """Share of the task's success distance within which the sparse reward of training is 0. Below 1
+    the actor learns to come closer than necessary; evaluation keeps the task's distance."""
+    reward_rotation: Annotated[float, Range(1e-3, 1000)] = 1.0
+    """The same for the task's success rotation."""
+    first_distance: Annotated[float, Range(1, 1000)] = 1.0
+    """Factor on `reward_distance` at the start of the run; it falls geometrically to 1 over the
+    first two thirds. Coarse goals, which are met often, come first."""
+    first_rotation: Annotated[float, Range(1, 1000)] = 1.0
+    """The same for `reward_rotation`."""
+    reward_grades: tuple[float, ...] = ()
+    """Rising multiples of the success thresholds, as `.5,1,2,4`. The reward of training becomes the
+    share of them that the distance meets, times that of the rotation, minus 1."""
+
+    marks: ClassVar[dict[str, Any]] = {'reward_type': 'sparse'}
+
+    @property
+    def narrows(self) -> bool:
+        """Whether goals are met more easily at the start of a run than at its end."""
+        return self.first_distance != 1.0 or self.first_rotation != 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Dense(Checked):
+    """The negative distance."""
+
+    marks: ClassVar[dict[str, Any]] = {'reward_type': 'dense'}
+
+
+@dataclass(frozen=True, slots=True)
+class Exploration(Checked):
+    """Noise on collected actions."""
+
+    random_epsilon: Share = 0.3
+    """Probability of a uniformly random action."""
+    noise_std: Annotated[float, Range(0)] = 0.2
+    """Standard deviation of the Gaussian noise on other actions."""
+    final_exploration: Share = 1.0
+    """Share of `random_epsilon` and `noise_std` left at `total_steps`; both fall linearly in
+    the last third of the run. 1 keeps them constant."""
+    random_steps: Total = 0
+    """Steps with uniformly random actions before the policy acts."""
+    noise_seconds: Annotated[float, Range(0, 10)] = 0.0
+    """Seconds for which noise and random actions hold; 0 is one tick."""
+    parameter_noise: bool = False
+    """Noise on weights, which moves actions by `noise_std`, instead of noise on actions."""
+
+    def noise_ticks(self, control_hz: float) -> int:
+        """Return the number of ticks for which noise holds."""
+        return max(round(self.noise_seconds * control_hz), 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Critics(Checked):
+    """Networks that values come from."""
+
+    critics: Annotated[int, Range(1, 100)] = 1
+    """Critics that start differently; the actor follows their mean."""
+    aggregate: Literal['mean', 'min', 'truncated'] = 'mean'
+    """Target from several critics; `truncated` is the mean without the highest."""
+    norm: Literal['none', 'layer', 'batch'] = 'none'
+    """Normalisation of the critic's hidden layers; `batch` as CrossQ, without target networks.
+    `layer_norm` is for both networks."""
+    quantiles: Annotated[int, Range(1, 1000)] = 1
+    """Quantiles of the return that each critic learns; 1 is its mean. Targets take all of them
+    (`mean`) or leave out the highest 2 in 25 (`truncated`: TQC, arXiv 2005.04269)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Learner(Checked):
+    """Fields of every learner."""
+
+    batch_size: Annotated[int, Range(1, 1_000_000)] = 1024
+    """Transitions per update."""
+    updates_per_cycle: Annotated[int, Range(0, 100_000)] = 40
+    """Gradient updates after each cycle."""
+    learning_rate: Share = 1e-3
+    """Adam step size of actor and critic."""
+    final_learning_rate: Share = 1.0
+    """Share of `learning_rate` left at `total_steps`, falling linearly; 1 keeps it constant. The
+    network that imagines subgoals keeps the whole."""
+    actor_average: Below1 = 0.0
+    """Share of an average of actor weights kept each cycle. The average is evaluated and saved. 0
+    evaluates the actor itself."""
+    gamma: Below1 = 0.98
+    """Discount. Targets are clipped to [-1/(1-gamma), 0], as in the paper's code, with dense
+    rewards too, although these lie below -1 far from the goal."""
+    action_l2: Annotated[float, Range(0)] = 1.0
+    """Weight of the mean squared action in the actor loss."""
+    critic_first: Total = 0
+    """Updates of the critics before the actor learns too. 0 is 5,000 where `init_from` gives an
+    actor without its critic or fewer than `critics`, else none."""
+
+
+@dataclass(frozen=True, slots=True)
+class OffPolicy(Learner):
+    """Learners with a replay and target networks."""
+
+    polyak: Share = 0.95
+    """Share of the old target network kept by a target update."""
+    target_update_interval: Annotated[int, Range(1)] = 40
+    """Updates between target updates."""
+    policy_delay: Annotated[int, Range(1, 1000)] = 1
+    """Updates of the critic for each of the actor (TD3, arXiv 1802.09477); 2 takes three quarters
+    of the time."""
+    target: Literal['polyak', 'none'] = 'polyak'
+    """Networks of the targets: `polyak` (slow copies) or `none` (the learning networks)."""
+    discount: Literal['tick', 'time'] = 'tick'
+    """Unit of `gamma`: a `tick`, or `time`: 40 ms at any rate. The reward of a tick is then
+    multiplied by its share of 40 ms, so that values are equal at every rate."""
+    exploration: Exploration = Exploration()
+    critic: Critics = Critics()
+
+
+@dataclass(frozen=True, slots=True)
+class OneStep(Checked):
+    """Values of one step, for the task's goals alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class Returns(Checked):
+    """Returns of several steps."""
+
+    n_step: Annotated[int, Range(1, 100)] = 1
+    """Most steps of a return before it bootstraps."""
+    correction: Literal['none', 'lambda', 'cut'] = 'none'
+    """Correction of longer returns, whose actions are not the actor's: `lambda` (their mean is the
+    truncated lambda-return) or `cut` (they end before an action far from the actor's)."""
+    trace: Below1 = 0.7
+    """With `lambda`, the probability of going on after each step; with `ppo` its lambda."""
+    cut_distance: Annotated[float, Range(0, 2)] = 0.3
+    """With `cut`, the largest distance from the actor's action, root mean square."""
+
+
+@dataclass(frozen=True, slots=True)
+class Held(Checked):
+    """Actions with a length."""
+
+    longest_hold: Annotated[int, Range(1, 1000)] = 1
+    """Most ticks for which the actor holds an action while it collects; above 1 it learns how
+    long. The evaluated and saved actor decides at every tick."""
+
+
+@dataclass(frozen=True, slots=True)
+class Advantages(Checked):
+    """Values of states and advantages of actions apart."""
+
+    advantage: bool = False
+    """Critics learn values of states and advantages per 40 ms (DAU) instead of action values."""
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold(Checked):
+    """Values for a success threshold as well."""
+
+    widest_threshold: Annotated[float, Range(1, 10_000)] = 8.0
+    """Largest threshold of `condition=threshold`, in those of success. It should reach from the
+    start of episodes to their goals."""
+
+    marks: ClassVar[dict[str, Any]] = {'condition': 'threshold'}
+
+
+@dataclass(frozen=True, slots=True)
+class Horizon(Checked):
+    """Values for a number of steps left as well."""
+
+    marks: ClassVar[dict[str, Any]] = {'condition': 'horizon'}
+
+
+@dataclass(frozen=True, slots=True)
+class Density(Checked):
+    """Importance weights in the critic's loss, which remove the bias of hindsight."""
+
+    marks: ClassVar[dict[str, Any]] = {'importance': 'density'}
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen(Checked):
+    """The best of several future goals."""
+
+    goal_choice: Literal['uniform', 'bellman', 'uncertain'] = 'uniform'
+    """Choice among 8 future goals: `uniform` (any), `bellman` (largest error of the value) or
+    `uncertain` (largest difference between critics)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Imagined(Checked):
+    """Subgoals that the actor only imagines."""
+
+    subgoal_prior: Annotated[float, Range(0)] = 0.0
+    """Weight in the actor loss of the distance between its actions and those for an imagined
+    subgoal, halfway to the goal by value; 0 imagines none."""
+    imagination_interval: Annotated[int, Range(1, 1000)] = 1
+    """Actor updates for each update of the network that imagines subgoals, which costs almost as
+    much as one of actor and critic."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drop(Checked):
+    """Ticks after an object fell."""
+
+    ticks_after_drop: Annotated[int, Range(-1)] = -1
+    """Ticks after an object fell off the palm that are still learnt from; -1 is all."""
+    drop_is_lost: bool = False
+    """With `ticks_after_drop`, every tick after the last of them counts -1. Otherwise the learner
+    never sees that a drop is final."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ddpg(OffPolicy):
+    """Deep deterministic policy gradient with hindsight."""
+
+    values: OneStep | Returns | Held | Advantages | Threshold | Horizon | Density | Chosen = (
+        OneStep()
+    )
+    imagined: Imagined | None = None
+    drop: Drop | None = None
+
+    marks: ClassVar[dict[str, Any]] = {'algorithm': 'ddpg'}
+
+
+@dataclass(frozen=True, slots=True)
+class Hierarchical(OffPolicy):
+    """Two levels of DDPG."""
+
+    subgoal_every: Annotated[int, Range(0, 1000)] = 0
+    """Ticks for which a subgoal holds that a second, high level proposes to the actor while it
+    collects; 0 has none. The evaluated and saved actor is given the goal itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ppo(Learner):
+    """Proximal policy optimisation: each cycle's episodes once, also for goals in hindsight."""
+
+    noise_std: Annotated[float, Range(1e-6)] = 0.2
+    importance: Literal['none', 'decision'] = 'none'
+    """Weights of transitions: `decision` (with `ppo`) corrects that actions of a replayed episode
+    were for another goal; `density` (with `ddpg`), in the critic's loss, that a goal in hindsight
+    depends on where the transition led."""
+    trace: Below1 = 0.7
+    first_value: Annotated[float, Range(-1_000_000, 0)] = 0.0
+    """Value that the critic of `ppo` starts with. With -1 / (1 - gamma), the value of failing for
+    ever, no state looks good because it is new."""
+    first_action_gain: Share = 1.0
+    """Factor on the last layer of the actor of `ppo` at the start: near 0 it begins with noise
+    around no action, with any seed."""
+
+    marks: ClassVar[dict[str, Any]] = {'algorithm': 'ppo', 'random_epsilon': 0.0}
+
+    @property
+    def exploration(self) -> Exploration:
+        """The noise of the policy."""
+        return Exploration(random_epsilon=0.0, noise_std=self.noise_std)
