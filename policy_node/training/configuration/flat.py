@@ -30,8 +30,7 @@ from policy_node.training.configuration.checked import (
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Hierarchical, Learner, Ppo
 
-# Fields of earlier versions that changed nothing in any recipe or study. A stored run may have
-# them at these values.
+# Fields of earlier versions that no recipe and no study used, with their defaults.
 REMOVED = {
     'noise_spread': 0.0,
     'retry_failed': 0.0,
@@ -66,9 +65,10 @@ _MARK_MEANINGS = {
 RESEARCH = (
     'algorithm subgoal_every trace importance first_value first_action_gain gamble reward_distance '
     'reward_rotation first_distance first_rotation episode_weights random_steps noise_seconds '
-    'parameter_noise target discount critics aggregate norm quantiles n_step correction cut_distance longest_hold advantage '
-    'condition widest_threshold goal_choice subgoal_prior imagination_interval ticks_after_drop '
-    'drop_is_lost'
+    'parameter_noise target discount critics aggregate norm quantiles n_step correction '
+    'cut_distance longest_hold advantage condition widest_threshold goal_choice subgoal_prior '
+    'imagination_interval ticks_after_drop drop_is_lost reward_grades '
+    'critic_first'
 ).split()
 # Former and shorter names of options.
 _OTHER_NAMES = {'total_steps': ('--steps',), 'simulation_threads': ('--threads',)}
@@ -291,15 +291,18 @@ def _all_groups(group: type[Checked]) -> Iterator[type[Checked]]:
 def config_from_dict(values: Mapping[str, Any], **changes: Any) -> TrainConfig:
     """Rebuild a configuration that went through JSON; later fields have their default.
 
+    Fields that were removed since are ignored: `removed_fields` returns them.
+
     Raises:
-        ValueError: If a field is unknown, a value is not allowed, or the run used a field that was
-            removed since.
+        ValueError: If a field is unknown or a value is not allowed.
     """
     kept = {name: value for name, value in values.items() if name not in REMOVED}
-    for name, default in REMOVED.items():
-        if values.get(name, default) != default:
-            raise ValueError(f'{name} {values[name]!r} was removed in version 2.0')
     return from_flat(kept, **changes)
+
+
+def removed_fields(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a stored run that had an effect and were removed in version 2.0."""
+    return {n: values[n] for n, default in REMOVED.items() if values.get(n, default) != default}
 
 
 def typed_fields(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.flat import config_from_dict, to_flat
+from policy_node.training.configuration.flat import config_from_dict, removed_fields, to_flat
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.runs.training_state import read_state
 
@@ -40,6 +40,8 @@ def resumed_config(
     for name, chosen in (('task', task), ('recipe', recipe)):
         if chosen not in (None, stored.get(name)):
             raise ValueError(f'{folder} is a run of {stored.get(name)}, not of {chosen}')
+    for name, value in removed_fields(stored).items():
+        raise ValueError(f'{folder} was trained with {name} {value!r}, removed in version 2.0')
     before, config = config_from_dict(stored), config_from_dict(stored, **changes)
     fixed = {name: 'networks' for name in _NETWORK_FIELDS}
     fixed |= {name: 'experience' for name in _EXPERIENCE_FIELDS}

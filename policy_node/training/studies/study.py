@@ -14,7 +14,12 @@ from typing import Any
 
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.flat import changed, config_from_dict, to_flat
+from policy_node.training.configuration.flat import (
+    changed,
+    config_from_dict,
+    removed_fields,
+    to_flat,
+)
 from policy_node.training.configuration.recipes import recipe_config, steps_at_rate
 from policy_node.training.runs.run_folder import PROGRESS_FILE, STATE_FILE
 from policy_node.training.runs.run_log import read_progress
@@ -201,7 +206,8 @@ def differing_fields(stored: Mapping[str, Any], config: TrainConfig) -> dict[str
         ValueError: If the stored configuration has unknown fields or invalid values.
     """
     before, now = to_settings(config_from_dict(dict(stored))), to_settings(config)
-    return {
+    removed = {n: f'{n} {value!r}, now removed' for n, value in removed_fields(stored).items()}
+    return removed | {
         name: f'{name} {value!r}, now {now[name]!r}'
         for name, value in before.items()
         if value != now[name] and name not in _MAY_DIFFER

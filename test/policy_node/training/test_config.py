@@ -120,7 +120,7 @@ def test_scalars_of_numpy_are_values_of_python() -> None:
         ('gamma=high', "gamma 'high' is not of type float"),
         ('layer_norm=maybe', "layer_norm 'maybe' is not of type bool"),
         ('num_envs=1.5', "num_envs '1.5' is not of type int"),
-        ('hidden_sizes=wide', "hidden_sizes 'wide' is not whole numbers with commas"),
+        ('hidden_sizes=wide', "hidden_sizes 'wide' is not numbers with commas"),
     ],
 )
 def test_bad_assignments_are_refused(text: str, match: str) -> None:
@@ -143,15 +143,13 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ({'reward_rotation': 0.5}, 'goals of FetchPush have no rotation'),
         ({'task': 'HandManipulatePenRotate', 'reward_distance': 0.5}, 'does not count'),
         ({'task': 'HandManipulatePenRotate', 'first_distance': 8.0}, 'does not count'),
-        ({'task': 'HandReach', 'reward_distance': 0.5}, 'need reward_type sparse'),
-        ({'moved_share': 0.0, 'episode_weights': 'energy'}, 'energy needs moved_share above 0'),
-        ({'reward_grades': '2,1'}, "reward_grades '2,1': numbers above 0 and below 1000, rising"),
-        ({'reward_grades': 'all'}, "reward_grades 'all': numbers"),
-        ({'reward_grades': '1,2', 'condition': 'threshold'}, 'reward_grades needs'),
-        ({'reward_apart': 0.5}, 'reward_apart needs reward_grades'),
-        ({'reward_apart': 0.5, 'reward_grades': '1,2'}, 'and goals of position and rotation'),
-        ({'temporal_smoothness': 0.1, 'n_step': 3}, 'temporal_smoothness is of one tick'),
-        ({'temporal_smoothness': 0.1, 'longest_hold': 3}, 'temporal_smoothness is of one tick'),
+        (
+            {'task': 'HandReach', 'reward_distance': 0.5},
+            'reward_distance 0.5 has no effect: it needs reward_type sparse',
+        ),
+        ({'reward_grades': '2,1'}, 'rising numbers above 0 and below 1000'),
+        ({'reward_grades': 'all'}, "reward_grades 'all' is not numbers"),
+        ({'reward_grades': '1,2', 'condition': 'threshold'}, 'condition excludes reward_grades'),
         (
             {
                 'task': 'HandManipulatePenRotate',
@@ -159,20 +157,16 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
                 'drop_is_lost': True,
                 'condition': 'horizon',
             },
-            'condition horizon excludes drop_is_lost',
+            'it excludes condition horizon',
         ),
-        ({'noise_spread': 1.5}, 'noise_spread 1.5; allowed: 0 ... 1'),
-        ({'trace': 0.5}, 'trace needs correction lambda, or algorithm ppo'),
-        ({'cut_distance': 0.5, 'n_step': 3}, 'cut_distance needs correction cut'),
+        ({'trace': 0.5}, 'trace 0.5 has no effect'),
         ({'hidden_sizes': (0,)}, 'hidden_sizes'),
-        ({'retry_failed': 1.0}, 'retry_failed 1.0; allowed: 0 ... 0.9'),
-        ({'importance': 'density', 'goals': 'future=1'}, "needs other goals beside 'future=1'"),
-        ({'goal_choice': 'bellman', 'n_step': 3}, 'goal_choice bellman is of one step'),
-        ({'target_noise': 0.2, 'longest_hold': 3}, 'target_noise excludes longest_hold'),
+        ({'retry_failed': 0.5}, 'unknown configuration fields: retry_failed'),
         (
-            {'target_noise': 0.2, 'advantage': True, 'discount': 'time'},
-            'advantage excludes importance, goal_choice and target_noise',
+            {'importance': 'density', 'goals': 'future=1'},
+            'density needs goals of the episode .* beside others',
         ),
+        ({'goal_choice': 'bellman', 'n_step': 3}, 'n_step 3 excludes goal_choice bellman'),
     ],
 )
 def test_bad_values_are_refused(changes: dict[str, object], match: str) -> None:
@@ -223,7 +217,7 @@ def test_help_explains_every_field_and_keeps_studies_apart(
     with pytest.raises(SystemExit):
         options_of(option)
     said = ' '.join(capsys.readouterr().out.split())
-    shown = [name for name in FIELDS if f'--{name.replace("_", "-")} ' in f'{said} ']
+    shown = [n for n in FIELDS if re.search(rf'--{n.replace("_", "-")}[ ,\]]', said)]
     wanted = [n for n in FIELDS if (n in RESEARCH) == (option == '--help-research')]
     assert {*shown} == {*wanted} - {'task', 'recipe'}
     assert len(wanted) <= 45
@@ -259,7 +253,7 @@ def test_steps_are_whole_however_they_are_written(text: str) -> None:
     [
         (['--learning-rte', '1'], "--learning-rte 1; did you mean '--learning-rate'?"),
         (['--gamma', 'high'], "gamma 'high' is not of type float"),
-        (['--hidden-sizes', 'abc'], "hidden_sizes 'abc' is not whole numbers with commas"),
+        (['--hidden-sizes', 'abc'], "hidden_sizes 'abc' is not numbers with commas"),
         (['--nosuchthing'], 'unrecognized arguments: --nosuchthing'),
         (['--gamble', 'true'], 'switches take no value: --name is on, --no-name is off'),
         (['--steps', '1e6.5'], "total_steps '1e6.5' is not of type int"),

@@ -66,7 +66,8 @@ def test_variants_of_a_study_share_all_other_settings(study: Study, tmp_path: Pa
         for name in settings[0].keys() - own:
             assert all(each[name] == settings[0][name] for each in settings), name
         assert len({str(each) for each in settings}) == len({job.folder for job in jobs})
-        assert first.simulation_threads == first.torch_threads == 1 and not first.overlap
+        machine = jobs[0].config.machine
+        assert machine.simulation_threads == machine.torch_threads == 1 and not machine.overlap
 
 
 def test_every_study_has_its_page_and_every_request_its_line() -> None:
