@@ -15,7 +15,7 @@ from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import PHASES, EpisodeStatus
 from msgs_spec.topics import MONITORING, topics
-from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.flat import FIELDS
 from support import ROOT
 
 # One promise per line, written by `write` when 1.0 was released. Lines may be added, never changed.
@@ -43,7 +43,7 @@ def present() -> Iterator[str]:
     yield from (f'command line: {words}' for words in command_lines(COMMANDS))
     scripts = distribution('fetch_hand_sim').entry_points.select(group='console_scripts')
     yield from (f'executable: {script.name}' for script in scripts)
-    yield from (f'training field: {field.name}' for field in dataclasses.fields(TrainConfig))
+    yield from (f'training field: {name}' for name in FIELDS)
     own = (name for name in registry if name.startswith('fetch_hand_sim/'))
     yield from (f'environment: {name}' for name in (*own, *reference_ids()))
 

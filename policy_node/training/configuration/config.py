@@ -355,7 +355,7 @@ def _contradictions_of_options(
         ('condition threshold needs reward_type sparse'),
     )
     if isinstance(values, Chosen):
-        later = {config.goals.strategy[:6], *config.goals.goals} & {'future', 'near'}
+        later = {*(config.goals.goals or [config.goals.strategy[:6]])} & {'future', 'near'}
         yield not later, f'goal_choice {values.goal_choice} needs future or near goals'
         yield (
             values.goal_choice == 'uncertain' and critic.critics == 1,

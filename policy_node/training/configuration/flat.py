@@ -204,7 +204,9 @@ def from_flat(fields: Mapping[str, Any], **changes: Any) -> TrainConfig:
     for name in changes:
         effective = used.get(name, DEFAULTS.get(name))
         if flat[name] not in (effective, DEFAULTS.get(name)):
-            raise ValueError(f'{name} {flat[name]!r} has no effect: it needs {_needed(name)}')
+            raise ValueError(
+                f'{name} {flat[name]!r} has no effect: it needs {_needed(name, flat[name])}'
+            )
     return config
 
 
@@ -271,14 +273,16 @@ _ALTERNATIVES = {
 }
 
 
-def _needed(name: str) -> str:
-    """Return the flat fields that select the groups which have a field."""
+def _needed(name: str, value: Any) -> str:
+    """Return the flat fields that select the groups which have a field with this value."""
     found = []
     for group in _all_groups(TrainConfig):
-        if name in types_of(group) and (selector := _selector(group)) and selector != name:
-            value = group.marks.get(selector, 'another value')
-            found.append(f'{selector} {value}')
-    return ' or '.join(dict.fromkeys(found)) or 'algorithm ddpg'
+        selector = _selector(group)
+        if selector and selector != name and name in types_of(group):
+            if value in (choices_of(types_of(group)[name]) or [value]):
+                default = f'other than {DEFAULTS[selector]}'
+                found.append(f'{selector} {group.marks.get(selector, default)}')
+    return ' or '.join(dict.fromkeys(found)) or 'algorithm ddpg and no subgoal_every'
 
 
 def _all_groups(group: type[Checked]) -> Iterator[type[Checked]]:

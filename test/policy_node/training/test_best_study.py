@@ -16,6 +16,7 @@ import torch
 
 from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
+from policy_node.training.configuration.flat import to_flat
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.runs.origins import steps_behind
 from policy_node.training.runs.run import Ending
@@ -56,7 +57,7 @@ def test_every_task_is_trained_with_its_best_recipe_after_what_it_starts_from(
         assert job.config == recipe_config(job.config.task, 'best', **threads, **chained)
         assert job.is_ready == (start is None)
         gains_position = job.config.task.endswith('Full') and start is not None
-        assert (job.config.first_distance > 1.0) == gains_position
+        assert (to_flat(job.config)['first_distance'] > 1.0) == gains_position
         if start:
             assert job.config.network.init_from == folder and job.config.replay.learning_starts > 0
             assert job.after in jobs[:number] and job.after.config.task == start

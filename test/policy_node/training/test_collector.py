@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.policy import RestingPolicy
 from policy_node.training.collection.collector import Collector
-from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.flat import from_flat
 from policy_node.training.replay.episode_replay import Episodes
 
 torch.set_num_threads(1)
@@ -22,7 +21,7 @@ torch.set_num_threads(1)
 
 def make_collector(noise_std: float = 0.2, random_epsilon: float = 0.3, envs: int = 4) -> Collector:
     simulation = Simulation('FetchReach', num_envs=envs, num_threads=1)
-    config = TrainConfig('FetchReach', noise_std=noise_std, random_epsilon=random_epsilon)
+    config = from_flat({'task': 'FetchReach'}, noise_std=noise_std, random_epsilon=random_epsilon)
     return Collector(simulation, [10 * i for i in range(envs)], config)
 
 
@@ -79,23 +78,6 @@ def test_noise_has_the_spread_and_the_share_asked_for(epsilon: float) -> None:
     assert inside.std() == pytest.approx(0.1, abs=0.012)
 
 
-def test_exploration_may_differ_between_simulations() -> None:
-    simulation = Simulation('FetchReach', num_envs=5, num_threads=1)
-    config = TrainConfig('FetchReach', noise_std=0.1, random_epsilon=0.0, noise_spread=1.0)
-    collector = Collector(simulation, list(range(5)), config)
-    collector.exploration = 0.5
-    spread = [collector.collect(RestingPolicy(4))[0].action.std(axis=(1, 2)) for _ in range(4)]
-    expected = 0.05 * np.array([0.0, 0.5, 1.0, 1.5, 2.0])
-    assert np.mean(spread, axis=0) == pytest.approx(expected, rel=0.1)
-
-
-def test_one_simulation_alone_explores_as_configured() -> None:
-    simulation = Simulation('FetchReach', num_envs=1, num_threads=1)
-    config = TrainConfig('FetchReach', noise_std=0.1, random_epsilon=0.0, noise_spread=1.0)
-    action = Collector(simulation, [0], config).collect(RestingPolicy(4))[0].action
-    assert action.std() == pytest.approx(0.1, rel=0.2)
-
-
 def test_random_actions_ignore_the_policy() -> None:
     episodes, _ = make_collector(0.0, 0.0).collect(RestingPolicy(4), random=True)
     assert episodes.action.std() == pytest.approx(1 / np.sqrt(3), abs=0.03)
@@ -106,28 +88,6 @@ def test_the_second_cycle_has_new_goals() -> None:
     first, _ = collector.collect(make_actor())
     second, _ = collector.collect(make_actor())
     assert (first.desired_goal != second.desired_goal).all()
-
-
-@pytest.mark.release
-def test_goals_of_failures_are_tried_again() -> None:
-    """Only those of failures at goals as the task draws them, and the rest are drawn as ever."""
-    config = TrainConfig('FetchReach', noise_std=0.0, random_epsilon=0.0, retry_failed=0.5)
-    seeds = list(range(64))
-    collectors = [
-        Collector(Simulation('FetchReach', num_envs=64, num_threads=1), seeds, settings)
-        for settings in (config, replace(config, retry_failed=0.0))
-    ]
-    failed: set[bytes] = set()
-    for cycle in range(3):
-        retrying, plain = (c.collect(RestingPolicy(4))[0] for c in collectors)
-        drawn = (retrying.desired_goal == plain.desired_goal).all(axis=1)
-        assert drawn.all() if cycle == 0 else 0.3 < drawn.mean() < 0.7
-        retried = {goal.tobytes() for goal in retrying.desired_goal[~drawn]}
-        assert retried <= failed
-        distance = np.linalg.norm(retrying.achieved_goal[:, -1] - retrying.desired_goal, axis=1)
-        missed = drawn & (distance > 0.05)
-        failed |= {goal.tobytes() for goal in retrying.desired_goal[missed]}
-        assert missed.sum() > 5 and (drawn & ~missed).any()
 
 
 def test_the_same_seeds_give_the_same_episodes_in_any_thread() -> None:

@@ -10,7 +10,7 @@ import torch
 
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.flat import from_flat
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.networks.critics import AGGREGATES, Ensemble, make_critic
 from policy_node.training.replay.transitions import Transitions
@@ -29,7 +29,7 @@ def test_what_an_ensemble_says_as_one(name: str, expected: list[float]) -> None:
 
 
 def test_members_start_differently_and_have_an_axis_of_their_own() -> None:
-    critic = make_critic(TrainConfig('FetchReach', critics=5), 3 - SHAPE.action_size, SHAPE)
+    critic = make_critic(from_flat({'task': 'FetchReach'}, critics=5), 3 - SHAPE.action_size, SHAPE)
     assert isinstance(critic, Ensemble)
     values = critic(torch.randn(7, 2), torch.randn(7, 1))
     assert values.shape == (5, 7) and len(set(values[:, 0].tolist())) == 5

@@ -174,35 +174,6 @@ def test_action_l2_keeps_actions_small() -> None:
     assert sizes[1] < 0.1 < sizes[0]
 
 
-def test_temporal_smoothness_keeps_actions_of_neighbouring_states_alike() -> None:
-    changes = []
-    for weight in (0.0, 30.0):
-        learner = make_learner(temporal_smoothness=weight, action_l2=0.0, learning_rate=3e-3)
-        for seed in range(100):
-            learner.update(make_batch(seed=seed))
-        batch = make_batch(seed=1000)
-        now, then = (
-            learner.actor.predict({'observation': seen, 'desired_goal': batch.goal})[0]
-            for seen in (batch.observation, batch.next_observation)
-        )
-        changes.append(float(np.abs(now - then).mean()))
-    assert changes[1] < 0.3 * changes[0]
-
-
-def test_a_change_of_action_costs_its_weight_beside_the_size_of_actions() -> None:
-    learner = make_learner(action_l2=0.7, temporal_smoothness=0.4)
-    with torch.no_grad():
-        learner.target_actor.output.weight.neg_()
-    batch = make_batch()
-    now, then = (
-        np.tanh(forward(learner.actor.network, np.concatenate([seen, batch.goal], axis=1)))
-        for seen in (batch.observation, batch.next_observation)
-    )
-    losses = learner.update(batch)
-    penalty = 0.7 * np.square(now).mean() + 0.4 * np.square(then - now).mean()
-    assert losses.actor.item() == pytest.approx(penalty - losses.value.item(), rel=1e-4)
-
-
 def test_the_averaged_actor_keeps_its_share_and_takes_the_rest_of_the_actor() -> None:
     config = recipe_config('FetchReach', 'paper', actor_average=0.9)
     learner = DDPG(NetworkShape(3, 2, 4, (8,)), config, CPU, Workers())
@@ -223,20 +194,6 @@ def test_learning_rates_fall_linearly_to_the_share_asked_for() -> None:
         learner.set_progress(progress)
         for optimizer in learner.optimizers().values():
             assert optimizer.param_groups[0]['lr'] == pytest.approx(expected)
-
-
-def test_target_noise_is_cut_and_stays_within_the_actions() -> None:
-    torch.manual_seed(0)
-    learner = make_learner(target_noise=0.2)
-    features = learner._known(make_batch()).next_features
-    own = torch.tanh(learner.target_actor(features))
-    drawn = torch.stack([learner._target_action(features) for _ in range(400)])
-    assert drawn.abs().max() <= 1.0
-    assert (drawn - own).abs().max() <= 0.5 + 1e-6
-    inside = own.abs() < 0.4
-    spread = (drawn - own)[:, inside].std()
-    assert 0.18 < spread < 0.2
-    assert torch.equal(make_learner()._target_action(features), own)
 
 
 @pytest.mark.parametrize('name', ['surprise', 'disagreement'])

@@ -19,6 +19,7 @@ from policy_node.training.collection.frame_skip import (
     ticks_of,
 )
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.flat import from_flat, to_flat
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.sampling import TransitionSampler, make_sampler
 from policy_node.training.learners.ddpg import DDPG
@@ -26,7 +27,6 @@ from policy_node.training.machine.distributed import Workers
 from policy_node.training.networks.shape_from_config import network_shape
 from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.transitions import Starts, Transitions
-from support.refusals import assert_refused
 
 torch.set_num_threads(1)
 
@@ -176,7 +176,9 @@ def test_what_is_recorded_of_held_actions_is_what_was_executed(noise: float) -> 
     with torch.no_grad():
         # Lengths that differ from state to state.
         actor.network.output.weight.mul_(4.0)
-    config = TrainConfig('FetchReach', longest_hold=6, noise_std=noise, random_epsilon=noise)
+    config = from_flat(
+        {'task': 'FetchReach'}, longest_hold=6, noise_std=noise, random_epsilon=noise
+    )
     simulation, again = (Simulation('FetchReach', num_envs=2, num_threads=1) for _ in range(2))
     collector = Collector(simulation, [3, 4], config)
     lengths: set[int] = set()
@@ -274,58 +276,25 @@ def test_advantages_are_as_large_at_every_rate(control_hz: float) -> None:
     assert learner.actor(features).item() > 0.8
 
 
-@pytest.mark.parametrize(
-    ('changes', 'message'),
-    [
-        ({'noise_seconds': 0.01}, 'noise_seconds 0.01 is less than a tick of 0.04 s'),
-        ({'parameter_noise': True, 'noise_spread': 0.5}, 'parameter_noise excludes noise_spread'),
-        ({'longest_hold': 5, 'n_step': 3}, 'longest_hold above 1 excludes n_step'),
-        ({'longest_hold': 5, 'noise_seconds': 0.04}, 'longest_hold above 1 excludes n_step'),
-        ({'longest_hold': 5, 'condition': 'horizon'}, 'excludes condition horizon'),
-        ({'longest_hold': 5, 'gamble': True}, 'excludes gamble'),
-        ({'longest_hold': 5, 'init_from': 'FetchReach'}, 'init_from excludes'),
-        ({'advantage': True}, 'advantage needs discount time'),
-        ({'advantage': True, 'discount': 'time', 'critics': 2}, 'excludes critics above 1'),
-        ({'advantage': True, 'discount': 'time', 'n_step': 3}, 'advantage is of one tick'),
-        ({'advantage': True, 'discount': 'time', 'goal_choice': 'bellman'}, 'goal_choice'),
-        ({'algorithm': 'ppo', 'noise_seconds': 0.04}, 'ppo needs .*noise_seconds=0.0'),
-        ({'discount': 'second'}, "discount 'second'; allowed: tick, time"),
-    ],
-)
-def test_what_makes_no_sense_is_refused_in_one_line(
-    changes: dict[str, object], message: str
-) -> None:
-    assert_refused(message, **changes)
-
-
 def test_the_best_recipe_counts_time_as_time_at_high_rates() -> None:
-    usual, fast = (recipe_config('FetchPush', 'best', control_hz=rate) for rate in (25.0, 250.0))
-    for name in ('total_steps', 'evaluate_every'):
-        assert getattr(fast, name) == 10 * getattr(usual, name)
-    assert (fast.discount, fast.noise_seconds, fast.n_step) == ('time', 0.04, 10)
-    assert (usual.discount, usual.noise_seconds, usual.n_step) == ('tick', 0.0, 1)
-    own = recipe_config('FetchPush', 'best', control_hz=250.0, longest_hold=5, total_steps=1000)
-    assert (own.discount, own.n_step, own.total_steps) == ('tick', 1, 1000)
-    slow = recipe_config('FetchPush', 'best', control_hz=12.5)
-    assert (slow.n_step, slow.total_steps) == (1, usual.total_steps // 2)
-    paper = recipe_config('FetchPush', 'paper', control_hz=250.0)
-    assert (paper.n_step, paper.total_steps) == (1, recipe_config('FetchPush', 'paper').total_steps)
+    def values(recipe: str, *names: str, **fields: object) -> list[object]:
+        flat = to_flat(recipe_config('FetchPush', recipe, **fields))
+        return [flat[name] for name in names]
+
+    counts = ('total_steps', 'evaluate_every')
+    usual = values('best', *counts)
+    assert values('best', *counts, control_hz=250.0) == [10 * count for count in usual]
+    names = ('discount', 'noise_seconds', 'n_step')
+    assert values('best', *names, control_hz=250.0) == ['time', 0.04, 10]
+    assert values('best', *names) == ['tick', 0.0, 1]
+    own = values('best', *names, *counts, control_hz=250.0, longest_hold=5, total_steps=1000)
+    assert own[:4] == ['tick', 0.0, 1, 1000]
+    assert values('best', 'n_step', *counts, control_hz=12.5) == [1, *(n // 2 for n in usual)]
+    paper = values('paper', 'n_step', *counts, control_hz=250.0)
+    assert paper == values('paper', 'n_step', *counts)
 
 
-@pytest.mark.parametrize(
-    'changes', [{'goal_choice': 'bellman', 'critics': 2}, {'temporal_smoothness': 1.0}]
-)
-def test_the_best_recipe_adds_no_longer_returns_to_what_is_of_one_tick(
-    changes: dict[str, object],
-) -> None:
-    config = recipe_config('FetchPush', 'best', control_hz=250.0, **changes)
-    assert (config.learner.discount, config.learner.exploration.noise_seconds, config.n_step) == (
-        'tick',
-        0.0,
-        1,
-    )
-
-
-@pytest.mark.parametrize('control_hz', [0.0, -25.0, float('nan'), float('inf'), 60.0])
-def test_the_best_recipe_refuses_a_rate_that_there_is_not(control_hz: float) -> None:
-    assert_refused('control_hz', control_hz=control_hz)
+def test_the_best_recipe_adds_no_longer_returns_to_what_is_of_one_tick() -> None:
+    changes = {'goal_choice': 'bellman', 'critics': 2}
+    flat = to_flat(recipe_config('FetchPush', 'best', control_hz=250.0, **changes))
+    assert (flat['discount'], flat['noise_seconds'], flat['n_step']) == ('tick', 0.0, 1)

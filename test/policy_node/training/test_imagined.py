@@ -15,7 +15,6 @@ from policy_node.training.learners.imagined import ImaginingDDPG
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.replay.transitions import Transitions
 from policy_node.training.runs.trainer import Trainer
-from support.refusals import assert_refused
 
 torch.set_num_threads(1)
 
@@ -134,23 +133,3 @@ def test_best_imagines_where_it_pays_and_nothing_else_is_asked_for(
     task: str, changes: dict[str, object], prior: float
 ) -> None:
     assert recipe_config(task, 'best', **changes).subgoal_prior == prior
-
-
-@pytest.mark.parametrize(
-    ('changes', 'message'),
-    [
-        ({'subgoal_every': 10}, 'subgoal_prior excludes subgoal_every'),
-        ({'condition': 'horizon'}, 'subgoal_prior excludes subgoal_every, condition'),
-        ({'advantage': True, 'discount': 'time'}, 'condition and advantage'),
-        ({'subgoal_prior': 0.0, 'imagination_interval': 4}, 'needs subgoal_prior above 0'),
-        ({'longest_hold': 5}, 'subgoal_prior excludes longest_hold above 1'),
-        (
-            {'algorithm': 'ppo', 'overlap': False, 'random_epsilon': 0.0},
-            'algorithm ppo needs subgoal_prior=0.0$',
-        ),
-    ],
-)
-def test_what_makes_no_sense_is_refused_in_one_line(
-    changes: dict[str, object], message: str
-) -> None:
-    assert_refused(message, **{'subgoal_prior': 0.1, **changes})

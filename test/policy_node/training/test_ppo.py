@@ -34,7 +34,6 @@ from policy_node.training.machine.distributed import Workers
 from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.transitions import Transitions
 from policy_node.training.runs.trainer import Trainer
-from support.refusals import assert_refused
 
 torch.set_num_threads(1)
 
@@ -469,30 +468,6 @@ def test_ppo_refuses_transitions_that_nobody_rolled_out() -> None:
     one = np.zeros((1, 1), np.float32)
     with pytest.raises(TypeError, match='PPO learns from RolloutTransitions, not Transitions'):
         learner.update(Transitions(one, one, one, one, one[0], one[0]))
-
-
-@pytest.mark.parametrize(
-    ('changes', 'message'),
-    [
-        ({'overlap': True}, 'algorithm ppo needs overlap=false'),
-        (
-            {'random_epsilon': 0.2, 'n_step': 3},
-            'algorithm ppo needs random_epsilon=0.0, n_step=1',
-        ),
-        ({'importance': 'density'}, 'importance density excludes algorithm ppo'),
-        ({'algorithm': 'ddpg', 'importance': 'decision'}, 'decision excludes algorithm ddpg'),
-        ({'init_from': 'FetchReach'}, 'init_from excludes algorithm ppo'),
-        ({'importance': 'decision', 'strategy': 'none'}, 'decision needs goals chosen'),
-        ({'noise_std': 0.0}, 'algorithm ppo needs noise_std above 0'),
-        ({'algorithm': 'ddpg', 'goals': 'outcome=.8'}, 'goals outcome needs algorithm ppo'),
-        ({'algorithm': 'ddpg', 'first_value': -50.0}, 'first_value needs algorithm ppo'),
-        ({'first_value': 1.0}, 'first_value 1.0; allowed: -1000000 ... 0'),
-        ({'algorithm': 'ddpg', 'first_action_gain': 0.1}, 'first_action_gain needs algorithm ppo'),
-        ({'first_action_gain': 2.0}, 'first_action_gain 2.0; allowed: 0 ... 1'),
-    ],
-)
-def test_what_ppo_would_not_look_at_is_refused(changes: dict[str, object], message: str) -> None:
-    assert_refused(message, **{**ON_POLICY, **changes})
 
 
 @pytest.mark.parametrize(

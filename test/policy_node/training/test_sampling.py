@@ -22,7 +22,6 @@ from policy_node.training.networks.conditions import Horizon, Threshold, fold
 from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.multi_step import StepCounter
 from policy_node.training.replay.transitions import Transitions
-from support.refusals import assert_refused
 
 torch.set_num_threads(1)
 
@@ -199,43 +198,3 @@ def test_an_actor_at_one_condition_is_an_actor_like_any_other() -> None:
     features = torch.randn(5, 7)
     wide = torch.cat([features, torch.full((5, 1), 2.0)], dim=-1)
     torch.testing.assert_close(folded(features), learner.actor.network(wide))
-
-
-@pytest.mark.parametrize(
-    ('changes', 'message'),
-    [
-        ({'correction': 'cut'}, 'correction cut needs n_step above 1'),
-        ({'aggregate': 'min'}, 'aggregate min needs critics above 1'),
-        ({'critics': 2, 'aggregate': 'min', 'quantiles': 5}, 'allowed: mean, truncated'),
-        ({'quantiles': 5, 'norm': 'batch', 'target': 'none'}, 'exclude norm batch and advantage'),
-        ({'quantiles': 5, 'init_from': 'FetchReach'}, 'init_from excludes quantiles 5'),
-        ({'norm': 'layer', 'layer_norm': True}, 'norm layer excludes layer_norm'),
-        ({'norm': 'batch'}, 'norm batch needs target none'),
-        ({'goal_choice': 'bellman', 'goals': 'actual=.8'}, 'bellman needs future or near goals'),
-        ({'goal_choice': 'uncertain'}, 'goal_choice uncertain needs critics above 1'),
-        ({'condition': 'horizon', 'n_step': 3}, 'condition horizon excludes n_step above 1'),
-        ({'condition': 'threshold', 'reward_type': 'dense'}, 'needs reward_type sparse'),
-        ({'widest_threshold': 32.0}, 'widest_threshold needs condition threshold'),
-        ({'widest_threshold': 0.5, 'condition': 'threshold'}, 'allowed: 1 ... 10000'),
-        ({'condition': 'horizon', 'importance': 'density'}, 'excludes goal_choice and importance'),
-        ({'importance': 'density', 'strategy': 'none'}, 'needs goals chosen in hindsight'),
-        ({'importance': 'density', 'goals': 'real=1'}, 'needs goals chosen in hindsight'),
-        ({'importance': 'density', 'goals': 'actual=.8'}, "episode beside 'actual=.8': future, fi"),
-        ({'importance': 'density', 'goals': 'future=1'}, "other goals beside 'future=1': actual"),
-        ({'importance': 'density', 'strategy': 'random'}, 'density excludes strategy random'),
-        ({'future_only_steps': 9}, 'needs strategy futureactual, and no goals'),
-        (
-            {
-                'parameter_noise': True,
-                'noise_seconds': 0.04,
-                'random_epsilon': 0.0,
-                'random_steps': 0,
-            },
-            'parameter_noise with noise_seconds above 0 needs random_epsilon or random_steps',
-        ),
-    ],
-)
-def test_what_makes_no_sense_is_refused_in_one_line(
-    changes: dict[str, object], message: str
-) -> None:
-    assert_refused(message, **changes)

@@ -12,14 +12,13 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.collection.collector import Collector
-from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.flat import from_flat
 from policy_node.training.experience.hindsight_actions import SubgoalSampler
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.goals.hindsight import with_subgoals
 from policy_node.training.goals.subgoals import TESTED, GuidedPolicy, Proposer
 from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.train_her import main
-from support.refusals import assert_refused
 
 torch.set_num_threads(1)
 
@@ -38,7 +37,9 @@ class Constant:
 def collected(proposer: Proposer | None, noise: tuple[float, float], actor: object) -> Episodes:
     simulation = Simulation('FetchReach', num_envs=80, num_threads=1)
     std, epsilon = noise
-    config = TrainConfig('FetchReach', noise_std=std, random_epsilon=epsilon, subgoal_every=20)
+    config = from_flat(
+        {'task': 'FetchReach'}, noise_std=std, random_epsilon=epsilon, subgoal_every=20
+    )
     collector = Collector(simulation, list(range(80)), config)
     collector.proposer = proposer
     return collector.collect(actor)[0]
@@ -149,29 +150,3 @@ def test_logged_episodes_have_no_subgoals(
     assert main([*arguments, '--from-episodes', str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert 'subgoal_every excludes --from-episodes' in error and error.count('\n') == 1
-
-
-@pytest.mark.parametrize(
-    ('changes', 'message'),
-    [
-        ({'subgoal_every': 51}, 'subgoal_every 51 is longer than an episode'),
-        ({'subgoal_every': -1}, 'subgoal_every -1; allowed: 0'),
-        ({'n_step': 3}, 'subgoal_every excludes n_step'),
-        ({'longest_hold': 5}, 'subgoal_every excludes n_step and longest_hold'),
-        ({'parameter_noise': True}, 'and parameter_noise'),
-        ({'condition': 'horizon'}, 'subgoal_every excludes condition'),
-        ({'goal_choice': 'bellman'}, 'goal_choice, importance'),
-        ({'importance': 'density'}, 'goal_choice, importance'),
-        ({'advantage': True, 'discount': 'time'}, 'and advantage'),
-        ({'reward_type': 'dense'}, 'subgoal_every needs reward_type sparse'),
-        ({'init_from': 'FetchReach'}, 'init_from excludes .*subgoal_every'),
-        (
-            {'algorithm': 'ppo', 'overlap': False, 'random_epsilon': 0.0},
-            'algorithm ppo needs subgoal_every=0$',
-        ),
-    ],
-)
-def test_what_makes_no_sense_is_refused_in_one_line(
-    changes: dict[str, object], message: str
-) -> None:
-    assert_refused(message, **{'subgoal_every': 10, **changes})
