@@ -29,7 +29,9 @@ class Constant:
     def __init__(self, value: float, size: int) -> None:
         self.value, self.size = value, size
 
-    def predict(self, observation: dict, *, deterministic: bool = True) -> tuple:
+    def predict(
+        self, observation: dict, state: object = None, *, deterministic: bool = True
+    ) -> tuple:
         count = len(np.asarray(observation['observation']))
         return np.full((count, self.size), self.value, np.float32), None
 

@@ -22,7 +22,7 @@ from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.experience.sampling import scale_thresholds
 from policy_node.training.generate_episodes import main as generate_episodes
-from policy_node.training.goals.graded import GradedReward, parse_grades
+from policy_node.training.goals.graded import GradedReward
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.replay.logged_episodes import read_experience
 from policy_node.training.runs.finite_checks import TrainingError
@@ -283,13 +283,10 @@ def test_graded_rewards_are_shares_of_thresholds_met() -> None:
     achieved[:, 0] = [0.0, 0.006, 0.015, 0.03, 0.05]
     angle = np.array([0.0, 0.04, 0.3, 0.3, 0.0])
     achieved[:, 3], achieved[:, 4] = np.cos(angle / 2), np.sin(angle / 2)
-    reward = GradedReward(metric, parse_grades('.5,1,2,4'))
+    reward = GradedReward(metric, (0.5, 1.0, 2.0, 4.0))
     met = np.array([1.0, 0.75 * 1.0, 0.5 * 0.25, 0.25 * 0.25, 0.0 * 1.0])
     np.testing.assert_array_equal(reward(achieved, goal), met - 1.0)
-    apart = GradedReward(metric, parse_grades('.5,1,2,4'), apart=0.5)
-    mean = np.array([1.0, 0.875, 0.375, 0.25, 0.5])
-    np.testing.assert_array_equal(apart(achieved, goal), (met + mean) / 2.0 - 1.0)
-    sparse = GradedReward(metric, parse_grades('1'))
+    sparse = GradedReward(metric, (1.0,))
     np.testing.assert_array_equal(sparse(achieved, goal), metric.reward(achieved, goal))
 
 
@@ -321,7 +318,7 @@ def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_p
         assert ((distance > 0.5 * threshold) & (distance < threshold)).any()
     with pytest.raises(ValueError, match='first_rotation: goals of FetchReach have no rotation'):
         small_config(first_rotation=2.0)
-    with pytest.raises(ValueError, match='need reward_type sparse'):
+    with pytest.raises(ValueError, match='it needs reward_type sparse'):
         small_config(first_distance=2.0, reward_type='dense')
 
 
