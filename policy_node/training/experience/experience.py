@@ -16,7 +16,6 @@ from policy_node.training.goals.hindsight import complete_mixture, goal_mixture
 from policy_node.training.goals.subgoals import subgoal_columns
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.networks.normalizer import RunningStatistics
-from policy_node.training.networks.shape_from_config import network_shape
 from policy_node.training.replay.episode_replay import EpisodeReplay, Episodes
 from policy_node.training.replay.transitions import Transitions
 
@@ -55,8 +54,9 @@ class Experience:
         self.judge: Judge | None = None
         self.generator = generator
         self.batch_size = workers.share(config.learner.batch_size)
+        inputs = spec.observation_size + config.network.past_actions * spec.robot.action_size
         self.statistics = {
-            'observation_statistics': RunningStatistics(network_shape(config).input_size),
+            'observation_statistics': RunningStatistics(inputs),
             'goal_statistics': RunningStatistics(spec.goal.size),
         }
         drop, guided = config.find(Drop), config.find(Hierarchical)
@@ -68,7 +68,7 @@ class Experience:
         self.replay = EpisodeReplay(
             max(capacity, workers.share(config.collect.num_envs)),
             spec.episode_ticks,
-            network_shape(config).input_size,
+            inputs,
             spec.goal.size,
             spec.robot.action_size
             + (config.find(Held) is not None)
