@@ -135,7 +135,7 @@ def test_both_levels_learn_a_line_together() -> None:
         assert (collector.proposer is None) == (cycle == 0), 'nothing is proposed at first'
         episodes, _ = collector.collect(learner.acting_actor())
         experience.replay.add(episodes)
-        experience.normalize(episodes, learner.actor, 0)
+        experience.normalize(episodes, learner.actor)
         for _ in range(40):
             batch = experience.batch(0)
             learner.update(batch)

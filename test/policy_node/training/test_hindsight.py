@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from msgs_spec.rotations import quaternion_from_axis_angle
+from policy_node.training.configuration.flat import parse_value
+from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.goals.hindsight import (
+    complete_mixture,
     draw_sources,
     goal_mixture,
     goals_of,
-    parse_mixture,
 )
 from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.replay.transitions import Starts
@@ -185,24 +187,23 @@ def test_displaced_poses_are_turned_as_another_episode_turned() -> None:
     ],
 )
 def test_goal_sources_can_be_mixed(text: str, mixture: dict[str, float]) -> None:
-    assert parse_mixture(text) == pytest.approx(mixture)
+    assert complete_mixture(parse_value('goals', text)) == pytest.approx(mixture)
 
 
 @pytest.mark.parametrize(
     ('text', 'message'),
     [
-        ('past=.4', "'past'; allowed, once each: "),
-        ('future=.4,future=.4', "'future'; allowed, once each: "),
-        ('future', "'future' is not source=share"),
+        ('past=.4', "'past'; allowed: "),
+        ('future=.4,future=.4', 'is not name=share with commas'),
+        ('future', 'is not name=share with commas'),
         ('future=.8,actual=.3', 'add up to at most 1'),
         ('future=-1', 'add up to at most 1'),
         ('future=nan', 'add up to at most 1'),
-        ('', "''; allowed, once each: "),
     ],
 )
 def test_a_bad_mixture_is_refused(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
-        parse_mixture(text)
+        recipe_config('FetchReach', 'best', goals=text)
 
 
 def numbered(count: int, ticks: int) -> Episodes:

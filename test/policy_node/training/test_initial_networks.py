@@ -383,7 +383,7 @@ def test_normalisers_of_an_actor_go_on_from_what_it_has_seen(tmp_path: Path) -> 
     trainer = Trainer(recipe_config('FetchReach', 'best'), tmp_path, Workers(), init_from=networks)
     before = {name: value.clone() for name, value in trainer.learner.actor.state_dict().items()}
     trainer.experience.normalize(
-        trainer.collector.collect(trainer.learner.actor)[0], trainer.learner.actor, 0
+        trainer.collector.collect(trainer.learner.actor)[0], trainer.learner.actor
     )
     steps = checkpoint.read_info(shipped_actors()['FetchReach']).env_steps
     count = trainer.experience.statistics['observation_statistics'].count.item()

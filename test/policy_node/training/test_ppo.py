@@ -203,7 +203,7 @@ def learn(cycles: int, **changes: object) -> tuple[PPO, RolloutMaker]:
     generator = np.random.default_rng(0)
     config = configured(learning_rate=3e-3, action_l2=0.0, gamma=0.5, **changes)
     learner = PPO(NetworkShape(1, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
-    corrects = config.importance == 'decision'
+    corrects = config.learner.importance == 'decision'
     maker = RolloutMaker(learner, reached, config.learner.gamma, 0.95, corrects)
     for _ in range(cycles):
         episodes = one_step(learner, generator.uniform(-0.8, 0.8, (256, 1)), generator, np.copy)
