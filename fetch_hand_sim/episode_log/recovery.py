@@ -192,9 +192,13 @@ def _in_use(leftover: Path) -> EpisodeInUseError:
 def _recover(leftover: Path, name: str) -> Path | None:
     file, final = files.bag_file(leftover, name), leftover.parent / name
     if not file.exists():
+        entries = [files.rewritten_file(file), files.metadata_file(leftover)]
+        if any(entry.exists() and entry.stat().st_size > _FEW_BYTES for entry in entries):
+            leftover.rename(files.aside_path(leftover.parent, name))
+            return None
         # A robot may begin its file right now, so its new file and the folder stay.
-        files.rewritten_file(file).unlink(missing_ok=True)
-        files.metadata_file(leftover).unlink(missing_ok=True)
+        for entry in entries:
+            entry.unlink(missing_ok=True)
         _remove_empty(leftover)
         return None
     with files.open_regular(file) as torn:

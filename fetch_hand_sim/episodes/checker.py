@@ -40,6 +40,8 @@ from node_runtime.source_revision import source_revision
 _LONGEST = 80
 # Keys of the record `episode` that name software; another value is a change, not a difference.
 _SOFTWARE = ('interface_version', 'model_sha256', 'source_revision')
+# Keys of the record `episode_result` that do not follow from the simulation.
+_NOT_SIMULATED = {'reason', 'received_not_logged'}
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,8 +200,9 @@ def _start_differences(
     )
     stamp_ns = ticks[0].stamp_ns
     for name, value in here.items():
-        given = recorded.get(name, value)
-        if given != value and (name in _SOFTWARE or name.endswith('_version')):
+        is_software = name in _SOFTWARE or name.endswith('_version')
+        given = recorded.get(name, value if is_software else 'nothing')
+        if given != value and is_software:
             short = one_line(given, longest=12)
             result.changed.append(f'{name.removesuffix("_version")} {short} -> {value[:12]}')
         elif given != value:
@@ -304,10 +307,13 @@ def _result_difference(
         # All ticks of an episode may be there although its end was cut off.
         recorded = episode.result.get('complete')
         expected['complete'] = 'false' if recorded == 'false' else 'true'
-    for name, simulated in expected.items():
-        recorded = episode.result.get(name, simulated)
+    # A file that was cut short may lack all but `complete`.
+    missing = {'complete': 'nothing'}
+    for name in sorted({*expected, *episode.result.keys() - _NOT_SIMULATED}):
+        simulated = expected.get(name, 'nothing')
+        recorded = episode.result.get(name, missing.get(name, simulated))
         if recorded != simulated:
-            where = f'episode_result {name}'
+            where = f'episode_result {one_line(name, longest=40)}'
             return _difference(status.tick, last.stamp_ns, where, recorded, simulated)
     return None
 

@@ -255,6 +255,15 @@ def test_a_leftover_without_messages_is_put_aside(finished, tmp_path, size):
     assert find_leftovers(tmp_path) == []
 
 
+@pytest.mark.parametrize('name', ['episode_0.recovered', 'metadata.yaml'])
+def test_a_leftover_without_its_file_is_put_aside(tmp_path, name):
+    leftover = tmp_path / '.episode.active'
+    leftover.mkdir()
+    (leftover / name).write_bytes(bytes(1000))
+    assert recover_episode(leftover) is None
+    assert (tmp_path / '.episode.aside' / name).read_bytes() == bytes(1000)
+
+
 def test_a_damaged_length_is_not_taken_for_a_kill(finished, tmp_path):
     """Cleared away is only what ends too early; here all of the file is there."""
     leftover = tmp_path / '.episode.active'

@@ -446,9 +446,35 @@ def other_record(parts):
     return parts.file().replace(parts.record, metadata('episode', changed))
 
 
+def lost_key(parts):
+    changed = {k: v for k, v in parts.episode.metadata.items() if k != 'episode_ticks'}
+    return parts.file().replace(parts.record, metadata('episode', changed))
+
+
+def renamed_key(parts):
+    changed = {k.replace('return', 'retorn'): v for k, v in parts.episode.result.items()}
+    return parts.file().replace(parts.result, metadata('episode_result', changed))
+
+
+def lost_end(parts):
+    changed = {k: v for k, v in parts.episode.result.items() if k != 'complete'}
+    return parts.file().replace(parts.result, metadata('episode_result', changed))
+
+
+def later_command(parts):
+    index = next(i for i, row in enumerate(parts.rows) if row[1] == parts.channel_ids['/commands'])
+    time, id, data = parts.rows[index]
+    changed = message(id, time + 5, data)
+    return parts.file(messages=[*parts.messages[:index], changed, *parts.messages[index + 1 :]])
+
+
 @pytest.mark.parametrize(
     ('make', 'where'),
     [
+        (lost_key, 'metadata episode_ticks'),
+        (renamed_key, 'episode_result retorn'),
+        (lost_end, 'episode_result complete'),
+        (later_command, 'log time of commands'),
         (later_publish_time, 'publish time of'),
         (other_sequence, 'sequence number of'),
         (other_record, 'metadata joint_order'),
