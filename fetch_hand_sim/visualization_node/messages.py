@@ -1,4 +1,4 @@
-"""Messages for standard tools: transforms, markers, pictures and camera calibration."""
+"""Messages for standard tools: transforms, markers, pictures, numbers for plots."""
 
 from __future__ import annotations
 
@@ -14,10 +14,15 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Marker as Shape
 from fetch_hand_sim.simulation.urdf import ROOT
+from fetch_hand_sim.view.robot_watch import SeenTick
 from fetch_hand_sim.visualization_node.transforms import Transform
 from msgs_spec.arrays import Array, Picture
+from msgs_spec.cdr import TopicCodec
+from msgs_spec.tasks import SuccessRule, TaskSpec
+from msgs_spec.topics import scalar_topics
 
 _GEOM = mujoco.mjtGeom
 _SHAPES = {
@@ -141,3 +146,28 @@ def _scale(shape: Shape) -> Vector3:
         size = np.array([size[0], size[0], size[1]])
     x, y, z = (2.0 * size).tolist()
     return Vector3(x=x, y=y, z=z)
+
+
+class Scalars:
+    """Encodes the topics `scalars/*` of one task."""
+
+    def __init__(self, spec: TaskSpec, success_rule: SuccessRule) -> None:
+        self._metric = GoalMetric(spec, success_rule=success_rule)
+        self._codecs = {source.name: TopicCodec(source) for source in scalar_topics(spec)}
+
+    def messages(self, tick: SeenTick) -> dict[str, bytes]:
+        """Return the CDR bytes of each topic; a reset has no reward."""
+        frame = tick.frame
+        distance, rotation = self._metric.distances(frame.achieved_goal, frame.desired_goal)
+        numbers = {
+            'distance': float(distance),
+            'rotation': float(rotation),
+            'reward': tick.reward,
+            'is_success': float(frame.is_success),
+        }
+        found = {}
+        for name, codec in self._codecs.items():
+            number = numbers[codec.topic.layout[0].name]
+            if number is not None:
+                found[name] = codec.encode(tick.stamp_ns, [number])
+        return found

@@ -13,13 +13,13 @@ from fetch_hand_sim.view.robot_watch import RobotWatch, SeenTick
 from fetch_hand_sim.visualization_node import NODE_NAME
 from fetch_hand_sim.visualization_node.camera import Camera
 from fetch_hand_sim.visualization_node.messages import (
+    Scalars,
     camera_info,
     compressed_message,
     image_message,
     marker_array,
     transform_messages,
 )
-from fetch_hand_sim.visualization_node.scalars import Scalars
 from fetch_hand_sim.visualization_node.transforms import (
     Transform,
     Transforms,

@@ -10,7 +10,7 @@ from rclpy.serialization import deserialize_message
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
 from fetch_hand_sim.view.robot_watch import SeenTick
-from fetch_hand_sim.visualization_node.scalars import Scalars
+from fetch_hand_sim.visualization_node.messages import Scalars
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import scalar_topics
