@@ -116,6 +116,7 @@ assert main(['train', *training, *fast, '--output', 'run']) == 0
 """
 
 
+@pytest.mark.release
 def test_the_pages_other_reward_trains_and_is_checked(tmp_path: Path) -> None:
     blocks = python_blocks((ROOT / 'docs' / 'own_task.md').read_text())
     specification, simulation = (block for block in blocks if 'FetchPushNear' in block)
