@@ -22,7 +22,7 @@ from support import SUPPORT, script_environment
 from support.graph import SIM_NODE, TIMEOUT, client, ros_args
 
 # `make torture` turns this up.
-KILLS = int(os.environ.get('EPISODE_KILLS', '20'))
+KILLS = int(os.environ.get('EPISODE_KILLS', '10'))
 LONGEST_LIFE = float(os.environ.get('EPISODE_LIFE', '0.6'))
 SCRIPT = SUPPORT / 'killed_recorder.py'
 # Of finished files, how many may wait for the disk when a robot is killed.

@@ -25,8 +25,8 @@ from support.crafted_files import Crafter
 from support.episode_recorder import Recorder
 
 # `make torture` turns these up.
-FILES = int(os.environ.get('EPISODE_MUTATIONS', '360'))
-CRAFTED = int(os.environ.get('EPISODE_CRAFTED', '40'))
+FILES = int(os.environ.get('EPISODE_MUTATIONS', '240'))
+CRAFTED = int(os.environ.get('EPISODE_CRAFTED', '25'))
 SCRIPT = SUPPORT / 'mutated_files.py'
 READERS = 6
 
