@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 FORMAT = 'fetch_hand_actor'
 FORMAT_VERSION = 1
 MOST_PAST_ACTIONS = 16
+MOST_LAYERS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +226,10 @@ def parse_metadata(metadata: dict[str, str], path: str | Path) -> ActorInfo:
 
 def _check_format(path: str | Path, metadata: dict[str, str]) -> None:
     if metadata.get('format') != FORMAT:
-        raise ValueError(f'{path} is no actor checkpoint (format {metadata.get("format")!r:.80})')
+        raise ValueError(
+            f'{path} is no policy of this project (format {metadata.get("format")!r:.80}); '
+            'allowed: files that fetch_hand_sim train and export write'
+        )
     version = metadata.get('format_version')
     if version != str(FORMAT_VERSION):
         raise ValueError(
@@ -244,6 +248,10 @@ def _check_sizes(path: str | Path, info: ActorInfo) -> None:
     if not 0 <= info.past_actions <= MOST_PAST_ACTIONS:
         raise ValueError(
             f'{path} has past_actions {info.past_actions}; allowed: 0 ... {MOST_PAST_ACTIONS}'
+        )
+    if len(info.hidden_sizes) > MOST_LAYERS:
+        raise ValueError(
+            f'{path} has {len(info.hidden_sizes)} hidden layers; allowed: up to {MOST_LAYERS}'
         )
     expected = (observation_layout(spec), spec.goal.size, spec.robot.action_size)
     found = (info.observation_layout, info.goal_size, info.action_size)

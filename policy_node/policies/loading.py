@@ -140,7 +140,7 @@ def _try_out(loaded: LoadedPolicy, spec: TaskSpec) -> None:
     }
     try:
         for _ in range(_WARM_UP_CALLS):
-            action, _ = loaded.policy.predict(zeros, deterministic=True)
+            action, _ = loaded.predict(zeros)
         action = np.asarray(action, dtype=np.float64)
     except Exception as error:
         # Libraries raise types of their own for a model that loads but does not run.

@@ -30,6 +30,8 @@ from policy_node.policies.policy import LoadedPolicy, Observation, observation_a
 
 INPUTS = ('observation', 'desired_goal')
 OUTPUT = 'action'
+# Entry `location` of a tensor whose weights are in another file, in protobuf's encoding.
+_EXTERNAL = b'\n\x08location\x12'
 
 # Limits of the trial: 100 MiB and .1 s go to onnxruntime itself.
 _TRIAL_MEMORY = 400 * 2**20
@@ -94,6 +96,9 @@ def load_onnx(path: Path, task: str | None = None) -> LoadedPolicy:
         ValueError: If it cannot be used, costs too much, or was trained on another task.
     """
     data = read_file(path)
+    if _EXTERNAL in data:
+        # They would be read from the working directory, and the SHA-256 would not cover them.
+        raise ValueError(f'{path} keeps weights in other files; allowed: one file with all weights')
     _require_onnxruntime(path)
     _try_out(data, path)
     actor = OnnxActor(data, path)

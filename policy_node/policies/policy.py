@@ -65,8 +65,11 @@ class LoadedPolicy:
     ) -> tuple[NDArray[Any], Any]:
         """Act as `policy` does; a policy without memory may take only the observation."""
         if state is None and episode_start is None:
-            return self.policy.predict(observation, deterministic=deterministic)
-        return self.policy.predict(observation, state, episode_start, deterministic)
+            answer: Any = self.policy.predict(observation, deterministic=deterministic)
+        else:
+            answer = self.policy.predict(observation, state, episode_start, deterministic)
+        # A policy of the user's own may return the action alone.
+        return answer if isinstance(answer, tuple) and len(answer) == 2 else (answer, None)
 
 
 # Apart from other streams of random numbers that a seed stands for.

@@ -1,15 +1,16 @@
 """Actors that Stable-Baselines3 trained on the same dict observation: its `.zip` files.
 
 Such a file holds pickles, and loading one runs the code in it: load only those you trust. It does
-not say which task or rate it was trained at, so only sizes can be checked.
+not say which task or rate it was trained at, so only sizes can be checked. A model that was trained
+under `VecNormalize` needs its statistics in `vecnormalize.pkl` beside it.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import pickle
 import zipfile
-import zlib
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -40,19 +41,8 @@ _WITHOUT_TRAINING: dict[str, Any] = {
 # Unpacked; an actor and its critics of the paper's size have 10 MB with their optimisers.
 _LARGEST_CONTENTS = 256 * 2**20
 _LARGEST_DESCRIPTION = 16 * 2**20
-
-# What `zipfile` and `json` raise for a file that is none of these.
-_DAMAGES = (
-    AttributeError,
-    KeyError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    UnicodeDecodeError,
-    json.JSONDecodeError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+# Statistics of `VecNormalize` beside a model, as rl-zoo3 names them.
+_STATISTICS = 'vecnormalize.pkl'
 
 
 class StableBaselines3Policy:
@@ -60,10 +50,12 @@ class StableBaselines3Policy:
 
     Args:
         policy: The policy of a model.
+        statistics: The `VecNormalize` that it was trained under, or None.
     """
 
-    def __init__(self, policy: Any) -> None:
+    def __init__(self, policy: Any, statistics: Any = None) -> None:
         self._policy = policy
+        self._statistics = statistics
 
     def predict(
         self,
@@ -73,7 +65,10 @@ class StableBaselines3Policy:
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
         """Returns actions (..., action size) in [-1, 1] for one observation or a batch."""
-        action, state = self._policy.predict(dict(observation), state, episode_start, deterministic)
+        seen: Any = dict(observation)
+        if self._statistics is not None:
+            seen = self._statistics.normalize_obs(seen)
+        action, state = self._policy.predict(seen, state, episode_start, deterministic)
         return action, state
 
 
@@ -95,12 +90,33 @@ def load_stable_baselines3(path: Path, task: str) -> LoadedPolicy:
         # Unpickling a file of another version can raise anything.
         raise ValueError(f'{path} cannot be loaded: {one_line(error)}') from None
     _check_sizes(path, task_spec(task), model.policy)
+    file = path.with_name(_STATISTICS)
+    statistics, ending = (
+        (_statistics(file), f' with {_STATISTICS}') if file.is_file() else (None, '')
+    )
     return LoadedPolicy(
-        policy=StableBaselines3Policy(model.policy),
+        policy=StableBaselines3Policy(model.policy, statistics),
         task=task,
-        description=f'Stable-Baselines3 {algorithm.__name__} {path.name}',
+        description=f'Stable-Baselines3 {algorithm.__name__} {path.name}{ending}',
         sha256=sha256(data),
     )
+
+
+def _statistics(file: Path) -> Any:
+    """Load the `VecNormalize` of a training, which runs the code in its file.
+
+    Raises:
+        ValueError: If the file cannot be read or holds something else.
+    """
+    try:
+        statistics = pickle.loads(read_file(file, _LARGEST_DESCRIPTION))
+        is_right = type(statistics).__name__ == 'VecNormalize' and statistics.obs_rms is not None
+    except Exception as error:
+        # Unpickling a file of another version can raise anything.
+        raise ValueError(f'{file} cannot be loaded: {one_line(error)}') from None
+    if not is_right:
+        raise ValueError(f'{file} holds {type(statistics).__name__}; allowed: VecNormalize')
+    return statistics
 
 
 def _algorithm(data: bytes, path: Path) -> Any:
@@ -109,7 +125,8 @@ def _algorithm(data: bytes, path: Path) -> Any:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
             _check_contents(path, file)
             module = json.loads(file.read('data'))['policy_class']['__module__']
-    except _DAMAGES as error:
+    except Exception as error:
+        # Each compression method raises types of its own for a damaged file.
         line = one_line(error)
         raise ValueError(f'{path} is not a file of Stable-Baselines3: {line}') from None
     for package, name in _ALGORITHMS.items():

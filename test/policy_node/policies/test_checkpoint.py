@@ -124,7 +124,7 @@ def test_other_formats_and_versions_are_refused(saved: Path) -> None:
     rewrite(saved, format_version='2')
     assert_refused(saved, 'format version 2; supported: 1')
     rewrite(saved, format='something')
-    assert_refused(saved, "no actor checkpoint .*'something'")
+    assert_refused(saved, "no policy of this project .*'something'")
 
 
 def test_missing_or_broken_metadata_are_refused(saved: Path) -> None:
@@ -237,7 +237,7 @@ def test_escape_characters_of_a_file_never_reach_the_terminal(saved: Path) -> No
 def test_crafted_headers_are_refused_in_one_line(tmp_path: Path, header: bytes) -> None:
     path = tmp_path / 'a.safetensors'
     path.write_bytes(len(header).to_bytes(8, 'little') + header)
-    assert_refused(path, 'not a readable safetensors file|no actor checkpoint')
+    assert_refused(path, 'not a readable safetensors file|no policy of this project')
 
 
 def test_large_headers_and_files_are_refused_unread(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import resource
 import subprocess
@@ -224,6 +225,54 @@ def test_stable_baselines3_model_answers_as_it_does_there(algorithm, tmp_path):
         load_policy(path, 'HandReach', trust=True)
     with pytest.raises(TaskMissing, match=r'model\.zip needs a task'):
         load_policy(path, trust=True)
+
+
+def test_a_model_acts_with_the_statistics_beside_it(tmp_path):
+    library = pytest.importorskip('stable_baselines3')
+    vec_env = pytest.importorskip('stable_baselines3.common.vec_env')
+    env = vec_env.DummyVecEnv([lambda: gymnasium.make('fetch_hand_sim/FetchReach-v0')])
+    env = vec_env.VecNormalize(env, norm_reward=False)
+    model = library.PPO(
+        'MultiInputPolicy', env, n_steps=64, policy_kwargs={'net_arch': [8]}, seed=1
+    )
+    model.learn(64)
+    path = tmp_path / 'model.zip'
+    model.save(path)
+    observation = observations(REACH)
+    plain = load_policy(path, 'FetchReach', trust=True)
+    env.save(tmp_path / 'vecnormalize.pkl')
+    found = load_policy(path, 'FetchReach', trust=True)
+    wanted, _ = model.predict(env.normalize_obs(observation), deterministic=True)
+    assert found.predict(observation)[0].tolist() == wanted.tolist()
+    assert plain.predict(observation)[0].tolist() != wanted.tolist()
+    assert found.description.endswith('model.zip with vecnormalize.pkl')
+    (tmp_path / 'vecnormalize.pkl').write_bytes(pickle.dumps([1]))
+    with pytest.raises(ValueError, match=r'vecnormalize.pkl holds list'):
+        load_policy(path, 'FetchReach', trust=True)
+
+
+def test_an_onnx_file_that_keeps_weights_elsewhere_is_refused(onnx_file, tmp_path, monkeypatch):
+    """They would be read from the working directory, and the SHA-256 would not cover them."""
+    path = tmp_path / 'apart.onnx'
+    onnx.save(
+        onnx.load(onnx_file), path, save_as_external_data=True, location='w', size_threshold=0
+    )
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r'apart.onnx keeps weights in other files'):
+        load_policy(path)
+
+
+@pytest.mark.parametrize('method', [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_damaged_zip_is_one_line_with_any_compression(tmp_path, method):
+    path = tmp_path / 'model.zip'
+    with zipfile.ZipFile(path, 'w', method) as file:
+        file.writestr('data', json.dumps({'policy_class': {'__module__': 'x' * 500}}))
+    data = bytearray(path.read_bytes())
+    for place in range(30, 60):
+        torn = bytes(data[:place]) + bytes([data[place] ^ 0xFF]) + bytes(data[place + 1 :])
+        path.write_bytes(torn)
+        with pytest.raises(ValueError, match=r'model.zip'):
+            load_policy(path, 'FetchReach', trust=True)
 
 
 def test_a_model_whose_actions_were_rescaled_is_refused(tmp_path):

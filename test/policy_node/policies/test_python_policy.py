@@ -164,3 +164,21 @@ def test_what_acts_wrongly_later_is_said_in_one_line(
     assert evaluate([*words, '--episodes', '2', '--threads', '1']) == 1
     error = capsys.readouterr().err
     assert error == f'fetch_hand_sim evaluate: {module}:{function} fails: {line}\n'
+
+
+def test_an_object_may_return_the_action_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = """
+import numpy as np
+class Bare:
+    def predict(self, observation, deterministic=True):
+        return np.zeros((*np.shape(observation['observation'])[:-1], 4))
+def make(task):
+    return Bare()
+"""
+    (tmp_path / 'bare_policy.py').write_text(source)
+    monkeypatch.chdir(tmp_path)
+    loaded = load_policy('bare_policy:make', 'FetchReach', trust=True)
+    action, state = loaded.predict(observations(task_spec('FetchReach'), 3))
+    assert action.shape == (3, 4) and state is None
