@@ -13,8 +13,8 @@ PYTHON_FILES := $(PACKAGES) bench docs/conf.py examples test tools setup.py
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.complete
 
-# The environment holds a ROS of its own: a sourced one, or one that a parent process loaded, must
-# not leak in. Bytecode that is not kept would be made again by some hundred processes.
+# The environment contains a ROS of its own: a sourced one, or one that a parent process loaded, must
+# not leak in. Some hundred processes share the bytecode.
 unexport PYTHONDONTWRITEBYTECODE PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 .PHONY: help env demo docs tables pictures test test-alone test-nodes test-others test-browser lint format twin bench-sim bench-view bench-camera bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
@@ -27,22 +27,22 @@ help:
 	@echo 'make lint       ruff and mypy only'
 	@echo 'make format     let ruff rewrite the code'
 	@echo 'make docs       the documentation as pages: build/docs/index.html'
-	@echo 'make tables     what pages say in numbers, from the package and the shipped actors'
+	@echo 'make tables     the tables of the pages, from the package and the shipped actors'
 	@echo 'make pictures   the film of the README and a picture of every task, from logged episodes'
 	@echo 'make twin       the long comparison with Gymnasium-Robotics, 20 seeds per task'
 	@echo 'make bench-sim  simulation speed against its peers'
-	@echo 'make bench-view [SECONDS=$(SECONDS)]  what viewers cost a robot'
-	@echo 'make bench-camera  what pictures cost, with and without somebody who looks'
+	@echo 'make bench-view [SECONDS=$(SECONDS)]  rate of a robot beside viewers'
+	@echo 'make bench-camera  CPU time of camera pictures, with and without subscribers'
 	@echo 'make bench-her  training speed against Stable-Baselines3'
-	@echo 'make bench-paper [TASK=$(TASK)]  four arms x five seeds, as in the figures of the paper'
+	@echo 'make bench-paper [TASK=$(TASK)]  four variants x five seeds, as in the figures of the paper'
 	@echo 'make bench-lockstep  ticks per second of two nodes against the limit of the middleware'
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
 	@echo 'make torture    100,000 hostile messages per test, an hour of memory at 20x, 50 killed'
 	@echo '                robots, 10,000 damaged and 2,000 crafted episode files'
-	@echo 'make test-release  the long tests, among them the tutorials and, where there is one, an'
-	@echo '                installed Chromium with the page; documentation; wheel and'
-	@echo '                sdist, built, installed elsewhere and used; the tests of Gymnasium-Robotics'
-	@echo 'make bench-episodes  what logging costs and how fast logs load'
+	@echo 'make test-release  the long tests, also the tutorials and the page in an installed Chromium;'
+	@echo '                documentation; wheel and sdist, built, installed elsewhere and used;'
+	@echo '                the tests of Gymnasium-Robotics'
+	@echo 'make bench-episodes  CPU time of logging, speed of loading'
 	@echo 'make env        only create $(VENV)'
 	@echo 'make clean      remove build products; distclean removes $(VENV) too'
 
