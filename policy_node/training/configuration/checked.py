@@ -25,6 +25,9 @@ class Range:
         return f'{_number(self.low)} ... {_number(self.high)}'
 
 
+# Floats represent all whole numbers up to here.
+LARGEST = 2**53
+
 Share = Annotated[float, Range(0, 1)]
 Below1 = Annotated[float, Range(0, 1 - 1e-6)]
 Total = Annotated[int, Range(0)]
@@ -92,7 +95,9 @@ def require_within(name: str, value: Any, kind: Any) -> None:
     choices, limits = choices_of(kind), range_of(kind)
     if choices and value not in choices:
         raise ValueError(f'{name} {value!r}; allowed: {", ".join(choices)}')
-    if plain_type(kind) in (int, float) and not math.isfinite(value):
+    if plain_type(kind) is int and abs(value) > LARGEST:
+        raise ValueError(f'{name} is too large; allowed: up to {LARGEST}')
+    if plain_type(kind) is float and not math.isfinite(value):
         raise ValueError(f'{name} {value} is no finite number')
     if limits and not limits.low <= value <= limits.high:
         raise ValueError(f'{name} {value}; allowed: {limits}')
@@ -113,7 +118,7 @@ def typed(name: str, value: Any, kind: Any) -> Any:
     if origin is dict and isinstance(value, dict):
         return {str(key): typed(name, each, float) for key, each in value.items()}
     value = value.item() if isinstance(value, np.generic) else value
-    if plain is float and type(value) is int:
+    if plain is float and type(value) is int and abs(value) <= LARGEST:
         return float(value)
     if type(value) is not plain:
         raise ValueError(f'{name} {value!r} is not of type {type_name(plain)}')

@@ -171,9 +171,11 @@ class TrainConfig(Checked):
         spec = task_spec(self.task, control_hz=self.collect.control_hz)
         goal_features(self.network.goal_features, spec)
         read_disturbances(self.collect.disturbances)
-        if not self.network.hidden_sizes or min(self.network.hidden_sizes) < 1:
-            sizes = self.network.hidden_sizes
-            raise ValueError(f'hidden_sizes {sizes}; allowed: one or more widths >= 1')
+        sizes = self.network.hidden_sizes
+        if not 1 <= len(sizes) <= 64 or not all(1 <= size <= MOST_UNITS for size in sizes):
+            raise ValueError(
+                f'hidden_sizes {str(sizes)[:80]}; allowed: 1 to 64 widths of 1 ... {MOST_UNITS}'
+            )
         _require_goals(self)
         _require_reward(self, spec)
         for holds, reason in _contradictions(self, spec):
@@ -207,6 +209,11 @@ class TrainConfig(Checked):
         return -self.tick_share / (1.0 - self.tick_gamma)
 
 
+# Largest width of a hidden layer.
+MOST_UNITS = 65_536
+# Noise of this standard deviation leaves next to nothing of actions in [-1, 1].
+_NOISE_ALONE = 10.0
+
 # Sources of goals. `real` keeps the goal of the episode.
 STRATEGIES = ('future', 'final', 'episode', 'random')
 SOURCES = ('real', *STRATEGIES, 'actual', 'next', 'near', 'displaced', 'outcome')
@@ -230,6 +237,48 @@ def unusual_networks(config: TrainConfig) -> list[str]:
     if isinstance(learner, OffPolicy) and learner.critic.quantiles > 1:
         found.append(f'quantiles {learner.critic.quantiles}')
     return found
+
+
+def idle_parts(config: TrainConfig) -> Iterator[str]:
+    """Yield a line for each part of learning that never happens with these values.
+
+    Three questions: will any update happen, will the targets ever move, will the policy ever act?
+    """
+    learner, total = config.learner, config.run.total_steps
+    updates = _updates_of(config)
+    if updates == 0 or learner.learning_rate == 0:
+        yield (
+            f'nothing will be learnt: {updates} updates with learning_starts '
+            f'{config.replay.learning_starts}, updates_per_cycle {learner.updates_per_cycle}, '
+            f'learning_rate {learner.learning_rate:g}, total_steps {total}'
+        )
+    elif learner.critic_first >= updates:
+        yield f'the actor will not learn: critic_first {learner.critic_first} of {updates} updates'
+    if not isinstance(learner, OffPolicy):
+        return
+    interval = learner.target_update_interval
+    if learner.target == 'polyak' and updates and (learner.polyak == 1 or interval > updates):
+        yield (
+            f'the targets will not move: polyak {learner.polyak:g}, target_update_interval '
+            f'{interval} of {updates} updates'
+        )
+    noise = learner.exploration
+    constant = noise.final_exploration == 1 and noise.random_epsilon == 1
+    if noise.random_steps >= total or constant or noise.noise_std >= _NOISE_ALONE:
+        yield (
+            f'the policy will not act while it collects: random_steps {noise.random_steps} of '
+            f'{total}, random_epsilon {noise.random_epsilon:g}, noise_std {noise.noise_std:g}'
+        )
+
+
+def _updates_of(config: TrainConfig) -> int:
+    """Return the number of updates of a whole run; time limits and resumed runs apart."""
+    ticks = task_spec(config.task, control_hz=config.collect.control_hz).episode_ticks
+    cycle = config.collect.num_envs * ticks
+    # The replay holds whole episodes, at least those of one cycle.
+    start = min(config.replay.learning_starts, max(config.replay.replay_transitions, cycle))
+    waiting = max(-(-start // cycle) - 1, 0)
+    return max(-(-config.run.total_steps // cycle) - waiting, 0) * config.learner.updates_per_cycle
 
 
 def _require_goals(config: TrainConfig) -> None:

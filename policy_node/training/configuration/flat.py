@@ -18,6 +18,7 @@ from typing import Any
 
 from msgs_spec.text import did_you_mean
 from policy_node.training.configuration.checked import (
+    LARGEST,
     Checked,
     Range,
     choices_of,
@@ -72,8 +73,6 @@ RESEARCH = (
 ).split()
 # Former and shorter names of options.
 _OTHER_NAMES = {'total_steps': ('--steps',), 'simulation_threads': ('--threads',)}
-# Floats represent all whole numbers up to here.
-_EXACT = 2**53
 
 
 def _groups_in(kind: Any) -> list[type[Checked]]:
@@ -387,7 +386,7 @@ def whole(text: str) -> int:
         return int(text)
     except ValueError:
         number = float(text)
-        if not number.is_integer() or abs(number) > _EXACT:
+        if not number.is_integer() or abs(number) > LARGEST:
             raise
         return int(number)
 

@@ -93,15 +93,9 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
     digest = checkpoint.checkpoint_hash(path)
     norm, valued_by = 'none', {}
     if source is not None:
-        state = read_state(source)
-        if state.extra.get('actor_sha256', digest) != digest:
-            raise ValueError(f'{source} is the critic of another actor than {path}')
-        config = config_from_dict(state.extra['config'])
-        _require_usual(config, str(source))
-        _require_critic_of(info, path, config, source)
+        critic, config = _critic_beside(source, path, info, digest)
         norm, valued_by = _norm(config), _valued_by(config)
-        critic = _unconditioned(part_of(state.tensors, 'critic'), config)
-        tensors |= {f'critic.{key}': value for key, value in critic.items()}
+        tensors |= critic
     origin = {
         'name': name,
         'critic': source is not None,
@@ -112,6 +106,24 @@ def _of_actor(name: str, path: Path) -> InitialNetworks:
         'init_from': info.init_from,
     }
     return InitialNetworks(tensors, info.shape, info.goal_features, norm, origin, valued_by)
+
+
+def _critic_beside(
+    source: Path, path: Path, info: ActorInfo, digest: str
+) -> tuple[dict[str, Tensor], TrainConfig]:
+    """Return the critic in a training state and the configuration that trained it.
+
+    Raises:
+        ValueError: If it is the critic of another actor, or no other run can start from it.
+    """
+    state = read_state(source)
+    if state.extra.get('actor_sha256', digest) != digest:
+        raise ValueError(f'{source} is the critic of another actor than {path}')
+    config = config_from_dict(state.extra['config'])
+    _require_usual(config, str(source))
+    _require_critic_of(info, path, config, source)
+    critic = _unconditioned(part_of(state.tensors, 'critic'), config)
+    return {f'critic.{key}': value for key, value in critic.items()}, config
 
 
 def _require_critic_of(info: ActorInfo, path: Path, config: TrainConfig, source: Path) -> None:

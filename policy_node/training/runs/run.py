@@ -22,7 +22,7 @@ from node_runtime.command_line import (
 )
 from node_runtime.signals import on_stop_signals
 from node_runtime.source_revision import source_revision
-from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config import TrainConfig, idle_parts
 from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import is_first_worker, join_workers, leave_workers
 from policy_node.training.machine.host import available_memory, why_too_large
@@ -117,27 +117,44 @@ def train_run(
     with lock_run(output) if is_first_worker() else contextlib.nullcontext():
         if not resume and (output / STATE_FILE).exists():
             raise UsageError(f'{output} holds a run; continue it with --resume or choose another')
-        try:
-            workers = join_workers(choose_device(config.machine.device))
-            trainer = Trainer(config, output, workers, command, source_revision(), networks)
-            if resume:
-                trainer.resume(output / STATE_FILE)
-            if experience is not None:
-                trainer.add_experience(experience)
-        except ValueError as error:
-            raise UsageError(str(error)) from None
-        except (MemoryError, RuntimeError) as error:
-            raise _without_memory(error) from None
+        trainer = _make_trainer(config, output, command, networks, resume, experience)
         if why := _too_large(trainer):
             complain(NAME, why)
         ending = _train_or_explain(trainer, output, command, caller, resume=resume)
-        if workers.is_first:
+        if trainer.workers.is_first:
             title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
             try:
                 draw_curve(read_progress(output / PROGRESS_FILE), title, output / CURVE_FILE)
             except OSError as error:
                 complain(NAME, f'no curve, the run itself is saved: {error}')
         return ending
+
+
+def _make_trainer(
+    config: TrainConfig,
+    output: Path,
+    command: str,
+    networks: InitialNetworks | None,
+    resume: bool,
+    experience: Episodes | None,
+) -> Trainer:
+    """Return the trainer with what it starts from.
+
+    Raises:
+        UsageError: If something does not fit the configuration or the memory of the machine.
+    """
+    try:
+        workers = join_workers(choose_device(config.machine.device))
+        trainer = Trainer(config, output, workers, command, source_revision(), networks)
+        if resume:
+            trainer.resume(output / STATE_FILE)
+        if experience is not None:
+            trainer.add_experience(experience)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    except (MemoryError, RuntimeError) as error:
+        raise _without_memory(error) from None
+    return trainer
 
 
 def _train_or_explain(
@@ -183,29 +200,18 @@ def _too_large(trainer: Trainer) -> str:
 def _train(
     trainer: Trainer, output: Path, command: str, caller: Caller | None, *, resume: bool
 ) -> Ending:
-    config, counters, log = trainer.config, trainer.counters, None
-    on_cycle = caller.on_cycle if caller else None
-
-    def tell(row: Row) -> None:
-        if on_cycle is None:
-            return
-        try:
-            result = on_cycle(row)
-        except Exception as error:
-            raise _OfCallerError(error) from error
-        if isinstance(result, bool | np.bool_) and not result:
-            trainer.stop('stopped by on_cycle')
-
+    log = None
     if trainer.workers.is_first:
-        if not resume and (said := set_former_run_aside(output)):
-            complain(NAME, said)
-        # One line for each part; of a run that was killed before anything was saved there is none.
-        if not resume or counters.env_steps < config.run.total_steps:
-            with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
-                file.write(command + '\n')
-        limits = config.run.total_steps, config.run.time_limit
-        quiet = caller is not None and caller.quiet
-        log = RunLog(output, *limits, counters.env_steps, quiet=quiet, on_row=tell)
+        _prepare_folder(trainer, output, command, resume)
+        config, on_row = trainer.config, _row_listener(trainer, caller)
+        log = RunLog(
+            output,
+            config.run.total_steps,
+            config.run.time_limit,
+            trainer.counters.env_steps,
+            quiet=caller is not None and caller.quiet,
+            on_row=on_row,
+        )
     try:
         with _stop_on_signals(trainer, is_guest=caller is not None) as received:
             reason = trainer.train(log)
@@ -213,6 +219,35 @@ def _train(
         if log is not None:
             log.close()
     return Ending(reason, trainer.counters, received[0] if received else 0)
+
+
+def _prepare_folder(trainer: Trainer, output: Path, command: str, resume: bool) -> None:
+    """Set files of an earlier run aside, record the command and warn of idle parts."""
+    if not resume and (said := set_former_run_aside(output)):
+        complain(NAME, said)
+    # One line for each part; a run that was killed before its first checkpoint leaves none.
+    if not resume or trainer.counters.env_steps < trainer.config.run.total_steps:
+        with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
+            file.write(command + '\n')
+    for line in idle_parts(trainer.config):
+        complain(NAME, line)
+
+
+def _row_listener(trainer: Trainer, caller: Caller | None) -> Callable[[Row], None] | None:
+    """Return the function that passes each cycle to the caller, or None."""
+    on_cycle = caller.on_cycle if caller else None
+    if on_cycle is None:
+        return None
+
+    def tell(row: Row) -> None:
+        try:
+            result = on_cycle(row)
+        except Exception as error:
+            raise _OfCallerError(error) from error
+        if isinstance(result, bool | np.bool_) and not result:
+            trainer.stop('stopped by on_cycle')
+
+    return tell
 
 
 @contextlib.contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -99,13 +100,20 @@ class RunLog:
             self._live.start()
 
     def write(self, row: Row) -> None:
-        """Records one cycle; None leaves a column empty."""
+        """Record one cycle; None leaves a column empty.
+
+        Raises:
+            OSError: If the log was removed, or there is no room for it.
+        """
+        if not self.path.is_file():
+            raise OSError(f'{self.path} was removed while the run trained')
         self._writer.writerow({name: _short(row.get(name)) for name in COLUMNS})
         self._file.flush()
         if self._board is not None:
             for name, value in row.items():
                 if value is not None and name != 'env_steps':
                     self._board.add_scalar(name, value, int(row['env_steps'] or 0))
+            self._board.flush()
         if not self._quiet:
             self._show(row)
         if self._on_row is not None:
@@ -117,7 +125,7 @@ class RunLog:
         if self._live.is_started:
             self._live.stop()
         self._file.close()
-        if self._board is not None:
+        if self._board is not None and self.path.is_file():
             self._board.close()
 
     def _show(self, row: Row) -> None:
@@ -194,7 +202,10 @@ def _tensorboard(output: Path, resumed_steps: int) -> Any:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         return None
-    return SummaryWriter(str(output / BOARD_FOLDER), purge_step=resumed_steps + 1)
+    # `RunLog.write` flushes: in a thread of TensorBoard an error would be a traceback.
+    never = threading.TIMEOUT_MAX / 2
+    folder = str(output / BOARD_FOLDER)
+    return SummaryWriter(folder, purge_step=resumed_steps + 1, flush_secs=never)
 
 
 def read_progress(path: str | Path) -> list[dict[str, float]]:

@@ -48,6 +48,8 @@ from policy_node.training.runs.training_state import (
     require_readable,
 )
 
+Submit = Callable[..., 'Future[Collected]']
+
 # Steps that a resumed run without these episodes collects before it goes on.
 MOST_REFILLED = 100_000
 
@@ -226,31 +228,36 @@ class Trainer:
                 return self._stop_reason or 'another worker stopped'
             self._warn_of_rewards(collected.episodes)
             while True:
-                before = time.monotonic()
-                self._absorb(collected)
-                job = None
-                if self.config.machine.overlap:
-                    # At the end the actor after this cycle is evaluated, not the one before it.
-                    is_last = self._ended() is not None
-                    job = submit(self._collect, *self._prepare_collection(may_evaluate=not is_last))
-                losses = self._learn()
-                if job is None:
-                    job = submit(self._collect, *self._prepare_collection())
-                collected = self._collect_or_explain(job)
-                clock.write(self.counters)
-                knows = self.counters.updates > 0 or bool(self.config.network.init_from)
-                if collected.evaluation is None and knows and self._ended():
-                    # Noise and learning rate have fallen, and nothing else would measure it.
-                    last = self._actor_to_evaluate()
-                    collected = submit(self._evaluate, collected, last).result()
-                self._keep_best(collected)
-                if log is not None:
-                    log.write(self._row(collected, losses, time.monotonic() - before))
-                reason = self._reason_to_stop()
-                if reason:
+                collected = self._run_cycle(collected, submit, clock, log)
+                if reason := self._reason_to_stop():
                     self.save()
                     return reason
                 self._saver.save_when_due(self.learner, self.experience, self.counters)
+
+    def _run_cycle(
+        self, collected: Collected, submit: Submit, clock: RunClock, log: RunLog | None
+    ) -> Collected:
+        """Store and learn from the episodes of one cycle while those of the next are collected."""
+        before = time.monotonic()
+        self._store(collected)
+        if self.config.machine.overlap:
+            # At the end the actor after this cycle is evaluated, not the one before it.
+            may_evaluate = self._ended() is None
+            job = submit(self._collect, *self._prepare_collection(may_evaluate))
+            losses = self._learn()
+        else:
+            losses = self._learn()
+            job = submit(self._collect, *self._prepare_collection())
+        collected = self._collect_or_explain(job)
+        clock.write(self.counters)
+        knows = self.counters.updates > 0 or bool(self.config.network.init_from)
+        if collected.evaluation is None and knows and self._ended():
+            # Noise and learning rate have fallen, and nothing else would measure it.
+            collected = submit(self._evaluate, collected, self._actor_to_evaluate()).result()
+        self._keep_best(collected)
+        if log is not None:
+            log.write(self._row(collected, losses, time.monotonic() - before))
+        return collected
 
     def _warn_of_rewards(self, episodes: Episodes) -> None:
         """Says that values of a task's own rewards are clipped where these are above 0."""
@@ -266,7 +273,7 @@ class Trainer:
                 'of rewards within -1 ... 0, so that nothing is learnt of more',
             )
 
-    def _collect_first(self, submit: Callable[..., Future[Collected]]) -> Collected | None:
+    def _collect_first(self, submit: Submit) -> Collected | None:
         """Fills the replay of a resumed run that has lost it, then collects the first cycle.
 
         None where the run is stopped before: it has nothing to learn from yet.
@@ -320,7 +327,7 @@ class Trainer:
         require_finite_episodes(collected.episodes, self.counters)
         return collected
 
-    def _absorb(self, collected: Collected) -> None:
+    def _store(self, collected: Collected) -> None:
         """Puts new episodes into the replay and into the normalisers."""
         episodes = collected.episodes
         if len(episodes):

@@ -11,7 +11,7 @@ import pytest
 
 from msgs_spec.tasks import TASKS
 from node_runtime.command_line import CommandParser
-from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.config import TrainConfig, idle_parts
 from policy_node.training.configuration.flat import (
     FIELDS,
     RESEARCH,
@@ -205,6 +205,9 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ({'importance': 'decision'}, 'has no effect: it needs algorithm ppo'),
         ({'goals': 'outcome=.8'}, 'goals outcome needs algorithm ppo'),
         ({'first_value': -50.0}, 'has no effect: it needs algorithm ppo'),
+        ({'total_steps': 10**400}, 'total_steps is too large; allowed: up to 9007'),
+        ({'gamma': 10**400}, 'gamma 1.* is not of type float'),
+        ({'hidden_sizes': (10**400,)}, 'allowed: 1 to 64 widths'),
         ({'control_hz': 0.0}, 'control_hz'),
         ({'control_hz': float('nan')}, 'control_hz'),
         ({'control_hz': 60.0}, 'control_hz'),
@@ -214,6 +217,31 @@ def test_bad_values_are_refused(changes: dict[str, object], match: str) -> None:
     with pytest.raises(ValueError, match=match) as raised:
         recipe_config(**{'task': 'FetchPush', 'recipe': 'best', **changes})
     assert '\n' not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'idle'),
+    [
+        ({}, []),
+        ({'learning_starts': 100_000}, ['nothing']),
+        ({'updates_per_cycle': 0}, ['nothing']),
+        ({'learning_rate': 0.0}, ['nothing']),
+        ({'critic_first': 10_000}, ['actor']),
+        ({'polyak': 1.0}, ['targets']),
+        ({'target_update_interval': 10**9}, ['targets']),
+        ({'random_steps': 40_000}, ['policy']),
+        ({'noise_std': 1e9}, ['policy']),
+        ({**PPO, 'learning_starts': 100_000}, ['nothing']),
+    ],
+)
+def test_idle_parts_of_learning_are_named_in_a_line(
+    changes: dict[str, object], idle: list[str]
+) -> None:
+    lines = [*idle_parts(recipe_config('FetchReach', 'best', **changes))]
+    assert [
+        word for word in ('nothing', 'actor', 'targets', 'policy') if word in str(lines)
+    ] == idle
+    assert len(lines) == len(idle)
 
 
 def test_an_unknown_recipe_or_stored_field_is_refused() -> None:
