@@ -4,7 +4,7 @@
 
 A critic that promises more than there is cannot tell the actor what is better. Two things make it
 do so: actors seek the actions that it errs on, and goals chosen in hindsight count every landing
-as meant (docs/training.md).
+as meant (docs/her_and_recipes.md).
 """
 
 from __future__ import annotations

@@ -193,7 +193,7 @@ def _object_in_hand(task: str) -> dict[str, Any]:
     """The tasks with an object in the hand, and those of other packages that are not called Fetch.
 
     51 samples per environment step, as the paper has. Nothing stays unmoved in a hand. Symmetry
-    doubles the speed of the egg; for the block it is not decided (docs/training.md).
+    doubles the speed of the egg; for the block it is not decided (docs/lab_notes/training_log.md).
     """
     spec = task_spec(task)
     return _FETCH | {
@@ -214,7 +214,7 @@ def _finetune(task: str) -> dict[str, Any]:
     """From the shipped actor, which touches its goals, to one that holds them.
 
     Goals that are not chosen by where steps led, a short horizon and an actor that learns slowly
-    keep the critic from promising what there is not (docs/training.md).
+    keep the critic from promising what there is not (docs/lab_notes/training_log.md).
     """
     if not task.startswith('HandManipulate'):
         raise ValueError(f'recipe finetune is for the tasks with an object in the hand, not {task}')

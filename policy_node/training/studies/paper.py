@@ -49,7 +49,7 @@ STARTS_FROM = {
     'HandManipulatePenFull': 'HandManipulatePenRotate',
 }
 # Settings that preserve trained networks: a full replay before the first update, smaller steps and
-# less noise. Where goals gain a position, they are coarse at first (docs/training.md).
+# less noise. Where goals gain a position, they are coarse at first (docs/lab_notes).
 _FINE_TUNING = {
     'learning_starts': 100_000,
     'learning_rate': 5e-4,

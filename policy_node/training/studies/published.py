@@ -78,7 +78,7 @@ CEILINGS: dict[str, float] = {
     'HandManipulatePenRotate': 0.925,
     'HandManipulatePenFull': 0.926,
 }
-"""Share of goals that can be reached at all, where it was computed (docs/training.md, Ceilings)."""
+"""Share of goals that can be reached at all, where it was computed (docs/results.md, Ceilings)."""
 
 _NOT_PUBLISHED = 'no number found'
 

@@ -61,8 +61,8 @@ def test_every_field_is_explained() -> None:
 
 
 def switches() -> dict[str, str]:
-    """Rows of the tables of switches in docs/training.md, by field."""
-    page = (ROOT / 'docs' / 'training.md').read_text()
+    """Rows of the tables of switches in the reference, by field."""
+    page = (ROOT / 'docs' / 'reference' / 'training_fields.md').read_text()
     rows = re.findall(r'^\| (`.*) \|$', page.partition('## Switches')[2].split('\n## ')[0], re.M)
     return {field: row for row in rows for field in re.findall(r'(\w+)=', row.split(' | ')[0])}
 
