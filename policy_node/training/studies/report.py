@@ -142,7 +142,7 @@ def format_study(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
     """Return the Markdown table of a study: a variant per row, quartiles beside each median."""
     labels = {arm.name: arm.label for arm in study.arms}
     lines = [
-        f'| task | arm | seeds | area | steps to {GOOD_SUCCESS} (reached) | final success '
+        f'| task | variant | seeds | area | steps to {GOOD_SUCCESS} (reached) | final success '
         '| processor time, s | area in equal time | samples per s | against the baseline |',
         '| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |',
     ]
@@ -150,7 +150,7 @@ def format_study(study: Study, arms: Sequence[Mapping[str, Any]]) -> str:
         steps = row[f'steps_to_{GOOD_SUCCESS}_median']
         cells = [
             row['task'],
-            f'`{row["arm"]}`: {labels.get(row["arm"], "an arm of before")}',
+            f'`{row["arm"]}`: {labels.get(row["arm"], "former variant")}',
             str(row['seeds']),
             _quartiles(row, 'area'),
             f'{steps:,} ({row["reached"]})' if steps != '' else f'censored ({row["reached"]})',
@@ -192,7 +192,7 @@ def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, A
         if enough and is_significant(row, found[0], name):
             better = row[f'{name}_median'] > found[0][f'{name}_median']
             words.append(f'{label} {"better" if better else "worse"}')
-    return ', '.join(words) or 'not apart'
+    return ', '.join(words) or 'no significant difference'
 
 
 def _quartiles(row: Mapping[str, Any], name: str) -> str:

@@ -297,7 +297,7 @@ def test_time_is_compared_on_machines_of_the_baseline(
     assert (none3['timed'], none3['area_in_time_median']) == (0, '')
     lines = format_study(study, [one, none3, none5]).splitlines()
     assert lines[3].endswith('| 0.500 (0.500 ... 0.500) | - | - | - | fewer than five seeds |')
-    assert lines[4].count(', of 2 | ') == 3 and lines[4].endswith('| not apart |')
+    assert lines[4].count(', of 2 | ') == 3 and lines[4].endswith('| no significant difference |')
 
 
 def test_an_equal_run_of_another_study_is_copied(
