@@ -69,13 +69,14 @@ def test_single_simulations_equal_the_reference(task, twin_seeds, play_reference
 
 
 @pytest.mark.parametrize('task', TASKS)
-def test_a_batch_of_64_with_dense_reward_equals_the_reference(task, twin_seeds, play_reference):
+def test_a_batch_with_dense_reward_equals_the_reference(task, twin_seeds, play_reference):
     reference = play_reference(task, len(twin_seeds))
-    simulation = Simulation(task, num_envs=64, num_threads=3, reward_type='dense')
-    # The compared episodes are the last ones, beside others that go their own way.
-    ours = play(simulation, list(range(63, -1, -1)))
-    seeds = np.array(twin_seeds)
-    assert_equal({name: rows[63 - seeds] for name, rows in ours.items()}, reference)
+    # The compared episodes are the last ones of a larger batch.
+    count = 8 * len(twin_seeds)
+    simulation = Simulation(task, num_envs=count, num_threads=3, reward_type='dense')
+    ours = play(simulation, list(reversed(range(count))))
+    seeds = count - 1 - np.array(twin_seeds)
+    assert_equal({name: rows[seeds] for name, rows in ours.items()}, reference)
 
 
 @pytest.mark.parametrize('task', ['HandReach', 'HandManipulateEggFull'])
