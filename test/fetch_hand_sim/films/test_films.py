@@ -318,12 +318,12 @@ def test_a_camera_that_is_not_there_is_one_line(folder, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ('name', 'option', 'of'),
-    [('x.gif', '--frame', 'a picture (.png, .jpg)'), ('x.PNG', '--speed', 'a film (.mp4, .gif')],
+    [('x.gif', '--frame', 'pictures (.png, .jpg)'), ('x.PNG', '--speed', 'films (.mp4, .gif')],
 )
 def test_what_a_kind_of_file_has_no_use_for_is_refused(folder, tmp_path, name, option, of, capsys):
     assert episodes_film([str(folder), '--out', str(tmp_path / name), option, '2']) == 2
     error = capsys.readouterr().err
-    assert f'{option} is of {of}' in error and error.count('\n') == 1
+    assert f'{option} is for {of}' in error and error.count('\n') == 1
     assert list(tmp_path.iterdir()) == []
 
 
