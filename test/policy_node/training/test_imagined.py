@@ -10,6 +10,7 @@ import torch
 
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.flat import to_flat
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.learners.imagined import ImaginingDDPG
 from policy_node.training.machine.distributed import Workers
@@ -87,7 +88,8 @@ def test_the_actor_is_drawn_to_what_it_does_for_the_subgoal() -> None:
 
     # Until the copy moves for the first time it is the actor as it was.
     before = distance()
-    learner.config = configured(subgoal_prior=5.0, target_update_interval=1, polyak=0.0)
+    moving = configured(subgoal_prior=5.0, target_update_interval=1, polyak=0.0)
+    learner.config, learner.options = moving, moving.learner
     for _ in range(200):
         learner.update(batch)
     assert distance() < 0.1 * before
@@ -132,4 +134,4 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
 def test_best_imagines_where_it_pays_and_nothing_else_is_asked_for(
     task: str, changes: dict[str, object], prior: float
 ) -> None:
-    assert recipe_config(task, 'best', **changes).subgoal_prior == prior
+    assert to_flat(recipe_config(task, 'best', **changes))['subgoal_prior'] == prior

@@ -66,7 +66,7 @@ def test_the_record_says_all_that_was_given(tmp_path):
     fields = {name: value for name, value in SMALL.items() if name != 'quiet'}
     train('FetchReach', tmp_path, recipe='best', total_steps=400, goals='future=.8', **SMALL)
     train('FetchReach', tmp_path, resume=True, gamma=np.float64(0.9), total_steps=800, quiet=True)
-    named = {'recipe': 'best', 'total_steps': 400, 'goals': 'future=.8', **fields}
+    named = {'recipe': 'best', 'total_steps': 400, 'goals': {'future': 0.8}, **fields}
     first = ''.join(f', {name}={value!r}' for name, value in named.items())
     assert (tmp_path / 'command.txt').read_text().splitlines() == [
         f"policy_node.training.train('FetchReach', {str(tmp_path)!r}{rest})"
