@@ -22,11 +22,13 @@ from fetch_hand_sim.gym_envs.task_attributes import (
     TaskAttributes,
     check_reset_options,
     goals_of_options,
+    variation_of,
 )
 from fetch_hand_sim.simulation import Observation, Simulation
 from fetch_hand_sim.simulation.arguments import finite_goal
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
 from msgs_spec.arrays import Array
+from msgs_spec.disturbances import Disturbances
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
 
 
@@ -55,6 +57,8 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             `azimuth`, `elevation` (degrees) and `lookat` (m); None for the task's view.
         distance_threshold: Success within this distance, metres; None for the task's own.
         rotation_threshold: Success within this rotation, radians; None for the task's own.
+        disturbances: Delays, noise, other physics: a preset (`hardware`, `hardware*0.5`), a
+            mapping, a JSON or YAML file or `Disturbances`; None for an undisturbed robot.
 
     Raises:
         ValueError: If an argument is not allowed; the message says what is.
@@ -77,6 +81,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         default_camera_config: Mapping[str, Any] | None = None,
         distance_threshold: float | None = None,
         rotation_threshold: float | None = None,
+        disturbances: Disturbances | Mapping[str, Any] | str | None = None,
     ) -> None:
         check_render_mode(render_mode)
         self.simulation = Simulation(
@@ -87,6 +92,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             success_rule=success_rule,
             control_hz=control_hz,
             keeps_data=True,
+            disturbances=disturbances,
         )
         self.spec_of_task = self.simulation.spec
         self.metadata = {**self.metadata, 'render_fps': render_fps(control_hz)}
@@ -108,6 +114,8 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             options: `goal`, (goal size,): the desired goal, instead of one that is drawn. As
                 `Simulation.set_goal` takes it, quaternions are normalised and taken in the
                 hemisphere nearest to the object's. What else is drawn stays that of the seed.
+                `variation`, a dictionary: values of this episode in place of drawn ones, such as
+                `{'friction': 0.7}` (`Simulation.variation` has the names; needs `disturbances`).
 
         Returns:
             The observation, and an empty dictionary.
@@ -117,13 +125,14 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             ValueError: If an option is unknown or the goal is none.
             gymnasium.error.Error: If the seed is no integer or negative.
         """
-        check_reset_options(options, allowed=('goal',))
+        check_reset_options(options, allowed=('goal', 'variation'))
         asked = goals_of_options(options, np.ones(1, dtype=bool), self.spec_of_task)
         super().reset(seed=seed)
         self._physics.send()
         self._release_goal()
         draws_goals = self._draws_goals()
-        observation = _first(self.simulation.reset(seed=[self.np_random]))
+        variation = variation_of(options)
+        observation = _first(self.simulation.reset(seed=[self.np_random], variation=variation))
         self._physics.receive()
         if asked is not None:
             self.simulation.set_goal(asked)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
 
@@ -16,6 +18,9 @@ class SharedPhysics:
     itself; so does what was written into the model. Nothing is copied before somebody asks.
     """
 
+    # Values of the model when it was first shared, where its physics vary.
+    _unchanged: dict[str, NDArray[Any]] | None = None
+
     def __init__(self, simulation: Simulation) -> None:
         """Shares the first copy of a simulation that keeps its data."""
         self._simulation = simulation
@@ -25,6 +30,8 @@ class SharedPhysics:
     @property
     def model(self) -> mujoco.MjModel:
         """The compiled model, always the same object."""
+        if not self._shares_model and self._simulation.varies_physics:
+            self._unchanged = _values(self._simulation.model)
         self._shares_model = True
         return self._simulation.model
 
@@ -39,9 +46,16 @@ class SharedPhysics:
     def send(self) -> None:
         """Takes over what was written; to be called before anything is computed."""
         if self._shares_model:
-            self._simulation.apply_model_changes()
+            self._send_model()
         if self._data is not None:
             self._simulation.write_data(0, self._data)
+
+    def _send_model(self) -> None:
+        if self._unchanged is not None and self._simulation.varies_physics:
+            model = self._simulation.model
+            if all(np.array_equal(now, self._unchanged[n]) for n, now in _values(model).items()):
+                return
+        self._simulation.apply_model_changes()
 
     def receive(self) -> None:
         """Shows what was computed."""
@@ -51,3 +65,14 @@ class SharedPhysics:
     def __getstate__(self) -> dict[str, Any]:
         """The data is read from the simulation again."""
         return self.__dict__ | {'_data': None}
+
+
+def _values(model: mujoco.MjModel) -> dict[str, NDArray[Any]]:
+    """Return copies of the arrays of a model and of its options."""
+    found = {}
+    for owner in (model, model.opt):
+        for name in dir(owner):
+            value = None if name.startswith('_') else getattr(owner, name)
+            if isinstance(value, (np.ndarray, float, int)):
+                found[f'{type(owner).__name__}.{name}'] = np.array(value)
+    return found

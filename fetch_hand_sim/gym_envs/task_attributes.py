@@ -167,6 +167,11 @@ def check_reset_options(options: Any, allowed: tuple[str, ...]) -> None:
             raise ValueError(f'reset option {name!r} is not known; allowed: {known}')
 
 
+def variation_of(options: Any) -> Any:
+    """Return the variation that options of `reset` ask for, or None."""
+    return (options or {}).get('variation')
+
+
 def goals_of_options(options: Any, mask: NDArray[np.bool_], spec: TaskSpec) -> Array | None:
     """The goals that options of `reset` ask for; checked before anything has moved.
 

@@ -19,11 +19,13 @@ from fetch_hand_sim.gym_envs.task_attributes import (
     TaskAttributes,
     check_reset_options,
     goals_of_options,
+    variation_of,
 )
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.arguments import finite_goal, require_whole
 from fetch_hand_sim.simulation.rendering import HEIGHT, WIDTH
 from msgs_spec.arrays import Array, Flags
+from msgs_spec.disturbances import Disturbances
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
 
 # What Gymnasium takes for episodes that no number of steps ends.
@@ -61,7 +63,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         default_camera_config: Attributes of `mujoco.MjvCamera`; None for the task's view.
         distance_threshold: Success within this distance, metres; None for the task's own.
         rotation_threshold: Success within this rotation, radians; None for the task's own.
-        disable_env_checker: Of no account; `gymnasium.make_vec` hands it to batches, too.
+        disable_env_checker: Ignored; `gymnasium.make_vec` passes it to batches too.
+        disturbances: As `FetchHandEnv` takes them.
 
     Raises:
         ValueError: If an argument is not allowed; the message says what is.
@@ -91,6 +94,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         distance_threshold: float | None = None,
         rotation_threshold: float | None = None,
         disable_env_checker: bool | None = None,
+        disturbances: Disturbances | Mapping[str, Any] | str | None = None,
     ) -> None:
         if max_episode_steps is not None:
             require_whole('max_episode_steps', max_episode_steps)
@@ -111,6 +115,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             reward_type=reward_type,
             success_rule=success_rule,
             control_hz=control_hz,
+            disturbances=disturbances,
         )
         self.spec_of_task = self.simulation.spec
         self.num_envs = num_envs
@@ -153,7 +158,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
                 generators go on.
             options: `reset_mask`, booleans (N,): which environments start again; default all.
                 `goal`, (N, goal size) or (goal size,) for all of them: desired goals of those that
-                start, as `FetchHandEnv.reset` takes one.
+                start, as `FetchHandEnv.reset` takes one. `variation`, likewise, for all that start.
 
         Returns:
             The observations of all environments, in the order of the space, and an empty
@@ -175,7 +180,9 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         goals = goals_of_options(options, mask, self.spec_of_task)
         ids = np.flatnonzero(mask)
         seeds = self._each_seed(seed)
-        observation = self.simulation.reset(seed=[seeds[i] for i in ids.tolist()], ids=ids)
+        observation = self.simulation.reset(
+            seed=[seeds[i] for i in ids.tolist()], ids=ids, variation=variation_of(options)
+        )
         for index in ids.tolist():
             if seeds[index] is not None:
                 self._seeds[index] = seeds[index]
@@ -395,7 +402,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         ]
 
     def _reset_mask(self, options: Any) -> Flags:
-        check_reset_options(options, allowed=('reset_mask', 'goal'))
+        check_reset_options(options, allowed=('reset_mask', 'goal', 'variation'))
         if not options or 'reset_mask' not in options:
             return np.ones(self.num_envs, dtype=bool)
         mask = options['reset_mask']

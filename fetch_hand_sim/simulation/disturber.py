@@ -14,7 +14,7 @@ from fetch_hand_sim.simulation.tasks import Task
 from fetch_hand_sim.simulation.varied_physics import VariedPhysics, joint_dofs
 from msgs_spec.actions import command_limits
 from msgs_spec.arrays import Array
-from msgs_spec.disturbances import MOST_TICKS, Disturbances
+from msgs_spec.disturbances import MOST_TICKS, Disturbances, PhysicsDisturbance
 from msgs_spec.observations import Readings
 from msgs_spec.robots import FINGERTIPS
 from msgs_spec.rotations import quaternion_multiply
@@ -39,6 +39,7 @@ _SPANS = {
     'table_height': ('physics', 'table_height'),
 }
 VARIATIONS = (*_SPANS, 'gravity_tilt', 'gravity_direction')
+_PHYSICS = [each.name for each in fields(PhysicsDisturbance)]
 # Topics computed from the joint sensors, and the sites whose poses they hold.
 _LED = {
     'end_effector_pose': ('robot0:grip',),
@@ -110,6 +111,24 @@ class Disturber:
         return bool(joints.noise or joints.bias or joints.resolution)
 
     # Episodes
+
+    def allow(self, given: Mapping[str, Any]) -> dict[str, float]:
+        """Return variations that a user asks for as numbers, and make them possible.
+
+        Raises:
+            ValueError: If a name is unknown, a value is not allowed or the task lacks what it
+                changes.
+        """
+        wanted = {name: _variation(name, value) for name, value in given.items()}
+        for name in wanted:
+            if name in _PHYSICS:
+                self._physics.allow(name)
+        return wanted
+
+    @property
+    def varies_physics(self) -> bool:
+        """True if simulations differ from the model."""
+        return bool(self._physics.names)
 
     def start_nominal(self, ids: Ids) -> None:
         """Restore the model's physics, in which the task draws its start state."""
@@ -325,12 +344,14 @@ class Disturber:
 
     def state(self) -> dict[str, Any]:
         """Return everything that decides the future, for `pickle` and `copy.deepcopy`."""
-        return {name: getattr(self, name) for name in _STATE}
+        return {name: getattr(self, name) for name in _STATE} | {'varied': self._physics.names}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue from what `state` returned."""
         for name in _STATE:
             setattr(self, name, state[name])
+        for name in state.get('varied', ()):
+            self._physics.allow(name)
         self._physics.restore(self._all)
         self._physics.apply(self._all, self.variations)
 
@@ -348,6 +369,19 @@ _STATE = (
     '_true',
     '_held',
 )
+
+
+def _variation(name: str, value: Any) -> float:
+    """Return the value of a variation, or raise a `ValueError` that says what is allowed."""
+    if name not in VARIATIONS:
+        known = ', '.join(VARIATIONS)
+        raise ValueError(f'variation {name!r:.40} is unknown; allowed: {known}')
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise ValueError(f'variation {name}={value!r:.40}; allowed: one finite number')
+    if name != 'gravity_direction':
+        group, field_name = _SPANS.get(name, ('physics', name))
+        Disturbances.from_dict({group: {field_name: value}})
+    return float(value)
 
 
 def _turned(quaternion: Array, turn: Array) -> Array:

@@ -144,6 +144,8 @@ class Simulation:
         self._is_started = np.zeros(num_envs, dtype=np.bool_)
         self._process = os.getpid()
         self._disturber: Disturber | None = None
+        # Variations that the episodes that begin now do not draw.
+        self._given: dict[str, float] = {}
         self.disturbances = disturbances
 
     def __repr__(self) -> str:
@@ -206,7 +208,16 @@ class Simulation:
         self._task.write_data(self._index(index), data)
 
     def apply_model_changes(self) -> None:
-        """Step with `model` as it is now; the simulation keeps its own copy."""
+        """Step with `model` as it is now; the simulation keeps its own copy.
+
+        Raises:
+            ValueError: If disturbances vary the physics of each episode.
+        """
+        if self.varies_physics:
+            raise ValueError(
+                f'the model of {self.spec.name} cannot be changed while disturbances vary its '
+                'physics; leave out the group physics'
+            )
         self._model_may_change = True
         self._task.follow_model()
 
@@ -217,7 +228,12 @@ class Simulation:
             generator = self._generators[index] = seeding.np_random(None)[0]
         return generator
 
-    def reset(self, seed: Seeds = None, ids: ArrayLike | None = None) -> Observation:
+    def reset(
+        self,
+        seed: Seeds = None,
+        ids: ArrayLike | None = None,
+        variation: Mapping[str, Any] | None = None,
+    ) -> Observation:
         """Start new episodes.
 
         Args:
@@ -225,22 +241,29 @@ class Simulation:
                 order, or None to continue the random generators. The same seed gives the
                 reference's draws. A generator in place of a seed is used from then on.
             ids: Indices or a boolean mask (N,) of the simulations; None for all.
+            variation: Values for these episodes in place of drawn ones, by the names of
+                `Simulation.variation`; for simulations with `disturbances`.
 
         Returns:
             The observations of all N simulations.
 
         Raises:
-            ValueError: If a seed is negative, or ids or seeds do not match the simulations.
+            ValueError: If a seed is negative, ids or seeds do not match the simulations, or a
+                variation is unknown or impossible; nothing has moved then.
             TypeError: If a seed is not an integer.
             RuntimeError: If the object never stays on the palm, or this process was forked and
                 lacks the threads of the batch.
         """
         selected = self._select(ids)
+        self._given = self._given_variation(variation)
         fresh = generators(seed, selected)
         for index, generator in zip(selected.tolist(), fresh, strict=True):
             self._generators[index] = generator or self._generators[index]
-        if selected.size:
-            self._start(np.sort(selected))
+        try:
+            if selected.size:
+                self._start(np.sort(selected))
+        finally:
+            self._given = {}
         return self.observe()
 
     def step(self, actions: ArrayLike) -> StepResult:
@@ -359,6 +382,11 @@ class Simulation:
         self._disturber = None if chosen.is_off else Disturber(self._task, chosen)
         self._is_started[:] = False
 
+    @property
+    def varies_physics(self) -> bool:
+        """True if the physics of an episode may differ from `model`."""
+        return self._disturber is not None and self._disturber.varies_physics
+
     def variation(self, index: int) -> dict[str, float]:
         """Return what the running episode of a simulation drew from its disturbances."""
         if self._disturber is None:
@@ -426,6 +454,18 @@ class Simulation:
         self._is_pushed = state.get('is_pushed', False)
         self._is_started[:] = state.get('is_started', True)
 
+    def _given_variation(self, variation: Mapping[str, Any] | None) -> dict[str, float]:
+        if variation is None:
+            return {}
+        if not isinstance(variation, Mapping):
+            raise ValueError(f'variation {variation!r:.60}; allowed: a mapping of names to numbers')
+        if self._disturber is None:
+            raise ValueError(
+                f'variation {dict(variation)!r:.60} has no effect on an undisturbed robot; '
+                "set disturbances, such as 'mild'"
+            )
+        return self._disturber.allow(variation)
+
     def _start(self, ids: NDArray[np.intp]) -> None:
         """Begin episodes of simulations `ids`: state and physics first, then goals."""
         self._require_threads()
@@ -436,7 +476,7 @@ class Simulation:
             self._disturber.start_nominal(ids)
         self.goals[ids] = self._task.reset(ids, own)
         if self._disturber is not None:
-            self._disturber.start(ids, streams)
+            self._disturber.start(ids, streams, self._given)
         self._divergence.forget()
         self._is_started[ids] = True
 

@@ -68,6 +68,11 @@ class VariedPhysics:
             return bool(self._task.model.nu)
         return name != 'damping' or not self._task.spec.robot.has_gripper_command
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The variations that are possible."""
+        return tuple(self._names)
+
     def allow(self, name: str) -> None:
         """Make a variation possible that is off by default.
 
@@ -78,13 +83,19 @@ class VariedPhysics:
             return
         if not self._has(name):
             raise ValueError(f'{self._task.spec.name} has no {name} to vary')
-        self._names.append(name)
         self._expand(name)
+        self._names.append(name)
 
     def _expand(self, name: str) -> None:
         for field in _FIELDS[name]:
             if field not in self._live:
-                self._live[field] = self._task.batch.expand(field)
+                try:
+                    self._live[field] = self._task.batch.expand(field)
+                except mujoco.FatalError:
+                    raise ValueError(
+                        f'{name} cannot vary after the model was shared or changed; vary it by the '
+                        'disturbances with which the simulation is made'
+                    ) from None
                 self._nominal[field] = self._live[field][0].copy()
 
     def restore(self, ids: Ids) -> None:
