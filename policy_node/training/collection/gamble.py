@@ -67,9 +67,11 @@ class GambleSimulation(Simulation):
         for name, values in state['gamble'].items():
             setattr(self, name, values.copy())
 
-    def reset(self, seed: Seeds = None, ids: ArrayLike | None = None) -> Observation:
+    def reset(
+        self, seed: Seeds = None, ids: ArrayLike | None = None, variation: Any = None
+    ) -> Observation:
         """Starts simulations again, as `Simulation.reset`; the landing is drawn after the goal."""
-        return self._seen(super().reset(seed, ids))
+        return self._seen(super().reset(seed, ids, variation))
 
     def _start(self, ids: NDArray[np.intp]) -> None:
         super()._start(ids)
