@@ -274,9 +274,7 @@ def test_a_full_disk_is_said_with_the_file_and_what_is_left(
     assert said.endswith(kept if resumed else none)
 
 
-@pytest.mark.parametrize(
-    'field', ['replay_transitions=10000000000000', 'hidden_sizes=9999999,9999999']
-)
+@pytest.mark.parametrize('field', ['replay_transitions=10000000000000'])
 def test_a_run_larger_than_the_memory_is_one_line(
     tmp_path: Path, field: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -83,7 +83,7 @@ def test_a_copy_goes_on_as_the_original() -> None:
 
 def test_a_task_that_uses_its_gripper_is_refused() -> None:
     with pytest.raises(ValueError, match='gamble: FetchSlide uses its gripper; allowed: FetchR'):
-        GambleSimulation('FetchSlide')
+        recipe_config('FetchSlide', 'best', gamble=True)
     with pytest.raises(ValueError, match='gamble: HandReach uses its gripper'):
         recipe_config('HandReach', 'best', gamble=True)
 
