@@ -134,8 +134,9 @@ def film_episode(env: gymnasium.Env[Any, Any], policy: Any, seed: int | None = N
 
     Args:
         env: Made with `render_mode='rgb_array'`.
-        policy: An object with `predict(observation, deterministic=True)`, like the models of
-            Stable-Baselines3, or a function from observation to action.
+        policy: An object with `predict(observation, state, deterministic=True)`, like the
+            models of Stable-Baselines3; or a function from observation to
+            action. `state` is left out while it is None.
         seed: Seed of the reset; None continues the random generator.
 
     Raises:
@@ -151,7 +152,16 @@ def film_episode(env: gymnasium.Env[Any, Any], policy: Any, seed: int | None = N
 
 def _act(policy: Any) -> Callable[[Any], Any]:
     if hasattr(policy, 'predict'):
-        return lambda observation: policy.predict(observation, deterministic=True)[0]
+        state: Any = None
+
+        def predict(observation: Any) -> Any:
+            nonlocal state
+            # A policy without memory may take only the observation.
+            memory = {} if state is None else {'state': state}
+            action, state = policy.predict(observation, **memory, deterministic=True)
+            return action
+
+        return predict
     if not callable(policy):
         raise ValueError(
             f'policy {policy!r:.60}; allowed: what has predict(observation, deterministic=True), '

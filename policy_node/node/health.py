@@ -17,6 +17,8 @@ from policy_node.node.responder import Responder
 # says that once a second; one in slow motion is at most that many times slower than real time.
 _SILENCE = 2.0
 _SLOWEST = 100.0
+# A robot that restarts turns back once; so does a replay that is repeated.
+_TURNS_OF_ONE = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,7 @@ class Health:
     def _begin_counting(self) -> None:
         self._answered, self._dropped = Increase(), Increase()
         self._unusable, self._failed = Increase(), Increase()
+        self._turned_back = Increase()
 
     def stop(self) -> None:
         """Waits for a robot again."""
@@ -118,15 +121,23 @@ class Health:
         if robots and missing:
             report.warn(f'no state: nobody publishes {", ".join(missing)}')
         shared = [f'{count} publish {name}' for name, count in publishers.items() if count > 1]
+        is_mixed = self._turns_back() > _TURNS_OF_ONE
         if robots <= 1 and not shared:
             self._alone_at = now
-        # One that was killed and its successor are one.
-        elif now - self._alone_at > MEMORY_OF_THE_GRAPH:
+        # The graph still lists a robot that was killed, but only its successor publishes.
+        elif is_mixed or now - self._alone_at > MEMORY_OF_THE_GRAPH:
             if robots > 1:
                 report.warn(f'{robots} robots publish here; give each a namespace')
             else:
                 report.warn(f'state of several: {", ".join(shared)}')
         return report
+
+    def _turns_back(self) -> int:
+        """Return how many messages of one topic, on average, were older than the one before."""
+        if self._responder is None:
+            return 0
+        turned = self._turned_back.since(self._responder.turned_back)
+        return int(turned) // len(self._responder.topics)
 
     def news(self, report: Report) -> list[str]:
         """What the last report found wrong and the one before did not, without figures."""

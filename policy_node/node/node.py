@@ -217,10 +217,10 @@ class PolicyNode(Node):
         before, now = self._answered_status, self._status
         if not self._is_replaced:
             assert before is not None and now is not None
-            self.get_logger().info(
-                f'the robot changed from {before.task} at {before.control_hz:g} Hz to {now.task} '
-                f'at {now.control_hz:g} Hz'
-            )
+            old, new = (f'{each.task} at {each.control_hz:g} Hz' for each in (before, now))
+            if old == new:
+                old, new = (f'joint_prefix {each.joint_prefix!r}' for each in (before, now))
+            self.get_logger().info(f'the robot changed from {old} to {new}')
         self._is_replaced = False
         for each in self._of_robot:
             if isinstance(each, Publisher):

@@ -41,6 +41,8 @@ class Responder:
         join: Joins them by stamp.
         answered: Commands sent.
         overtaken: Complete ticks that were not answered because a newer one was there.
+        turned_back: Messages with an earlier stamp than the last one of their topic. One publisher
+            does this once when it restarts, two do it again and again.
         unusable: Messages that could not be read, and ticks of which no observation can be made.
         failed: Observations that the policy had no command for.
         last_failure: What it said at the last of them.
@@ -77,8 +79,10 @@ class Responder:
         self._unsent: bytes | None = None
         self.topics = self._assembler.topics
         self.join = StampJoin((source.name for source in self.topics), clock=clock)
+        self._newest: dict[str, int] = {}
         self.answered = 0
         self.overtaken = 0
+        self.turned_back = 0
         self.unusable = 0
         self.failed = 0
         self.last_failure = ''
@@ -101,6 +105,8 @@ class Responder:
         except ValueError:
             self.unusable += 1
             raise
+        self.turned_back += stamp < self._newest.get(name, stamp)
+        self._newest[name] = stamp
         vectors = self.join.add(name, stamp, vector)
         if vectors is not None:
             self.overtaken += self.is_due

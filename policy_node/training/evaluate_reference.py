@@ -97,7 +97,7 @@ def _run(options: argparse.Namespace) -> int:
     if spec.reference_id is None:
         raise UsageError(f'{spec.name} is no task of Gymnasium-Robotics')
     report = _report_to_add_to(options.json)
-    successes = success_in_reference(loaded.policy, spec.reference_id, spec.episode_ticks, seeds)
+    successes = success_in_reference(loaded, spec.reference_id, spec.episode_ticks, seeds)
     lower, upper = wilson_interval(successes, options.episodes)
     result = {
         'environment': spec.reference_id,

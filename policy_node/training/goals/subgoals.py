@@ -157,12 +157,12 @@ class GuidedPolicy:
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], None]:
-        """Actions (N, action size) for observations (N, ...) of the next tick."""
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Return actions (N, action size) for observations (N, ...) of the next tick."""
         if self._tick % self._every == 0:
             proposer = self._proposer
             self._subgoal = proposer.goals(proposer.normalized(observation))
         self._tick = (self._tick + 1) % self._ticks
         pursued = {**observation, 'desired_goal': self._subgoal}
-        del state, episode_start
-        return self._actor.predict(pursued, deterministic=deterministic)[0], None
+        del episode_start
+        return self._actor.predict(pursued, state, deterministic=deterministic)

@@ -330,6 +330,25 @@ def test_a_second_source_of_a_topic_is_named():
     assert report.message == 'state of several: 2 publish /desired_goal'
 
 
+def test_two_robots_that_publish_in_turn_are_named_within_two_seconds(case, episode):
+    responder, _, ticks = case
+    health, now = Health('/policy_node'), 1.0
+    health.report(now, 1)
+    health.start(responder, episode[0], now)
+    publishers = {'/joint_states': 2}
+    names = [source.name for source in responder.topics]
+    for name in names:
+        # A robot that was killed and its successor.
+        responder.receive(name, moved(ticks[0], name, 10**12))
+        responder.receive(name, moved(ticks[0], name, 10**9))
+    assert '2 robots' not in health.report(2.0, 2, publishers=publishers).message
+    for step in range(3):
+        for name in names:
+            responder.receive(name, moved(ticks[0], name, 10**12 + step))
+            responder.receive(name, moved(ticks[0], name, 10**9 + step))
+    assert '2 robots publish here' in health.report(3.0, 2, publishers=publishers).message
+
+
 def test_a_machine_that_believes_it_is_later_than_2038_reports_all_the_same(monkeypatch):
     monkeypatch.setattr('msgs_spec.diagnostics.time.time_ns', lambda: 2**31 * 10**9 + 5)
     message = deserialize(
