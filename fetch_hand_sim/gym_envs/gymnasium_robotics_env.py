@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import import_module
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -16,6 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fetch_hand_sim.gym_envs import joint_access
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.gym_envs.goal_env import import_goal_env
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES
@@ -55,6 +57,14 @@ CAMERAS: dict[str, dict[str, Any]] = {
 }
 
 
+# Functions of the reference that fail with today's MuJoCo.
+_JOINT_FUNCTIONS = (
+    'get_joint_qpos',
+    'get_joint_qvel',
+    'set_joint_qpos',
+    'set_joint_qvel',
+    'robot_get_obs',
+)
 # Hooks of the reference that nothing here would ask.
 _NOT_ASKED = (
     '_env_setup',
@@ -200,7 +210,9 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
     @property
     def _utils(self) -> Any:
-        return import_module('gymnasium_robotics.utils.mujoco_utils')
+        reference = import_module('gymnasium_robotics.utils.mujoco_utils')
+        working = {name: getattr(joint_access, name) for name in _JOINT_FUNCTIONS}
+        return SimpleNamespace(**vars(reference) | working)
 
     @property
     def _model_names(self) -> Any:

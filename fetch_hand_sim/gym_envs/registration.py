@@ -117,7 +117,7 @@ def _spec_of(name: str) -> EnvSpec:
 def make_vec(
     name: str | EnvSpec,
     num_envs: int = 1,
-    wrappers: Sequence[Callable[[Any], VectorEnv[Any, Any, Any]]] = (),
+    wrappers: Sequence[Callable[[Any], VectorEnv[Any, Any, Any]]] | None = None,
     **arguments: Any,
 ) -> VectorEnv[Any, Any, Any]:
     """`gymnasium.make_vec` of a batch, with wrappers, which Gymnasium itself refuses for batches.
@@ -146,7 +146,7 @@ def make_vec(
             f'vectorization_mode {mode!r} is for gymnasium.make_vec with the id; this makes '
             f'batches; allowed: None, {batch.value!r}'
         )
-    chosen = [_wrapper_of_batches(wrapper) for wrapper in wrappers]
+    chosen = [_wrapper_of_batches(wrapper) for wrapper in wrappers or ()]
     env = gymnasium.make_vec(
         name,
         num_envs=num_envs,

@@ -17,6 +17,10 @@ from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.arguments import finite_goals, nearest_quaternions, numbers
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import GoalKind, RewardType, TaskSpec
+from msgs_spec.text import one_line
+
+# Metres or radians.
+_LARGEST_THRESHOLD = 1e6
 
 
 class TaskAttributes:
@@ -129,8 +133,10 @@ class TaskAttributes:
             self.rotation_threshold = rotation
 
     def _set_threshold(self, name: str, value: float) -> None:
-        if not (isinstance(value, Real) and np.isfinite(value) and value >= 0.0):
-            raise ValueError(f'{name} must be a number of at least 0, not {value!r}')
+        if not (isinstance(value, Real) and 0.0 <= value < _LARGEST_THRESHOLD):
+            raise ValueError(
+                f'{name} must be 0 ... {_LARGEST_THRESHOLD:g}, not {one_line(value, 40)}'
+            )
         metric = self.simulation.metric
         changed: dict[str, Any] = {name: float(value)}
         self.simulation.metric = metric.with_changes(spec=replace(metric.spec, **changed))

@@ -355,10 +355,10 @@ def test_importing_the_package_registers_without_mujoco():
             {'default_camera_config': {'type': 1, 'trackbodyid': 9999}},
             r'type 1 with trackbodyid 9999; allowed: 0 \.',
         ),
-        ({'distance_threshold': 'a'}, "must be a number of at least 0, not 'a'"),
+        ({'distance_threshold': 'a'}, r'must be 0 ... 1e\+06, not a'),
         ({'control_hz': '25'}, "control_hz '25' is no number"),
         ({'default_camera_config': {'zoom': 2}}, "'zoom' is not known; allowed: azimuth,"),
-        ({'distance_threshold': float('nan')}, 'must be a number of at least 0, not nan'),
+        ({'distance_threshold': float('nan')}, r'must be 0 ... 1e\+06, not nan'),
     ],
 )
 def test_bad_pictures_are_refused_before_they_are_drawn(arguments, message):
@@ -666,3 +666,24 @@ def test_a_goal_that_is_no_numbers_is_named(goal):
     env = fetch_hand_sim.make('FetchReach')
     with pytest.raises(ValueError, match=r'a goal of FetchReach: \(3,\) or \(1, 3\) numbers, not '):
         env.reset(options={'goal': goal})
+
+
+def test_a_disturbed_environment_senses_late_and_rewards_the_true_state() -> None:
+    env = make('FetchReach', disturbances='hardware')
+    check_env(env.unwrapped, skip_render_check=True)
+    plain = make('FetchReach')
+    disturbed, _ = env.reset(seed=3)
+    true, _ = plain.reset(seed=3)
+    assert (disturbed['desired_goal'] == true['desired_goal']).all()
+    assert (disturbed['observation'] != true['observation']).any()
+    off = make('FetchReach', disturbances='none')
+    assert (off.reset(seed=3)[0]['observation'] == true['observation']).all()
+    with pytest.raises(ValueError, match='allowed: none, mild, hardware, severe'):
+        make('FetchReach', disturbances='hard')
+
+
+def test_a_batch_takes_disturbances_too() -> None:
+    pair = [fetch_hand_sim.make_vec('FetchPush', 2, disturbances=each) for each in ('severe', None)]
+    first, second = (env.reset(seed=3)[0] for env in pair)
+    assert (first['desired_goal'] == second['desired_goal']).all()
+    assert (first['observation'] != second['observation']).any()
