@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ class TowardsGoal:
     """Moves the gripper straight to the goal of FetchReach: always succeeds."""
 
     def predict(
-        self, observation: dict[str, np.ndarray], *, deterministic: bool = True
+        self, observation: dict[str, np.ndarray], state: Any = None, *, deterministic: bool = True
     ) -> tuple[np.ndarray, None]:
         offset = observation['desired_goal'] - observation['achieved_goal']
         action = np.zeros((len(offset), 4))
@@ -96,9 +97,11 @@ def test_both_rules_are_applied_whatever_the_rule_of_the_simulation() -> None:
     """3 mm in every coordinate: 11.6 mm over all fifteen, but 5.2 mm per fingertip."""
 
     class GoalNearby(RestingPolicy):
-        def predict(self, observation: dict[str, np.ndarray], **options: bool) -> tuple:
+        def predict(
+            self, observation: dict[str, np.ndarray], state: Any = None, **options: bool
+        ) -> tuple:
             hand.set_goal(observation['achieved_goal'] + 0.003)
-            return super().predict(observation, **options)
+            return super().predict(observation, state, **options)
 
     for rule in ('gymnasium', 'paper'):
         hand = Simulation('HandReach', num_envs=3, num_threads=1, success_rule=rule)
@@ -138,11 +141,13 @@ def test_staying_is_counted_tick_by_tick() -> None:
     class Fleeting(RestingPolicy):
         tick = 0
 
-        def predict(self, observation: dict[str, np.ndarray], **options: bool) -> tuple:
+        def predict(
+            self, observation: dict[str, np.ndarray], state: Any = None, **options: bool
+        ) -> tuple:
             far = 0.0 if self.tick % 4 < held else 1.0
             robot.set_goal(observation['achieved_goal'] + far)
             self.tick += 1
-            return super().predict(observation, **options)
+            return super().predict(observation, state, **options)
 
     robot = simulation(2)
     for held, stay in ((1, 0.0), (2, 13 / 25), (3, 25 / 37)):
