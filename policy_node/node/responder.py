@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -126,7 +127,8 @@ class Responder:
             # Topics are not ordered: the first tick may have been answered before its status came.
             if self._answered is not None and self._answered[0] == stamp and not self._is_first:
                 self.commander.start_episode()
-                self.commander.command(self._answered[1])
+                with contextlib.suppress(ValueError):
+                    self.commander.command(self._answered[1])
 
     @property
     def is_due(self) -> bool:

@@ -160,7 +160,7 @@ def test_unknown_and_unfitting_names_are_refused_in_one_line(tmp_path: Path) -> 
     ):
         load_policy('zzz', 'FetchReach')
     for mistyped, meant in {'rnd': 'random', 'fetchreach': 'FetchReach'}.items():
-        with pytest.raises(ValueError, match=rf"'resting'; did you mean '{meant}'\?$"):
+        with pytest.raises(ValueError, match=rf"'robust'; did you mean '{meant}'\?$"):
             load_policy(mistyped, 'FetchReach')
     with pytest.raises(ValueError, match='trained on FetchReach, not on FetchPush'):
         load_policy('FetchReach', 'FetchPush')
