@@ -102,7 +102,7 @@ def actors_summary(actors: Path) -> str:
     Raises:
         ValueError: If a file is no evaluation of an actor; the line names it.
     """
-    head = '| task | success (95 % interval) | in Gymnasium-Robotics | best published | by whom |'
+    head = '| task | success (95 % interval) | in Gymnasium-Robotics | best published |'
     return _table(head, actors, _short_row)
 
 
@@ -135,9 +135,9 @@ def _row(task: str, report: dict[str, Any]) -> list[str]:
 def _short_row(task: str, report: dict[str, Any]) -> list[str]:
     ours = [f'[{task}](docs/tasks/{task}.md)', _success(report), _in_reference(report)]
     if task not in BEST:
-        return [*ours, _NOT_PUBLISHED, '']
+        return [*ours, _NOT_PUBLISHED]
     best = BEST[task]
-    return [*ours, f'{best.success} ({best.kind})', best.source]
+    return [*ours, f'{best.success} ({best.kind})']
 
 
 def _success(report: dict[str, Any]) -> str:
