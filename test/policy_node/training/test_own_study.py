@@ -12,7 +12,7 @@ from policy_node.training.studies.command import find_study, main, parse_argumen
 from policy_node.training.studies.store import read_runs
 
 torch.set_num_threads(1)
-PAGE = Path(__file__).parents[3] / 'docs' / 'research' / 'README.md'
+PAGE = Path(__file__).parents[3] / 'docs' / 'research' / 'studies.md'
 SMALL = ['--seeds', '0', '--steps', '800', '--episodes', '2', '--set', 'num_envs=8']
 SMALL += ['--set', 'evaluation_episodes=4', '--set', 'evaluate_every=400']
 

@@ -57,7 +57,8 @@ class RichReach(FetchTask):
 def test_rewards_that_values_cannot_say_are_named_once(tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(registry, '_family', lambda spec: RichReach)
     train('FetchReach', tmp_path / 'run', total_steps=800, reward_type='dense', **SMALL)
-    (line,) = capfd.readouterr().err.splitlines()
+    lines = capfd.readouterr().err.splitlines()
+    (line,) = (each for each in lines if 'rewards of FetchReach' in each)
     assert line.startswith('fetch_hand_sim train: rewards of FetchReach are up to 99.')
     assert 'within -1 ... 0' in line
 
