@@ -19,8 +19,6 @@ from policy_node.training.studies.published import actors_summary, actors_table
 ROOT = Path(__file__).resolve().parent.parent
 ACTORS = ROOT / 'policy_node' / 'actors'
 SPEED = ROOT / 'bench' / 'results' / 'bench_sim.csv'
-# One task of each family.
-_SHORT = ('FetchPush', 'FetchPickAndPlace', 'HandReach', 'HandManipulateBlockFull')
 
 
 def speed_table(path: Path = SPEED) -> str:
@@ -53,32 +51,6 @@ def speed_table(path: Path = SPEED) -> str:
     return '\n'.join([*lines, '', f'({machine})'])
 
 
-def speed_summary(path: Path = SPEED) -> str:
-    """Returns a few rows of the same with all threads, and the mean over all tasks."""
-    machine, threads, (one, many) = _measured(path)
-    ours, peer = 'this_project', 'envpool'
-    lines = [
-        f'| steps per second, {threads} threads | this package | EnvPool '
-        '| Gymnasium-Robotics, 64 processes | one process |',
-        '| --- | ---: | ---: | ---: | ---: |',
-    ]
-    for task in _SHORT:
-        processes = (each[task]['gymnasium_robotics'] for each in (many, one))
-        speeds = (many[task][ours], many[task][peer], *processes)
-        lines.append(f'| {task} | ' + ' | '.join(f'{float(speed):,.0f}' for speed in speeds) + ' |')
-    gains = [
-        statistics.geometric_mean(ratios)
-        for ratios in (
-            [float(row['ratio_envpool']) for row in many.values()],
-            [float(row['ratio_gymnasium_robotics']) for row in many.values()],
-            [float(many[task][ours]) / float(one[task]['gymnasium_robotics']) for task in one],
-        )
-    ]
-    cells = f'{gains[0]:.2f} x | {gains[1]:.1f} x | {gains[2]:.1f} x'
-    lines.append(f'| *faster, mean of {len(one)} tasks* | | {cells} |')
-    return '\n'.join([*lines, '', f'({machine})'])
-
-
 def _measured(path: Path) -> tuple[str, int, list[dict[str, dict[str, str]]]]:
     """The machine, the larger number of threads, and the rows by task of one and of that many."""
     text = path.read_text(encoding='utf-8')
@@ -96,7 +68,6 @@ TABLES = {
     'results': lambda: actors_table(ACTORS),
     'results, short': lambda: actors_summary(ACTORS),
     'speed': speed_table,
-    'speed, short': speed_summary,
 }
 
 

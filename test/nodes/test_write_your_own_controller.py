@@ -11,13 +11,13 @@ import pytest
 from support import ROOT
 from support.graph import SIM_NODE, episodes_in, finish, ros_args
 
-PAGE = ROOT / 'docs' / 'write_your_own_controller.md'
+PAGE = ROOT / 'docs' / 'tutorials' / 'write_your_own_controller.md'
 
 
 @pytest.fixture
 def controller(tmp_path):
     """The code block of the page as a file."""
-    (code,) = re.findall(r'```python\n(.*?)```', PAGE.read_text(), re.DOTALL)
+    (code,) = re.findall(r'```python my_controller.py\n(.*?)```', PAGE.read_text(), re.DOTALL)
     path = tmp_path / 'my_controller.py'
     path.write_text(code)
     return path

@@ -22,6 +22,7 @@ import yaml
 from test_architecture import pages
 
 from fetch_hand_sim.__main__ import main as fetch_hand_sim
+from fetch_hand_sim.__main__ import ros_arguments
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.simulation import Simulation
@@ -34,8 +35,6 @@ from support.shell_lines import commands, python_blocks, shell_lines
 
 # Other programs, or files of the reader.
 FOREIGN = set('. > apt cd colcon git ls mkdir pip python3 rviz2 ssh touch uvx'.split())
-# The controller is run by test_write_your_own_controller.py, against a robot.
-RUN_ELSEWHERE = {'write_your_own_controller.md'}
 # Its task is there only when its package is: test_own_task.py reads its command lines.
 WITH_ANOTHER_PACKAGE = {'own_task.md'}
 # They train for half a minute.
@@ -74,9 +73,6 @@ def test_python_runs_as_it_stands(page, episodes):
     """All blocks of a page, one after the other, where the demo has logged episodes."""
     if page.parent.name == 'tutorials':
         pytest.skip('followed whole, by test_tutorials.py')
-    if page.name in RUN_ELSEWHERE:
-        assert page.name in (ROOT / 'test/nodes/test_write_your_own_controller.py').read_text()
-        return
     code = '\n'.join(python_blocks(page.read_text()))
     result = subprocess.run(
         [sys.executable, '-W', 'ignore', '-c', code],
@@ -130,7 +126,7 @@ def _run(name: str, rest: list[str]) -> None:
         _check_parameters(name, rest)
     elif name == 'fetch_hand_sim' and rest[0] in ('sim', 'policy', 'replay'):
         node = {'sim': 'sim_node', 'policy': 'policy_node', 'replay': 'replay_node'}[rest[0]]
-        _check_parameters(node, [part for word in rest[1:] for part in ('-p', word)])
+        _check_parameters(node, ros_arguments(rest[1:]))
     elif name == 'fetch_hand_sim':
         fetch_hand_sim(rest)
     elif name == 'view':

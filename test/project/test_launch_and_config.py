@@ -194,7 +194,7 @@ def test_the_parameter_file_of_the_demo_is_valid():
         assert value != specs[name].default
 
 
-@pytest.mark.parametrize('page', ['README.md', 'docs/write_your_own_controller.md'])
+@pytest.mark.parametrize('page', ['README.md', 'docs/tutorials/write_your_own_controller.md'])
 def test_a_page_lets_its_robot_wait_for_the_policy(page):
     """A policy takes seconds to load, in which a robot that does not wait fails its episodes."""
     robots = re.findall(

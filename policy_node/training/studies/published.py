@@ -97,12 +97,12 @@ def actors_table(actors: Path) -> str:
 
 
 def actors_summary(actors: Path) -> str:
-    """Returns the same in five columns, each task linked to its page.
+    """Returns the same in five short columns, without sources.
 
     Raises:
         ValueError: If a file is no evaluation of an actor; the line names it.
     """
-    head = '| task | success (95 % interval) | in Gymnasium-Robotics | best published |'
+    head = '| task | success | 95 % interval | in Gymnasium-Robotics | best published |'
     return _table(head, actors, _short_row)
 
 
@@ -133,11 +133,15 @@ def _row(task: str, report: dict[str, Any]) -> list[str]:
 
 
 def _short_row(task: str, report: dict[str, Any]) -> list[str]:
-    ours = [f'[{task}](docs/tasks/{task}.md)', _success(report), _in_reference(report)]
-    if task not in BEST:
-        return [*ours, _NOT_PUBLISHED]
-    best = BEST[task]
-    return [*ours, f'{best.success} ({best.kind})']
+    lower, upper = report['success_gymnasium_interval_95']
+    reference = report.get('reference')
+    return [
+        task,
+        f'**{report["success_gymnasium"]:.3f}**',
+        f'{lower:.3f} ... {upper:.3f}',
+        f'{reference["success"]:.3f}' if reference else '',
+        BEST[task].success if task in BEST else '',
+    ]
 
 
 def _success(report: dict[str, Any]) -> str:
