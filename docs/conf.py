@@ -15,13 +15,20 @@ project = 'fetch_hand_sim'
 author = 'The fetch_hand_sim maintainers'
 copyright = 'the fetch_hand_sim maintainers, Apache License 2.0'
 
-extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon']
+extensions = [
+    'myst_parser',
+    'sphinx.ext.autodoc',
+    'sphinx.ext.napoleon',
+    'sphinxcontrib.mermaid',
+]
 html_theme = 'furo'
 html_title = project
 exclude_patterns = ['benchmark/*/*.txt']
 
 # GitHub shows the same files: plain Markdown, links to headings, indented blocks are command lines.
 myst_heading_anchors = 4
+# GitHub draws these blocks as diagrams.
+myst_fence_as_directive = ['mermaid']
 highlight_language = 'text'
 
 # Docstrings name code in single backticks, and attributes of dataclasses under `Attributes:`.

@@ -106,8 +106,8 @@ SIM_NODE = (
         'disturbances',
         'string',
         'none',
-        'Delays, noise and other physics of each episode: none, mild, hardware, severe, scaled as '
-        'in hardware*0.5, or a YAML file; a new value counts from the next episode on.',
+        'Delays, noise, other physics: a preset, hardware*0.5 or a YAML file; new values count '
+        'from the next episode.',
         check=read_disturbances,
         read_only=False,
     ),
@@ -122,8 +122,8 @@ SIM_NODE = (
         'control_hz',
         'double',
         DEFAULT_CONTROL_HZ,
-        'Ticks per simulated second, 500/n for n = 1 ... 40. The seconds per episode and the speed '
-        'of the Fetch gripper do not depend on it.',
+        'Ticks per simulated second, 500/n for n = 1 ... 40; seconds per episode and speeds stay '
+        'equal.',
         lower=12.5,
         upper=500.0,
         check=substeps_per_tick,
@@ -159,8 +159,7 @@ SIM_NODE = (
         'joint_prefix',
         'string',
         MODEL_PREFIX,
-        'Prefix of the joint names in joint_states and joint_commands, such as left_; model keeps '
-        'the names of the model, robot0:.',
+        'Prefix of the joint names, such as left_; model keeps the names of the model, robot0:.',
         longest=LONGEST_JOINT_PREFIX,
     ),
     ParameterSpec(
@@ -204,9 +203,8 @@ POLICY_NODE = (
         'policy',
         'string',
         '',
-        'Shipped actor, file (.safetensors, .onnx, .zip), module:function, random, resting or '
-        'robust; '
-        'empty selects the shipped actor of the task.',
+        'File, module:function, random, resting, robust or a shipped policy; empty: that of the '
+        'task.',
         read_only=False,
         former='checkpoint',
     ),

@@ -200,8 +200,8 @@ def _command_topics(task: TaskSpec) -> list[TopicSpec]:
     specs.append(_subscribed('set_goal', type_name, text, goal_layout, frame=WORLD))
     wrench = 'geometry_msgs/msg/WrenchStamped'
     text = (
-        'Pushes a body during the next tick, where `perturb_limit` allows it: `frame_id` names the '
-        'body, force and torque are along the axes of the world, at its centre of mass.'
+        'Pushes the body `frame_id` during the next tick, up to `perturb_limit`, in world axes at '
+        'its centre of mass.'
     )
     specs.append(_subscribed('perturb', wrench, text, _WRENCH))
     text = 'Checkpoint of the policy and its SHA-256 as key/value pairs, for the log.'
@@ -226,9 +226,8 @@ LATEST_TICKS_PER_SECOND = 30
 LATEST_TICK = TopicSpec(
     'latest_tick',
     'std_msgs/msg/UInt8MultiArray',
-    'All messages of the latest tick in one, for viewers: `layout` contains the topics and their '
-    f'numbers of bytes. At most {LATEST_TICKS_PER_SECOND} Hz wall time, while it has subscribers; '
-    'not logged.',
+    'All messages of the latest tick, for viewers; at most '
+    f'{LATEST_TICKS_PER_SECOND} Hz wall time while subscribed; not logged.',
 )
 MONITORING = (DIAGNOSTICS, REAL_TIME_FACTOR, LATEST_TICK)
 

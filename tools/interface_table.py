@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from msgs_spec.parameters import NODES, ParameterSpec
-from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, CommandPart
+from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND
 from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS, GoalKind, TaskSpec, VectorPart
 from msgs_spec.tick import PHASES, EpisodeStatus
@@ -28,6 +28,10 @@ _PUBLISHING = (
 _VIEWING = (
     'None of them is logged. The scalars of a tick carry its stamp, for plots: '
     '`scalars/distance/vector/x`.'
+)
+_COMMANDS = (
+    'The order of the values in `commands` and `applied_command`. A joint is named as here in '
+    '`joint_commands`, after the prefix.'
 )
 _FAMILIES: dict[str, Callable[[TaskSpec], bool]] = {
     'all': lambda task: True,
@@ -145,37 +149,38 @@ def _qos(spec: QosSpec) -> str:
 def _orders() -> str:
     keys = [field.name for field in dataclasses.fields(EpisodeStatus)]
     lines = (
-        ('Quaternions', 'xyzw in messages, wxyz in observations and goals.'),
-        (
-            'Joints',
-            f'their names begin with `{JOINT_PREFIX}`, or with the parameter `joint_prefix`.',
-        ),
-        ('`joint_states`, Fetch', _names(FETCH.joints)),
-        ('`joint_states`, hand', _names(SHADOW_HAND.joints)),
-        ('`commands`, `applied_command`, Fetch', _command(FETCH.command)),
-        ('`commands`, `applied_command`, hand', _command(SHADOW_HAND.command)),
-        ('Fingertips', _names(FINGERTIPS)),
-        ('`episode_status` keys', f'{_names(keys)}, the last where it is not `{JOINT_PREFIX}`'),
-        ('Its `phase`', ', '.join(f'`{phase}` {when}' for phase, when in PHASES.items())),
+        'Quaternions: xyzw in messages, wxyz in observations and goals.',
+        f'Joint names begin with `{JOINT_PREFIX}`, or with the parameter `joint_prefix`.',
+        f'`joint_states` of a Fetch: {_names(FETCH.joints)}.',
+        f'`joint_states` of a hand: {_names(SHADOW_HAND.joints)}.',
+        f'Fingertips: {_names(FINGERTIPS)}.',
+        f'Keys of `episode_status`: {_names(keys)}. `joint_prefix`, `disturbances` and '
+        '`variation` are left out if they have their defaults.',
+        f'`phase`: {", ".join(f"`{phase}` {when}" for phase, when in PHASES.items())}.',
     )
-    return '\n'.join(f'- {title}: {text}' for title, text in lines)
+    values = '\n'.join(f'- {line}' for line in lines)
+    return f'{values}\n\n### Commands\n\n{_COMMANDS}\n\n{_command_table()}'
 
 
 def _names(names: Sequence[str]) -> str:
-    prefix = JOINT_PREFIX if all(name.startswith(JOINT_PREFIX) for name in names) else ''
-    text = ', '.join(_code(name.removeprefix(prefix)) for name in names)
-    return f'`{prefix}` + {text}' if prefix else text
+    return ', '.join(_code(name.removeprefix(JOINT_PREFIX)) for name in names)
 
 
-def _command(parts: Sequence[CommandPart]) -> str:
-    """Parts with their ranges; units once per run of equal ones."""
-    names = [part.name.removeprefix(JOINT_PREFIX) for part in parts]
-    texts = [f'`{n}` {p.lower:g} ... {p.upper:g}' for n, p in zip(names, parts, strict=True)]
-    for index, (part, following) in enumerate(zip(parts, [*parts[1:], None], strict=True)):
-        if following is None or following.unit != part.unit:
-            texts[index] += f' ({part.unit})'
-    return (f'`{JOINT_PREFIX}` + ' if parts[0].name.startswith(JOINT_PREFIX) else '') + ', '.join(
-        texts
+def _command_table() -> str:
+    return _table(
+        ('robot', 'index', 'value', 'lowest', 'highest', 'unit'),
+        (
+            (
+                robot,
+                str(index),
+                _code(part.name.removeprefix(JOINT_PREFIX)),
+                f'{part.lower:g}',
+                f'{part.upper:g}',
+                part.unit,
+            )
+            for robot, spec in (('Fetch', FETCH), ('hand', SHADOW_HAND))
+            for index, part in enumerate(spec.command)
+        ),
     )
 
 
@@ -183,18 +188,16 @@ def _observation_table() -> str:
     tasks: dict[tuple[VectorPart, ...], list[TaskSpec]] = {}
     for task in TASKS.values():
         tasks.setdefault(task.observation, []).append(task)
-    return _table(
-        ('tasks', 'size', 'goal size', 'parts in order'),
-        (
-            (
-                _family(users),
-                str(users[0].observation_size),
-                str(users[0].goal.size),
-                ', '.join(f'`{part.name}` {part.size} ({part.unit})' for part in parts),
-            )
-            for parts, users in tasks.items()
-        ),
-    )
+    rows = []
+    for parts, users in tasks.items():
+        start = 0
+        for part in parts:
+            indices = f'{start} ... {start + part.size - 1}'
+            rows.append((_family(users), indices, _code(part.name), part.unit))
+            start += part.size
+        goal = users[0].goal
+        rows.append((_family(users), f'0 ... {goal.size - 1}', 'either goal', goal.name.lower()))
+    return _table(('tasks', 'indices', 'part', 'unit'), rows)
 
 
 def _parameter_table() -> str:

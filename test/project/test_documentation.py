@@ -34,7 +34,7 @@ from support import ROOT, script_environment
 from support.shell_lines import commands, python_blocks, shell_lines
 
 # Other programs, or files of the reader.
-FOREIGN = set('. > apt cd colcon git ls mkdir pip python3 rviz2 ssh touch uvx'.split())
+FOREIGN = set('. > apt cd colcon git ls mkdir pip plotjuggler python3 rviz2 ssh touch uvx'.split())
 # Its task is there only when its package is: test_own_task.py reads its command lines.
 WITH_ANOTHER_PACKAGE = {'own_task.md'}
 # They train for half a minute.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 
 import pytest
@@ -51,11 +52,11 @@ def test_phases_and_the_limit_of_steps_are_documented():
 
 
 def test_hand_commands_are_listed_in_order_with_their_ranges():
-    (line,) = (
-        t for t in interface_markdown().splitlines() if t.startswith('- `commands`') and 'hand' in t
-    )
-    parts = [f'`{p.name[7:]}` {p.lower:g} ... {p.upper:g}' for p in SHADOW_HAND.command]
-    assert line.endswith(f'`robot0:` + {", ".join(parts)} (rad)')
+    rows = [line for line in interface_markdown().splitlines() if line.startswith('| hand |')]
+    assert rows == [
+        f'| hand | {i} | `{part.name[7:]}` | {part.lower:g} | {part.upper:g} | rad |'
+        for i, part in enumerate(SHADOW_HAND.command)
+    ]
 
 
 def test_tables_are_rectangular():
@@ -97,3 +98,14 @@ def test_missing_file_is_one_line(tmp_path, capsys):
 def test_without_arguments_it_is_printed(capsys):
     assert main([]) == 0
     assert capsys.readouterr().out == interface_markdown() + '\n'
+
+
+def test_the_joints_of_the_hand_have_both_numberings():
+    page = (ROOT / 'docs' / 'hand_joints.md').read_text()
+    commanded = [part.name for part in SHADOW_HAND.command]
+    for index, joint in enumerate(SHADOW_HAND.joints):
+        name = joint.removeprefix('robot0:')
+        row = re.search(rf'^\| `{name}` \| `rh_(\w+)(\d)` \|.*$', page, re.MULTILINE)
+        assert (row[1], int(row[2])) == (name[:-1], int(name[-1]) + 1)
+        command = str(commanded.index(joint)) if joint in commanded else 'none, coupled'
+        assert row[0].endswith(f'| {index} | {command} |')
