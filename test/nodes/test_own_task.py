@@ -118,7 +118,7 @@ assert main(['train', *training, *fast, '--output', 'run']) == 0
 
 @pytest.mark.release
 def test_the_pages_other_reward_trains_and_is_checked(tmp_path: Path) -> None:
-    blocks = python_blocks((ROOT / 'docs' / 'own_task.md').read_text())
+    blocks = python_blocks((ROOT / 'docs' / 'own_reward.md').read_text())
     specification, simulation = (block for block in blocks if 'FetchPushNear' in block)
     package, names = tmp_path / 'near', tmp_path / 'near-1.dist-info'
     for folder in (package, names):
