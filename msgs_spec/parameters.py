@@ -166,13 +166,13 @@ SIM_NODE = (
         'wait_for_commands',
         'bool',
         False,
-        'Whether the first episode waits for a publisher of commands.',
+        'Let the first episode wait for a publisher of commands.',
     ),
     ParameterSpec(
         'publish_clock',
         'bool',
         True,
-        'Whether to publish /clock; one robot per graph should.',
+        'Publish /clock; one robot per graph should.',
     ),
     ParameterSpec(
         'perturb_limit',
@@ -194,7 +194,7 @@ SIM_NODE = (
         'log_compiled_model',
         'bool',
         True,
-        'Whether each log contains the compiled model, 3 MB, beside its MJCF text.',
+        'Store the compiled model, 3 MB, in each log, beside its MJCF text.',
     ),
 )
 
@@ -212,7 +212,7 @@ POLICY_NODE = (
         'trust',
         'bool',
         False,
-        'Whether to load a .zip or module:function, which runs the code in it.',
+        'Load a .zip or module:function, which runs the code in it.',
     ),
     ParameterSpec(
         'task',
@@ -235,20 +235,20 @@ REPLAY_NODE = (
         upper=100.0,
         read_only=False,
     ),
-    ParameterSpec('loop', 'bool', False, 'Whether to start again at the end.', read_only=False),
-    ParameterSpec('start_paused', 'bool', False, 'Whether to wait for ~/pause with false.'),
+    ParameterSpec('loop', 'bool', False, 'Start again at the end.', read_only=False),
+    ParameterSpec('start_paused', 'bool', False, 'Wait for ~/pause with false.'),
     ParameterSpec('start_offset', 'double', 0.0, 'Recorded seconds to skip.', lower=0.0, upper=1e6),
     ParameterSpec(
         'topics', 'string', '', 'Topics to publish, separated by commas; empty for all published.'
     ),
     ParameterSpec(
-        'inputs', 'bool', False, 'Whether to publish also the recorded commands and goals.'
+        'inputs', 'bool', False, 'Publish also the recorded commands and goals.'
     ),
     ParameterSpec(
-        'wait_for_commands', 'bool', False, 'Whether to wait for a publisher of commands.'
+        'wait_for_commands', 'bool', False, 'Wait for a publisher of commands.'
     ),
     ParameterSpec(
-        'force', 'bool', False, 'Whether to publish on topics that have another publisher already.'
+        'force', 'bool', False, 'Publish on topics that have another publisher already.'
     ),
 )
 

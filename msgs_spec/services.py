@@ -30,7 +30,7 @@ RESET = ServiceSpec(
 PAUSE = ServiceSpec(
     '~/pause',
     'std_srvs/srv/SetBool',
-    'Stops the ticks and simulated time (true) or goes on (false).',
+    'Stops the ticks and simulated time (true) or continues (false).',
 )
 STEP = ServiceSpec(
     '~/step', 'std_srvs/srv/Trigger', 'Runs one tick now; while paused, or in lockstep.'

@@ -162,7 +162,7 @@ def _result_topics(task: TaskSpec) -> list[TopicSpec]:
         TopicSpec(
             'is_success',
             'std_msgs/msg/Bool',
-            'Whether the goal is reached now.',
+            'True if the goal is reached now.',
             (VectorPart('is_success', 1, ''),),
         ),
         TopicSpec(
