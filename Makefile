@@ -94,6 +94,7 @@ twin: env
 	$(BIN)/python -m pytest --twin-seeds 20 --timeout 0 test/fetch_hand_sim/simulation/test_twin.py
 
 docs: env
+	$(BIN)/python tools/check_pages.py
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs
 	@echo 'build/docs/index.html'
 

@@ -241,15 +241,9 @@ REPLAY_NODE = (
     ParameterSpec(
         'topics', 'string', '', 'Topics to publish, separated by commas; empty for all published.'
     ),
-    ParameterSpec(
-        'inputs', 'bool', False, 'Publish also the recorded commands and goals.'
-    ),
-    ParameterSpec(
-        'wait_for_commands', 'bool', False, 'Wait for a publisher of commands.'
-    ),
-    ParameterSpec(
-        'force', 'bool', False, 'Publish on topics that have another publisher already.'
-    ),
+    ParameterSpec('inputs', 'bool', False, 'Publish also the recorded commands and goals.'),
+    ParameterSpec('wait_for_commands', 'bool', False, 'Wait for a publisher of commands.'),
+    ParameterSpec('force', 'bool', False, 'Publish on topics that have another publisher already.'),
 )
 
 VISUALIZATION_NODE = (

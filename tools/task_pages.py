@@ -191,7 +191,7 @@ def _ceiling(task: TaskSpec) -> str:
     if task.name not in CEILINGS:
         return ''
     return (
-        f'At most {CEILINGS[task.name]:.3f} can succeed: [ceilings](../results.md#ceilings) says '
+        f'At most {CEILINGS[task.name]:.3f} can succeed: [ceilings](../results.md#ceilings) lists '
         'which goals are out of reach.'
     )
 

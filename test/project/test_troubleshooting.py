@@ -12,7 +12,13 @@ from support import ROOT
 PAGE = (ROOT / 'docs' / 'troubleshooting.md').read_text()
 PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
 # Messages of ROS, NumPy, pip and Python.
-OTHERS = ('A module that was', 'ModuleNotFoundError', 'error: externally', 'TF_OLD', 'AssertionError')
+OTHERS = (
+    'A module that was',
+    'ModuleNotFoundError',
+    'error: externally',
+    'TF_OLD',
+    'AssertionError',
+)
 
 
 def texts() -> str:
