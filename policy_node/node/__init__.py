@@ -1,6 +1,6 @@
 """`policy_node`: joins the topics of a robot by stamp, runs an actor, publishes its commands.
 
-It knows the robot by topics alone, so it runs as well on another machine or against a replayed
+It uses topics only, so it also works on another machine or with a replayed
 episode. `responder.py` holds what it does with a message, without ROS; `node.py` is the node.
 Nothing is imported here that takes long, so that Ctrl-C finds its handler in place.
 """

@@ -1,4 +1,4 @@
-"""The one who commands a robot: a policy whose actions become commands."""
+"""A policy whose actions become commands of a robot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Observation = dict[str, NDArray[np.float64]]
 
 
 class Commander:
-    """Turns observations into commands for one robot.
+    """Turn observations into commands for one robot.
 
     Args:
         loaded: The policy.
@@ -28,7 +28,7 @@ class Commander:
         sha256: Fingerprint of its file; empty if it has none.
 
     Raises:
-        ValueError: If the policy was trained at another rate; one line says which.
+        ValueError: If the policy was trained at another rate.
     """
 
     def __init__(self, loaded: LoadedPolicy, control_hz: float) -> None:

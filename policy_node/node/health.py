@@ -1,4 +1,4 @@
-"""What `policy_node` reports about itself once a second."""
+"""The health report of `policy_node`, once a second."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TURNS_OF_ONE = 1
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """What a robot says of its pace.
+    """The pace of a robot, from its diagnostics.
 
     Attributes:
         is_paused: Whether it has none.
@@ -140,7 +140,7 @@ class Health:
         return int(turned) // len(self._responder.topics)
 
     def news(self, report: Report) -> list[str]:
-        """What the last report found wrong and the one before did not, without figures."""
+        """Return the problems that are new in the last report, without numbers."""
         kinds = {text.partition(':')[0]: text for _, text in report.problems}
         fresh = [text for kind, text in kinds.items() if kind not in self._said]
         self._said = set(kinds)

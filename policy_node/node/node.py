@@ -79,7 +79,7 @@ class PolicyNode(Node):
         self.add_on_set_parameters_callback(self._take_policy)
 
     def run(self, stop: StopSignals) -> None:
-        """Serves until told to stop.
+        """Serve until `stop` is set.
 
         Raises:
             NodeFailure: If the policy does not fit the robot.
@@ -112,7 +112,7 @@ class PolicyNode(Node):
         responder.send_unsent()
 
     def _load_ahead(self) -> LoadedPolicy | None:
-        """Loads what can be loaded before a robot says its task: mistakes show at once."""
+        """Load the policy before a robot is found, so that errors show at once."""
         settings = self._settings
         try:
             return load_policy(
@@ -124,7 +124,7 @@ class PolicyNode(Node):
             raise UsageError(str(error)) from None
 
     def _start(self, status: EpisodeStatus, loop: EventLoop, stop: StopSignals) -> None:
-        """Begins to answer the robot that was found."""
+        """Begin to answer the robot that was found."""
         try:
             self._loaded = self._load_for(status)
             commander = Commander(self._loaded, status.control_hz)
@@ -144,22 +144,22 @@ class PolicyNode(Node):
                 return
             self._report_when_due(missing if time.monotonic() > began + _PATIENCE else ())
         self._announce(commander)
-        # Last of all: its appearance tells the robot that everything before it is in place.
+        # Created last: the robot takes its appearance as the sign that the policy is ready.
         self._commands = self._publisher(topic(commander.spec, 'commands'))
         self._of_robot.append(self._commands)
         self._health.start(responder, status, time.monotonic())
         self.get_logger().info(f'{commander.spec.name}: commands come from {commander.description}')
 
     def _unpublished(self, subscriptions: list[Subscription]) -> list[str]:
-        """Topics that nobody publishes, by their names on the graph, where they may be remapped."""
+        """Return the topics without a publisher, by their (possibly remapped) names."""
         names = [each.topic_name for each in subscriptions]
         return [name for name in names if not self.count_publishers(name)]
 
     def _load_for(self, status: EpisodeStatus) -> LoadedPolicy:
-        """Returns the policy for a robot.
+        """Return the policy for a robot.
 
         Raises:
-            ValueError: If there is none or it does not fit; one line says why.
+            ValueError: If no policy is found, or it does not fit the robot.
         """
         wanted, name = self._settings['task'], self._settings['policy']
         if wanted and wanted != status.task:
@@ -173,7 +173,7 @@ class PolicyNode(Node):
         return before is not None and now is not None and not now.is_of_same_robot(before)
 
     def _take_policy(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Loads another policy at once, so that who sets it hears whether there is one."""
+        """Load another policy at once, so that the parameter request reports errors."""
         result = set_callback(POLICY_NODE)(parameters)
         for parameter in parameters:
             if parameter.name != 'policy' or not result.successful:
@@ -191,11 +191,11 @@ class PolicyNode(Node):
         """Returns a policy and the robot it is for; None for what is not known yet.
 
         Raises:
-            ValueError: If there is no such policy, or it fits no robot; one line says why.
+            ValueError: If the policy is not found, or fits none of the robots.
         """
         is_there = self.count_publishers(self._status_name) > 0
         known: list[EpisodeStatus | None] = [self._status] if self._status else []
-        # One that is gone may be followed by a robot of another task.
+        # After the end of a robot, one with another task may follow.
         robots = [*known, *self._refused] if known and is_there else [None]
         problems = []
         for status in robots:
@@ -213,7 +213,7 @@ class PolicyNode(Node):
         raise problems[0]
 
     def _leave(self) -> None:
-        """Lets go of the robot that was answered; another policy, or another robot, follows."""
+        """Release the robot, before another policy or another robot."""
         before, now = self._answered_status, self._status
         if not self._is_replaced:
             assert before is not None and now is not None
@@ -232,7 +232,7 @@ class PolicyNode(Node):
         self._health.stop()
 
     def _announce(self, commander: Commander) -> None:
-        """Tells the robot's log who commands, in the time of the robot's last word about itself."""
+        """Publish the name of the policy for the robot's log, with its last stamp."""
         status = topic(commander.spec, 'policy_status')
         values = {'commander': commander.description, 'checkpoint_sha256': commander.sha256}
         message = build_status(status, self._status_stamp, NODE_NAME, values)
@@ -260,7 +260,7 @@ class PolicyNode(Node):
         )
 
     def _reader(self, spec: TopicSpec, callback: Callable[[Any], None]) -> Callable[[bytes], None]:
-        """What hands readable messages on; diagnostics are of anybody, and no others are missed."""
+        """Return a callback that passes readable messages on and reports others."""
 
         def on_message(data: bytes) -> None:
             try:
@@ -286,7 +286,7 @@ class PolicyNode(Node):
         return on_message
 
     def _send(self, data: bytes) -> bool:
-        """Publishes a command, unless nobody listens: it would be lost, and lockstep with it."""
+        """Publish a command if there is a subscriber; return whether it was published."""
         if self._commands is None or not self._commands.get_subscription_count():
             return False
         self._commands.publish(data)
@@ -314,7 +314,7 @@ class PolicyNode(Node):
             self._responder.note_phase(status.phase, stamp)
 
     def _may_follow(self, status: EpisodeStatus) -> bool:
-        """Whether who speaks is the robot that is known, its successor, or one the policy fits.
+        """Return whether a status comes from the known robot, its successor, or a robot that fits.
 
         A stranger beside a robot does not end what is between that and its policy.
         """
@@ -346,7 +346,7 @@ class PolicyNode(Node):
         self._report_due = next_report(self._report_due, now)
         robots = self.count_publishers(self._status_name)
         if not robots and self._responder is not None:
-            # Whoever comes next begins anew, also where its first stamp is the last one heard.
+            # The next robot begins anew, even with the same first stamp.
             self._responder.forget()
         elsewhere = [] if robots or now < self._elsewhere_from else self._robots_elsewhere()
         pace = self._pace if now < self._pace_until else None
@@ -358,7 +358,7 @@ class PolicyNode(Node):
             self.get_logger().warning(line)
 
     def _robots_elsewhere(self) -> list[str]:
-        """Namespaces in which somebody publishes `episode_status`."""
+        """Return the namespaces with a publisher of `episode_status`."""
         wanted = topic(_ANY_TASK, 'episode_status')
         found = []
         for name, types in self.get_topic_names_and_types():

@@ -1,4 +1,4 @@
-"""From the bytes of a robot's topics to the bytes of a command. Knows nothing of ROS."""
+"""Turn the bytes of a robot's topics into the bytes of a command, without ROS."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from msgs_spec.topics import topic
 from policy_node.node.commander import Commander
 from policy_node.node.stamp_join import StampJoin, Vectors
 
-# Seconds until a policy that failed is asked again about the same tick.
+# Seconds until the policy tries a failed tick again.
 _ASK_AGAIN = 1.0
 
 
 class Responder:
-    """Answers the newest complete tick of one robot with one command.
+    """Answer the newest complete tick of one robot with one command.
 
-    `receive` takes what comes, `answer` follows once nothing more is waiting: of a robot that is
-    faster than its policy, ticks are left out instead of answered ever later.
+    Call `receive` for each message and `answer` when no more are waiting. If the robot is faster
+    than the policy, ticks are skipped; the delay does not grow.
 
     Args:
-        commander: Who decides.
-        status: What the robot said of itself.
-        send: Takes the CDR bytes of a command; False if nobody listens yet.
+        commander: The policy of the robot.
+        status: The robot's last `episode_status`.
+        send: Publishes the CDR bytes of a command; returns False without a subscriber.
         clock: A steady clock, seconds.
 
     Attributes:
-        commander: Who decides.
+        commander: The policy of the robot.
         topics: The topics it needs.
         join: Joins them by stamp.
         answered: Commands sent.
         overtaken: Complete ticks that were not answered because a newer one was there.
         turned_back: Messages with an earlier stamp than the last one of their topic. One publisher
             does this once when it restarts, two do it again and again.
-        unusable: Messages that could not be read, and ticks of which no observation can be made.
-        failed: Observations that the policy had no command for.
-        last_failure: What it said at the last of them.
+        unusable: Messages that could not be read, and ticks without a valid observation.
+        failed: Observations at which the policy failed.
+        last_failure: Error of the last of them.
         inference: Wall time from a complete observation to its command.
         received_at: When the last observation was complete, seconds of the clock.
         interval: Seconds between the last two; infinite before.
@@ -92,7 +92,7 @@ class Responder:
         self.interval = math.inf
 
     def receive(self, name: str, data: bytes) -> None:
-        """Takes one message; with the one that completes a tick, that tick is due.
+        """Take one message; the last message of a tick makes the tick due.
 
         Args:
             name: Its topic.
@@ -132,7 +132,7 @@ class Responder:
 
     @property
     def is_due(self) -> bool:
-        """Whether a complete tick waits for its answer."""
+        """True while a complete tick has no answer."""
         return self._due is not None
 
     def answer(self) -> None:
@@ -155,13 +155,13 @@ class Responder:
         self._answered, self._asked = (self._due_stamp, self._asked), None
 
     def send_unsent(self) -> None:
-        """Sends the last command if nobody has heard it yet."""
+        """Send the last command if it was not sent yet."""
         if self._unsent is not None and self._send(self._unsent):
             self._unsent = None
             self.answered += 1
 
     def forget(self) -> None:
-        """Starts anew with a robot that did: its stamps begin again."""
+        """Forget all stamps, because the robot was started again."""
         self.join.forget()
         self._due = self._asked = self._unsent = self._answered = None
         self._starts_at = self._ends_at = -1
@@ -177,7 +177,7 @@ class Responder:
         try:
             return self._assembler.assemble(vectors)
         except Exception as error:
-            # Formulas of somebody's own task may raise anything.
+            # Formulas of third-party tasks may raise anything.
             self.unusable += 1
             raise ValueError(f'no observation: {one_line(error)}') from None
 

@@ -1,4 +1,4 @@
-"""Joins topics by stamp: what was true at one moment, whatever order messages arrive in."""
+"""Join the messages of several topics by stamp, in any order of arrival."""
 
 from __future__ import annotations
 
@@ -18,13 +18,11 @@ _LATEST = 1.0
 
 
 class StampJoin:
-    """Collects the vectors of several topics until one stamp has them all.
+    """Collect the vectors of several topics until one stamp has all of them.
 
-    Stamps that are incomplete when a later one completes are dropped, and so is everything that
-    arrives for a stamp no later than the last complete one: an actor wants the newest state, not
-    every state. A stamp of long before, or before one that completed long ago, is a simulation
-    started anew as soon as it is complete; a stranger's message on one of the topics, with a stamp
-    from anywhere, is never.
+    A complete stamp drops all earlier stamps, because a policy needs the newest state only. A much
+    earlier stamp that becomes complete means that the simulation was started again. A single
+    message with an odd stamp from another publisher has no effect.
 
     Args:
         topics: Names of the topics to join.
@@ -32,7 +30,7 @@ class StampJoin:
         clock: A steady clock, seconds.
 
     Attributes:
-        dropped: Incomplete stamps that were given up.
+        dropped: Number of incomplete stamps that were dropped.
     """
 
     def __init__(
@@ -73,12 +71,12 @@ class StampJoin:
         return None
 
     def forget(self) -> None:
-        """Begins again: whatever stamp comes next is the first."""
+        """Forget all stamps; the next one is the first."""
         self._last = None
         self._pending.clear()
 
     def _is_late(self, delay: int) -> bool:
-        """Whether a stamp that is so much earlier than the last one is of the same simulation."""
+        """Return whether a stamp this much before the last one belongs to the same simulation."""
         if not 0 < delay <= _LONGEST_DELAY:
             return delay == 0
         return self._clock() - self._completed_at < _LATEST

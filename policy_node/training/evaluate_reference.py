@@ -112,7 +112,7 @@ def _run(options: argparse.Namespace) -> int:
             flush=True,
         )
     finally:
-        # Nobody may read the line any more; the file is there for that.
+        # The terminal may be closed by now; the file keeps the result.
         if options.json is not None:
             _write(options.json, {**report, 'reference': result})
     return EXIT_SUCCESS
@@ -131,7 +131,7 @@ def _write(file: Path, report: dict[str, Any]) -> None:
 
 
 def _report_to_add_to(file: Path | None) -> dict[str, Any]:
-    """What a JSON file holds, read before hours of episodes are played for it.
+    """Return the contents of a JSON file, read before long evaluations.
 
     Raises:
         UsageError: If it cannot be written, or holds something else.

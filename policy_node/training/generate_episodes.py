@@ -130,7 +130,7 @@ def _say_what_is_there(options: argparse.Namespace, task: str) -> None:
     try:
         seeds = named_seeds(options.output, task)
     except OSError:
-        return  # Who writes there will say why not.
+        return  # Writing will report the error.
     series = range(options.first_seed, options.first_seed + options.episodes)
     if twice := sum(seed in seeds for seed in series):
         complain(

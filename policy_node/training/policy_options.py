@@ -66,7 +66,7 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
     """Loads the policy that the options of `add_policy_options` name.
 
     Raises:
-        UsageError: If there is none such; one line says why.
+        UsageError: If the policy cannot be loaded.
     """
     name: str = options.policy
     if not name and options.task is None:
@@ -82,13 +82,11 @@ def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
 
 
 class CheckedPolicy:
-    """A policy of which a command says in one line that it fails, or what it answered.
-
-    When it was loaded it answered one observation; code of somebody's own may fail at a later one.
+    """A policy whose failures and invalid actions end a command with one line.
 
     Args:
         loaded: The policy.
-        is_clipped: Whether who asks clips actions beyond [-1, 1], as a robot does.
+        is_clipped: Accept actions beyond [-1, 1], because the caller clips them.
     """
 
     def __init__(self, loaded: LoadedPolicy, *, is_clipped: bool = False) -> None:

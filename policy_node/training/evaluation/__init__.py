@@ -1,1 +1,1 @@
-"""What measures: success of policies over fresh episodes."""
+"""Success rate of policies over new episodes."""

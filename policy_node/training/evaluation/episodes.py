@@ -23,7 +23,7 @@ _Z95 = 1.959963984540054
 
 @dataclass(frozen=True, slots=True)
 class EpisodeOutcomes:
-    """What happened in each evaluated episode, arrays (episodes,).
+    """Outcomes of evaluated episodes, arrays (episodes,).
 
     Attributes:
         seed: Seed of the reset.
@@ -119,7 +119,7 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
     """Runs one episode per simulation, without noise.
 
     Args:
-        simulation: The simulations; both success rules are applied whatever theirs is.
+        simulation: The simulations; both success rules are applied.
         policy: The policy.
         seeds: One per simulation; an episode depends on its seed alone.
     """
@@ -162,7 +162,7 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
 
 
 def _long_way(spec: TaskSpec, observation: dict[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-    """Whether goal and object have quaternions of opposite signs, (episodes,)."""
+    """Return where goal and object have quaternions of opposite signs, (episodes,)."""
     achieved, desired = observation['achieved_goal'], observation['desired_goal']
     if spec.goal is not GoalKind.POSE:
         return np.zeros(len(achieved), np.bool_)

@@ -22,7 +22,7 @@ class Evaluator:
     Training episodes therefore do not depend on whether there was an evaluation between them.
 
     Attributes:
-        proposer: Who proposes subgoals, where somebody does.
+        proposer: High level that proposes subgoals, or None.
     """
 
     def __init__(self, simulation: Simulation, config: TrainConfig) -> None:
@@ -55,7 +55,7 @@ class Evaluator:
         return evaluate(simulation, both, config.run.evaluation_episodes, EVALUATION_SEED)
 
     def is_complete(self, outcomes: EpisodeOutcomes) -> bool:
-        """Whether an evaluation ran all its episodes; only then it may decide what is best."""
+        """Return whether an evaluation ran all its episodes, so that it may select the best."""
         return len(outcomes) >= self._config.run.evaluation_episodes
 
 
