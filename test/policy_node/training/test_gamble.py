@@ -171,7 +171,7 @@ def test_weighted_gambles_succeed_as_often_as_gambles_do() -> None:
     lucky = gamble & np.concatenate([batch.reward == 0.0 for batch in batches])
     assert lucky.sum() / gamble.sum() == pytest.approx(0.6, abs=0.03)
     assert weight[lucky].sum() / weight[gamble].sum() == pytest.approx(0.2, abs=0.03)
-    with pytest.raises(ValueError, match="only importance density has weights"):
+    with pytest.raises(ValueError, match='only importance density has weights'):
         gambler('none', {'future': 1.0})[0].importance(draw())
 
 
