@@ -4,8 +4,8 @@ Usage: gymnasium_robotics_suite.py [--source REPOSITORY]
 
 Its tests are not in its wheel: they come from its git repository, which needs the network, or from
 a folder with its files. Nothing of it is kept. An example counts if the reference itself runs it,
-with `python -O`, without which its Fetch environments fail on MuJoCo 4. Exits with 0 if all tests
-pass and all such examples run, with 3 if there is no source.
+with `python -O`, without which its Fetch and hand environments fail on MuJoCo 4. Exits with 0 if
+all tests pass and all such examples run, with 3 if there is no source.
 """
 
 from __future__ import annotations

@@ -39,10 +39,10 @@ _ARMS = {
 def task_section(task: TaskSpec, actors: Path = ACTORS) -> str:
     """Returns all that is generated of a task's page, as GitHub Markdown."""
     parts = [
-        ('Contract', _contract(task)),
+        ('The task in numbers', _contract(task)),
         ('Observation', _observation(task)),
         ('Published results', _published(task)),
-        ('Our actor', _actor(task, actors)),
+        ('Our policy', _actor(task, actors)),
         ('Try it', _commands(task, actors)),
     ]
     return '\n\n'.join(f'## {title}\n\n{text}' for title, text in parts)
@@ -56,7 +56,7 @@ def index_section(actors: Path = ACTORS) -> str:
         success = f'{report["success_gymnasium"]:.3f}' if report else 'none shipped'
         name = f'[{task.name}]({task.name}.md)'
         rows.append((name, str(task.observation_size), _success(task), success))
-    return _table(('task', 'observation', 'success', 'our actor'), rows)
+    return _table(('task', 'observation', 'success', 'our policy'), rows)
 
 
 def _thirteen() -> list[TaskSpec]:
@@ -124,7 +124,7 @@ def _published(task: TaskSpec) -> str:
         rows.append((f'best known: {best.source}', best.success, best.kind))
     if not rows:
         return 'No number found: the paper has curves only.'
-    return _table(('who, after how much', 'success', 'how read'), rows)
+    return _table(('source and steps', 'success', 'how read'), rows)
 
 
 def _report(task: TaskSpec, actors: Path) -> dict[str, Any] | None:
@@ -135,7 +135,7 @@ def _report(task: TaskSpec, actors: Path) -> dict[str, Any] | None:
 def _actor(task: TaskSpec, actors: Path) -> str:
     report = _report(task, actors)
     if report is None:
-        text = 'None is shipped yet: no training here has reached one that is worth it.'
+        text = 'No policy is shipped yet.'
         return f'{text} {_ceiling(task)}'.rstrip()
     lower, upper = report['success_gymnasium_interval_95']
     rows = [
@@ -155,8 +155,8 @@ def _actor(task: TaskSpec, actors: Path) -> str:
             1,
             (f'in `{reference["environment"]}`', f'{success}, {reference["episodes"]:,} episodes'),
         )
-    failures = f'### Its failures\n\n{_failures(task, report)}'
-    shows = 'Success during training, of a run before where the actor is a mean'
+    failures = f'### Failures\n\n{_failures(task, report)}'
+    shows = 'Success during training (for averaged policies: an earlier run)'
     curve = f'![{shows}](../../policy_node/actors/{task.name}.png)'
     return f'{_table(("", ""), rows)}\n\n{curve}\n\n{failures}'
 
@@ -167,16 +167,16 @@ def _failures(task: TaskSpec, report: dict[str, Any]) -> str:
     never = round(episodes * (1 - report['touched']))
     lines = [
         f'{failed:,} of {episodes:,} episodes: {never:,} never reached the goal, '
-        f'{failed - never:,} reached it and had lost it at the end.'
+        f'{failed - never:,} reached it but lost it before the end.'
     ]
     if 'stay' in report:
         stay = f'with probability {report["stay"]:.3f}'
-        lines.append(f'At the goal, it is still there at the next tick {stay}.')
+        lines.append(f'A reached goal is still reached at the next step {stay}.')
     if report.get('dropped') is not None:
         lines.append(f'{report["dropped"]:.1%} of the objects lay below the palm at the end.')
     if report.get('long_way') is not None:
         lines.append(
-            f'In {report["long_way_share"]:.1%} of the episodes the rule asks for the long way '
+            f'In {report["long_way_share"]:.1%} of the episodes the rule requires the long way '
             f'round (quaternions of opposite sign at the start); {report["long_way"]:.3f} succeed.'
         )
     lines += [
@@ -191,8 +191,8 @@ def _ceiling(task: TaskSpec) -> str:
     if task.name not in CEILINGS:
         return ''
     return (
-        f'At most {CEILINGS[task.name]:.3f} can succeed: [ceilings](../results.md#ceilings) lists '
-        'which goals are out of reach.'
+        f'At most {CEILINGS[task.name]:.3f} can succeed: the other goals are out of reach '
+        '([ceilings](../results.md#ceilings)).'
     )
 
 

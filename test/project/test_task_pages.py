@@ -34,13 +34,13 @@ def test_the_observation_is_listed_without_gaps(task) -> None:
 
 def test_a_newly_shipped_actor_is_all_it_takes(tmp_path: Path) -> None:
     task = TASKS['HandManipulatePenRotate']
-    assert 'None is shipped yet' in TOOL['task_section'](task, tmp_path)
+    assert 'No policy is shipped yet' in TOOL['task_section'](task, tmp_path)
     report = json.loads((TOOL['ACTORS'] / 'HandManipulateEggRotate.json').read_text())
     report |= {'success_gymnasium': 0.25, 'touched': 0.5, 'episodes': 1000, 'dropped': 0.125}
     (tmp_path / f'{task.name}.json').write_text(json.dumps(report))
     section = TOOL['task_section'](task, tmp_path)
     assert '| success at the last step | **0.250** (' in section
-    assert '750 of 1,000 episodes: 500 never reached the goal, 250 reached it and had' in section
+    assert '750 of 1,000 episodes: 500 never reached the goal, 250 reached it but lost' in section
     assert '12.5% of the objects lay below the palm' in section
     assert '| 0.250 |' in TOOL['index_section'](tmp_path)
 
