@@ -36,6 +36,9 @@ PHASES: dict[Phase, str] = {
     'finished': 'at the last tick of an episode that no reset ended',
 }
 
+# Values that the message leaves out.
+_LEFT_OUT = {'joint_prefix': JOINT_PREFIX, 'disturbances': '', 'variation': ''}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeStatus:
@@ -77,8 +80,7 @@ class EpisodeStatus:
     def to_values(self) -> dict[str, str]:
         """Return the key/value pairs of the message."""
         values = {key: str(value) for key, value in dataclasses.asdict(self).items()}
-        usual = {'joint_prefix': JOINT_PREFIX, 'disturbances': '', 'variation': ''}
-        return {key: text for key, text in values.items() if usual.get(key) != text}
+        return {key: text for key, text in values.items() if _LEFT_OUT.get(key) != text}
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> EpisodeStatus:
@@ -87,7 +89,7 @@ class EpisodeStatus:
         Raises:
             ValueError: If a pair is missing or invalid.
         """
-        values = {'joint_prefix': JOINT_PREFIX, 'disturbances': '', 'variation': '', **values}
+        values = {**_LEFT_OUT, **values}
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
         if missing:
             raise ValueError(f'episode_status without {", ".join(missing)}')

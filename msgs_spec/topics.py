@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Literal
@@ -285,9 +286,13 @@ def topic(task: TaskSpec, name: str) -> TopicSpec:
     Raises:
         ValueError: If the topic is unknown; the message lists the known ones.
     """
-    found = {spec.name: spec for spec in topics(task)}
+    return _named(task, topics(task), name)
+
+
+def _named(task: TaskSpec, specs: Iterable[TopicSpec], name: str, use: str = '') -> TopicSpec:
+    found = {spec.name: spec for spec in specs}
     if name not in found:
-        raise ValueError(f'{task.name} has no topic {name!r}; allowed: {", ".join(found)}')
+        raise ValueError(f'{task.name} has no topic {name!r}{use}; allowed: {", ".join(found)}')
     return found[name]
 
 
@@ -363,7 +368,4 @@ def view_topic(task: TaskSpec, name: str) -> TopicSpec:
     Raises:
         ValueError: If the topic is unknown; the message lists the known ones.
     """
-    found = {spec.name: spec for spec in view_topics(task)}
-    if name not in found:
-        raise ValueError(f'{task.name} has no topic {name!r} to view; allowed: {", ".join(found)}')
-    return found[name]
+    return _named(task, view_topics(task), name, ' to view')

@@ -34,7 +34,7 @@ from msgs_spec.disturbances import read_disturbances
 from msgs_spec.parameters import SIM_NODE
 from msgs_spec.robots import read_joint_prefix
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
-from msgs_spec.topics import LATEST_TICK, MONITORING, ground_truth_topics, topics
+from msgs_spec.topics import LATEST_TICK, MONITORING, TopicSpec, ground_truth_topics, topics
 from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import NodeFailure, StopSignals
 from node_runtime.ros import (
@@ -137,14 +137,17 @@ class SimNode(Node):
         publishers = {}
         # `latest_tick` comes before the topics of the task, so that viewers never miss it.
         for spec in (*MONITORING, *topics(self._robot.runner.spec)):
-            message_class = ros_message_class(spec.type_name)
-            profile = rclpy_profile(spec.qos)
             if spec.direction == 'subscribed':
+                message_class, profile = ros_message_class(spec.type_name), rclpy_profile(spec.qos)
                 callback = receivers.callback(spec)
                 self.create_subscription(message_class, spec.name, callback, profile, raw=True)
             elif spec.name != '/clock' or self._settings['publish_clock']:
-                publishers[spec.name] = self.create_publisher(message_class, spec.name, profile)
+                publishers[spec.name] = self._publisher(spec)
         return publishers
+
+    def _publisher(self, spec: TopicSpec) -> Publisher:
+        message_class, profile = ros_message_class(spec.type_name), rclpy_profile(spec.qos)
+        return self.create_publisher(message_class, spec.name, profile)
 
     def _open_ground_truth(self) -> None:
         """Publish the true state too, once something disturbs the robot."""
@@ -152,8 +155,7 @@ class SimNode(Node):
             return
         for spec in ground_truth_topics(self._robot.runner.spec):
             if spec.name not in self._outputs:
-                message_class, profile = ros_message_class(spec.type_name), rclpy_profile(spec.qos)
-                self._outputs[spec.name] = self.create_publisher(message_class, spec.name, profile)
+                self._outputs[spec.name] = self._publisher(spec)
 
     def _make_recorder(self) -> EpisodeRecorder | None:
         directory = self._settings['episode_dir']

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.tasks import Task
-from fetch_hand_sim.simulation.varied_physics import VariedPhysics, joint_dofs
+from fetch_hand_sim.simulation.varied_physics import VariedPhysics, first_body, joint_dofs
 from msgs_spec.actions import command_limits
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import MOST_TICKS, Disturbances, PhysicsDisturbance
@@ -113,7 +113,7 @@ class Disturber:
     # Episodes
 
     def allow(self, given: Mapping[str, Any]) -> dict[str, float]:
-        """Return variations that a user asks for as numbers, and make them possible.
+        """Return requested variations as numbers, and make them possible.
 
         Raises:
             ValueError: If a name is unknown, a value is not allowed or the task lacks what it
@@ -244,10 +244,6 @@ class Disturber:
         disturbed = np.clip(self._applied + half * moved, self._lower, self._upper)
         return disturbed.astype(commands.dtype)
 
-    def pending_commands(self) -> Array:
-        """Return the last `MOST_TICKS` commands, newest first, (N, MOST_TICKS, action size)."""
-        return np.moveaxis(self._sent[:MOST_TICKS], 0, 1).copy()
-
     def push(self, forces: Array) -> bool:
         """Add the pushes of this tick to (N, bodies, 6) wrenches; return whether there are any."""
         pushes = self.disturbances.pushes
@@ -372,7 +368,7 @@ _STATE = (
 
 
 def _variation(name: str, value: Any) -> float:
-    """Return the value of a variation, or raise a `ValueError` that says what is allowed."""
+    """Return the value of a variation, or raise a `ValueError` with the allowed range."""
     if name not in VARIATIONS:
         known = ', '.join(VARIATIONS)
         raise ValueError(f'variation {name!r:.40} is unknown; allowed: {known}')
@@ -401,8 +397,7 @@ def _object_address(model: mujoco.MjModel) -> int | None:
 def _pushed_body(task: Task) -> int:
     """Return the object, or the gripper or palm in tasks without one."""
     names = ('object0', 'object', 'robot0:gripper_link', 'robot0:palm')
-    numbers = (mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_BODY.value, n) for n in names)
-    return int(next((number for number in numbers if number > 0), task.model.nbody - 1))
+    return first_body(task.model, names) or int(task.model.nbody - 1)
 
 
 class _Lever:

@@ -48,8 +48,8 @@ class VariedPhysics:
 
     def __init__(self, task: Task, physics: PhysicsDisturbance) -> None:
         self._task = task
-        self._body = _number(task.model, _OBJECTS)
-        self._table = _number(task.model, (_TABLE,))
+        self._body = first_body(task.model, _OBJECTS)
+        self._table = first_body(task.model, (_TABLE,))
         self._live: dict[str, Array] = {}
         self._nominal: dict[str, Array] = {}
         off = PhysicsDisturbance()
@@ -175,7 +175,7 @@ def joint_dofs(task: Task) -> NDArray[np.intp]:
     return np.array([int(model.joint(name).dofadr[0]) for name in task.spec.robot.joints])
 
 
-def _number(model: mujoco.MjModel, names: tuple[str, ...]) -> int:
-    """The number of the first body of these names; 0 if the model has none."""
+def first_body(model: mujoco.MjModel, names: tuple[str, ...]) -> int:
+    """Return the number of the first of these bodies that the model has, or 0."""
     numbers = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY.value, name) for name in names)
     return next((number for number in numbers if number > 0), 0)

@@ -11,7 +11,7 @@ from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.text import one_line
 from policy_node.policies.policy import LoadedPolicy, Policy, RandomPolicy, RestingPolicy
 from policy_node.policies.python_policy import is_python_name, load_python
-from policy_node.policies.shipped import actor_path, shipped_actors
+from policy_node.policies.shipped import actor_path, shipped_actors, shipped_name
 
 if TYPE_CHECKING:
     from policy_node.policies.actor import Actor
@@ -85,15 +85,15 @@ def _untrained(name: str, task: str | None) -> LoadedPolicy:
 
 def _shipped(task: str | None, kind: str) -> Path:
     """Return the shipped policy of a task: the usual one (kind ''), or the robust one."""
-    what, ending = (f'{kind} actor', f'_{kind}') if kind else ('actor', '')
+    what = f'{kind} actor' if kind else 'actor'
     task, shipped = _require_task(f'the shipped {what}', task), shipped_actors()
-    if f'{task}{ending}' not in shipped:
-        names = [name for name in shipped if name.endswith(ending)]
+    if shipped_name(task, kind) not in shipped:
+        names = [name for name in shipped if name.endswith(shipped_name('', kind))]
         raise ValueError(
             f'no {what} is shipped for {task} (shipped: {", ".join(names) or "none"}); '
             f'give a policy: a file, {RANDOM!r} or {RESTING!r}'
         )
-    return shipped[f'{task}{ending}']
+    return shipped[shipped_name(task, kind)]
 
 
 def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:

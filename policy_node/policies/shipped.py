@@ -21,6 +21,11 @@ def shipped_actors() -> dict[str, Path]:
     return {path.stem: path for path in files if '.' not in path.stem}
 
 
+def shipped_name(task: str, kind: str) -> str:
+    """Return the name of the shipped policy of a task: the usual one (kind ''), or `robust`."""
+    return f'{task}_{kind}' if kind else task
+
+
 def actor_path(name_or_path: str | Path, besides: Sequence[str] = ()) -> Path:
     """Returns the file called `name_or_path`: the name of a shipped actor, or a file.
 

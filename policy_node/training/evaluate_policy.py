@@ -36,6 +36,7 @@ from policy_node.training.evaluation.table import print_table
 from policy_node.training.policy_options import (
     CheckedPolicy,
     add_batch_options,
+    add_disturbances_option,
     add_policy_options,
     add_reward_options,
     load_chosen_policy,
@@ -53,6 +54,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser, former='--actor')
     add_batch_options(parser, num_envs=100)
+    add_disturbances_option(parser)
     add_reward_options(parser)
     add, seed = parser.add_argument, whole_number(0, LARGEST_SEED)
     add('--first-seed', type=seed, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
@@ -76,10 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     loaded = load_chosen_policy(options)
-    try:
-        simulation = make_chosen_simulation(options, loaded)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+    simulation = make_chosen_simulation(options, loaded)
     files = [file for file in (options.json, options.csv) if file not in (None, _STDOUT)]
     for file in files:
         require_writable(file)

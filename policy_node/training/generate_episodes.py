@@ -36,6 +36,7 @@ from policy_node.policies.policy import RandomPolicy
 from policy_node.training.policy_options import (
     CheckedPolicy,
     add_batch_options,
+    add_disturbances_option,
     add_policy_options,
     add_reward_options,
     load_chosen_policy,
@@ -50,6 +51,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser)
     add_batch_options(parser, num_envs=64)
+    add_disturbances_option(parser)
     add_reward_options(parser)
     add, seed = parser.add_argument, whole_number(0, LARGEST_SEED)
     add('--output', type=Path, required=True, help='directory in which episodes are collected')
@@ -62,8 +64,7 @@ def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simul
     """Returns what makes the episodes, and its simulation.
 
     Raises:
-        UsageError: If there is no such policy.
-        ValueError: If an option does not fit it.
+        UsageError: If the policy is not found, or an option does not fit it.
     """
     loaded = load_chosen_policy(options)
     simulation = make_chosen_simulation(options, loaded)
@@ -98,10 +99,7 @@ def _run(options: argparse.Namespace) -> int:
     last = options.first_seed + options.episodes - 1
     if last > LARGEST_SEED:
         raise UsageError(f'the last seed would be {last}; allowed: 0 ... {LARGEST_SEED}')
-    try:
-        generator, simulation = make_generator(options)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+    generator, simulation = make_generator(options)
     _say_what_is_there(options, simulation.spec.name)
     began, cpu_began = time.perf_counter(), time.process_time()
     count = steps = successes = 0

@@ -44,15 +44,20 @@ def add_policy_options(parser: argparse.ArgumentParser, former: str | None = Non
     )
 
 
-def add_batch_options(parser: argparse.ArgumentParser, num_envs: int) -> None:
-    """Adds `--episodes`, `--num-envs` (with this default) and `--threads`."""
+def add_batch_options(parser: argparse.ArgumentParser, num_envs: int, episodes: int = 1000) -> None:
+    """Add `--episodes` and `--num-envs`, with these defaults, and `--threads`."""
     add, count = parser.add_argument, whole_number(1)
-    add('--episodes', type=count, default=1000, help='default: 1000')
+    add('--episodes', type=count, default=episodes, help=f'default: {episodes}')
     simulations = f'simulations in the batch; default: {num_envs}'
     add('--num-envs', type=count, default=num_envs, help=simulations)
     add('--threads', type=int, default=0, help='simulation threads; default: all cores')
+
+
+def add_disturbances_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--disturbances`."""
     presets = 'none, mild, hardware, severe, scaled as in hardware*0.5, or a YAML file'
-    add('--disturbances', default='none', help=f'of the robot: {presets}; default: none')
+    help_text = f'of the robot: {presets}; default: none'
+    parser.add_argument('--disturbances', default='none', help=help_text)
 
 
 def add_reward_options(parser: argparse.ArgumentParser) -> None:
@@ -122,20 +127,23 @@ class CheckedPolicy:
 
 
 def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:
-    """Simulations for a policy, as batch and reward options say.
+    """Return simulations for a policy, with the batch, reward and disturbances options.
 
     Raises:
-        ValueError: If an option does not fit it.
+        UsageError: If an option does not fit the policy.
     """
-    return Simulation(
-        loaded.task,
-        num_envs=min(options.num_envs, options.episodes),
-        num_threads=options.threads,
-        reward_type=options.reward_type,
-        success_rule=options.success_rule,
-        control_hz=loaded.control_hz or DEFAULT_CONTROL_HZ,
-        disturbances=options.disturbances,
-    )
+    try:
+        return Simulation(
+            loaded.task,
+            num_envs=min(options.num_envs, options.episodes),
+            num_threads=options.threads,
+            reward_type=options.reward_type,
+            success_rule=options.success_rule,
+            control_hz=loaded.control_hz or DEFAULT_CONTROL_HZ,
+            disturbances=options.disturbances,
+        )
+    except ValueError as error:
+        raise UsageError(str(error)) from None
 
 
 def require_writable(file: Path) -> None:

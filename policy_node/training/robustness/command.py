@@ -37,6 +37,7 @@ from policy_node.training.evaluation.episodes import (
 )
 from policy_node.training.policy_options import (
     CheckedPolicy,
+    add_batch_options,
     add_policy_options,
     load_chosen_policy,
     make_chosen_simulation,
@@ -54,11 +55,8 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser)
-    add, count = parser.add_argument, whole_number(1)
-    add('--episodes', type=count, default=200, help='episodes of each point; default: 200')
-    add('--num-envs', type=count, default=100, help='simulations in the batch; default: 100')
-    add('--threads', type=int, default=0, help='simulation threads; default: all cores')
-    seed = whole_number(0, LARGEST_SEED)
+    add_batch_options(parser, num_envs=100, episodes=200)
+    add, seed = parser.add_argument, whole_number(0, LARGEST_SEED)
     add('--first-seed', type=seed, default=FIRST_SEED, help=f'default: {FIRST_SEED}')
     add(
         '--output',
@@ -78,10 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     loaded = load_chosen_policy(options)
-    try:
-        simulation = make_chosen_simulation(options, loaded)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+    simulation = make_chosen_simulation(options, loaded)
     name = options.output or Path(f'{loaded.task}.robustness')
     files = {kind: name.with_name(f'{name.name}.{kind}') for kind in ('json', 'csv', 'png')}
     for file in files.values():

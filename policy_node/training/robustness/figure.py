@@ -70,11 +70,11 @@ def draw_overview(results: Sequence[Mapping[str, Any]]) -> bytes:
 
     figure = Figure(figsize=(12.0, 1.4 + 0.32 * len(results)), layout='constrained')
     axes = figure.subplots()
-    shares = [[_cell(result, sweep)[0] for sweep in SWEEPS] for result in results]
+    cells = [[_cell(result, sweep) for sweep in SWEEPS] for result in results]
+    shares = [[share for share, _ in row] for row in cells]
     axes.imshow(shares, cmap='RdYlGn', vmin=0.0, vmax=1.0, aspect='auto', alpha=0.75)
-    for row, result in enumerate(results):
-        for column, sweep in enumerate(SWEEPS):
-            text = _cell(result, sweep)[1]
+    for row, texts in enumerate(cells):
+        for column, (_, text) in enumerate(texts):
             axes.text(column, row, text, ha='center', va='center', fontsize='small')
     titles = [f'{sweep.name},\n{sweep.unit}' for sweep in SWEEPS]
     axes.set_xticks(range(len(SWEEPS)), titles, fontsize='x-small', rotation=30, ha='left')

@@ -14,6 +14,8 @@ from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo
 from policy_node.policies.files import sha256, to_json, write_files
+from policy_node.policies.loading import ROBUST
+from policy_node.policies.shipped import shipped_name
 from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate, summarize
 from policy_node.training.evaluation.table import print_table
 from policy_node.training.policy_options import require_writable
@@ -107,8 +109,8 @@ class _Candidate:
     @property
     def name(self) -> str:
         """Name of the shipped file: the task, with `_robust` where that recipe trained it."""
-        is_robust = self.info.config.get('recipe') == 'robust'
-        return f'{self.info.task}_robust' if is_robust else self.info.task
+        is_robust = self.info.config.get('recipe') == ROBUST
+        return shipped_name(self.info.task, ROBUST if is_robust else '')
 
     @property
     def disturbances(self) -> str | None:
