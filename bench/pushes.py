@@ -1,7 +1,7 @@
 """In how many episodes of FetchPush a policy moves the block, and where its gripper goes.
 
-On-policy learning only sees the noisy episodes of its own actor. If they never move the block, the
-actor cannot learn (docs/research/onpolicy).
+On-policy learning uses the noisy episodes of its own policy alone. If they never move the block,
+it cannot learn (docs/research/onpolicy).
 
 python bench/pushes.py none --noise .8
 python bench/pushes.py runs/push/latest.safetensors --noise .8

@@ -85,7 +85,7 @@ class CheckResult:
         ticks: Number of identical ticks.
         messages: Number of messages in them.
         unchecked: Messages of a last tick that was cut off before its command.
-        difference: The first difference, None if there is none.
+        difference: The first difference, or None.
         changed: Software that is not the recorded one: `name recorded -> here`.
     """
 

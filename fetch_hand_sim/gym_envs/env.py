@@ -61,7 +61,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             mapping, a JSON or YAML file or `Disturbances`; None for an undisturbed robot.
 
     Raises:
-        ValueError: If an argument is not allowed; the message says what is.
+        ValueError: If an argument is not allowed.
     """
 
     metadata = {  # noqa: RUF012 - as in gymnasium.Env

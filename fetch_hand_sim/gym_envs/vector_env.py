@@ -67,7 +67,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         disturbances: As `FetchHandEnv` takes them.
 
     Raises:
-        ValueError: If an argument is not allowed; the message says what is.
+        ValueError: If an argument is not allowed.
         TypeError: If a subclass has a method that would count in `FetchHandEnv` only.
     """
 

@@ -19,10 +19,10 @@ Seeds = int | Sequence[Seed] | None
 def require_whole(
     name: str, value: object, lowest: int | None = None, highest: int = 2**31 - 1
 ) -> None:
-    """Refuses what is no whole number.
+    """Require a whole number within limits.
 
     Raises:
-        ValueError: If it is none; True and False are none either.
+        ValueError: If the value is not an integer (booleans are not), or out of range.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ValueError(f'{name} must be a whole number, not {value!r:.60}')
@@ -31,10 +31,10 @@ def require_whole(
 
 
 def numbers(values: ArrayLike, what: str, shape: str) -> NDArray[Any]:
-    """Values as an array, whatever its shape.
+    """Return values as an array of any shape.
 
     Raises:
-        ValueError: If they are none, such as None, a dictionary or rows of different lengths.
+        ValueError: If they are not numbers, or rows have different lengths.
     """
     try:
         array = np.asarray(values)

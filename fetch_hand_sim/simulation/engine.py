@@ -28,9 +28,9 @@ _THREADED: weakref.WeakSet[Batch] = weakref.WeakSet()
 
 @functools.cache
 def prepare_engine() -> None:
-    """Sends MuJoCo's warnings to `logging` and stops its step timers; repeated calls do nothing.
+    """Send MuJoCo's warnings to `logging` and stop its step timers; repeated calls do nothing.
 
-    A warning handler that somebody else has installed stays.
+    A warning handler that is already installed stays.
     """
     if mujoco.get_mju_user_warning() is None:
         # The default handler writes MUJOCO_LOG.TXT into the working directory.
@@ -43,7 +43,7 @@ def _log_warning(message: str) -> None:
 
 
 def _stop_timers() -> None:
-    """Removes the clock that the Python bindings install to fill `MjData.timer`.
+    """Remove the clock that the Python bindings install to fill `MjData.timer`.
 
     MuJoCo reads it some twenty times per substep, 4-7 % of a step of these small models, and the
     bindings offer no way to switch it off. Trajectories do not depend on it.
@@ -57,7 +57,7 @@ def _stop_timers() -> None:
 
 
 class DivergenceWatch:
-    """Finds what MuJoCo has given up since one last looked.
+    """Find the simulations that MuJoCo reported as diverged since the last look.
 
     Args:
         batch: The `mujoco.batch.Batch` of N simulations.
@@ -68,12 +68,12 @@ class DivergenceWatch:
         self.forget()
 
     def forget(self) -> None:
-        """Counts no more what has been given up so far."""
+        """Ignore all divergences so far."""
         # The last axis is (last info, number).
         self._batch.warning[:, _THROWN_AWAY] = 0
 
     def found(self) -> NDArray[np.bool_]:
-        """Which simulations were given up since this or `forget` was called, (N,)."""
+        """Return which simulations diverged since the last call of this or `forget`, (N,)."""
         warning = self._batch.warning
         first, second, third = (warning[:, kind, 1] for kind in _THROWN_AWAY)
         lost = np.asarray(first + second + third > 0)
@@ -84,7 +84,7 @@ class DivergenceWatch:
 
 
 def keep_in_forks(batch: Batch) -> None:
-    """Has processes that are forked from this one keep a batch until they end."""
+    """Keep a batch alive in forked processes until they end."""
     if batch.nthread > 1:
         _THREADED.add(batch)
 

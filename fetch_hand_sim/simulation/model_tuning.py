@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 Geoms = NDArray[np.integer[Any]]
 
-# What is mixed, as `MjModel` and `MjsPair` name it, and what says how.
+# Contact parameters that two geoms combine, with the fields that decide how.
 _OF_GEOMS = ('condim', 'friction', 'margin', 'gap', 'solref', 'solimp', 'solmix', 'priority')
 # Pairs of Fetch bodies that pass the bounding tests at most steps and stay more than 1 cm apart for
 # all positions of the joints between them, even 0.3 rad beyond the limits, which are soft and were
@@ -140,12 +140,12 @@ def mix(model: mujoco.MjModel, first: Geoms, second: Geoms) -> dict[str, NDArray
 
 
 def _rows(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Rows (n,) of flags (n, ...) in which there is one."""
+    """Return which rows (n,) of flags (n, ...) contain a True."""
     return np.asarray(flags.any(axis=tuple(range(1, flags.ndim))))
 
 
 def _share(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
-    """What the first of two geoms contributes, by what both weigh."""
+    """Return the weight of the first of two geoms, from both values of `solmix`."""
     small_one, small_other = one < mujoco.mjMINVAL, other < mujoco.mjMINVAL
     weighed = one / np.where(small_one | small_other, 1.0, one + other)
     cases = [small_one & small_other, small_one, small_other]

@@ -370,7 +370,7 @@ class Simulation:
 
     @property
     def disturbances(self) -> Disturbances:
-        """What is disturbed."""
+        """The disturbances; off by default."""
         return Disturbances() if self._disturber is None else self._disturber.disturbances
 
     @disturbances.setter

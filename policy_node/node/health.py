@@ -13,8 +13,8 @@ from msgs_spec.tick import EpisodeStatus
 from node_runtime.ros import MEMORY_OF_THE_GRAPH
 from policy_node.node.responder import Responder
 
-# Seconds without a complete observation after which the report says so. A robot that is paused
-# says that once a second; one in slow motion is at most that many times slower than real time.
+# Seconds without a complete observation until the report names it. A paused robot publishes its
+# state once a second; the slowest motion is this many times slower than real time.
 _SILENCE = 2.0
 _SLOWEST = 100.0
 # A robot that restarts turns back once; so does a replay that is repeated.
@@ -39,7 +39,7 @@ def read_pace(message: Any, namespace: str) -> Pace | None:
     """Returns the pace of the robot of a namespace, from a message on `/diagnostics`.
 
     Returns:
-        None if the message is none of that robot's.
+        None if the message belongs to another node.
     """
     for status in message.status:
         if status.name.rpartition('/')[0] == namespace.rstrip('/'):

@@ -37,7 +37,7 @@ _WARN_PERIOD = 1.0
 # missing are; discovery takes a moment.
 _PATIENCE = 3.0
 _SERVED_AT_ONCE = 1000
-# Seconds for which it holds what a robot says of its pace, or that it is paused: once a second.
+# Seconds for which the pace of a robot is valid; it is published once a second.
 _PACE_HOLDS = 3.0
 # Robots beside the known one that need not be looked at twice.
 _REMEMBERED = 7
@@ -91,7 +91,7 @@ class PolicyNode(Node):
                 loop.wait(BEAT)
                 if self._has_robot_changed() or self._is_replaced:
                     self._leave()
-                    # Only then the middleware lets go of topics that the next robot may type anew.
+                    # The middleware releases topics only then; the next robot may have other types.
                     loop.serve_pending(_SERVED_AT_ONCE)
                 if self._responder is not None:
                     self._answer(self._responder, loop)

@@ -1,4 +1,4 @@
-"""One name for every policy: what the node and all commands accept, whatever the format."""
+"""Load a policy by one name, in every format that the node and the commands accept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a policy is, and the two that need no training."""
+"""The interface of policies, and two policies without training."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Observation = Mapping[str, ArrayLike]
 
 
 class Policy(Protocol):
-    """What acts, in the form of Stable-Baselines3's `predict`."""
+    """A policy with the `predict` of Stable-Baselines3."""
 
     def predict(
         self,
@@ -96,7 +96,7 @@ class RandomPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Returns actions (..., action size) in [-1, 1], whatever the observation."""
+        """Returns actions (..., action size) in [-1, 1] for any observation."""
         del state, episode_start, deterministic
         shape = _action_shape(observation, self._action_size)
         if shape == (len(self._of_rows), self._action_size):
@@ -118,7 +118,7 @@ class RestingPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Returns zeros (..., action size), whatever the observation."""
+        """Return zeros (..., action size) for any observation."""
         del state, episode_start, deterministic
         return np.zeros(_action_shape(observation, self._action_size), np.float32), None
 
