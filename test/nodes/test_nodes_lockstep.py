@@ -200,6 +200,12 @@ def test_every_command_of_a_burst_has_a_tick_of_its_own(start_process: Start) ->
         robot.connect('commands')
         robot.spin_until(lambda: bool(robot.received['joint_states']), 'the reset')
         applied = robot.received['applied_command']
+        # A command whose tick arrives shows that both directions are connected.
+        while not applied:
+            robot.publish('commands', Float64MultiArray(data=[0.0] * 4))
+            robot.spin(0.3)
+        robot.spin(0.3)
+        applied.clear()
         sent = [0.125 * number for number in range(1, 8)]
         for value in sent:
             robot.publish('commands', Float64MultiArray(data=[value, 0.0, 0.0, 0.0]))
