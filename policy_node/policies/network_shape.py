@@ -44,6 +44,15 @@ class NetworkShape:
         return self.observation_size + self.past_size
 
     @property
+    def past_start(self) -> int:
+        """Index of the first past action among the network inputs."""
+        return (
+            self.observation_size
+            if self.goal_features is None
+            else self.feature_size - self.past_size
+        )
+
+    @property
     def feature_size(self) -> int:
         """Length of the network input."""
         if self.goal_features is None:

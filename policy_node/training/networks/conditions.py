@@ -21,10 +21,9 @@ from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration import groups
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.networks.widening import first_weights
 
 Goals = NDArray[np.float64]
-# Names of the layer that takes the inputs, in actors and critics alike.
-_WEIGHT, _BIAS = 'hidden.0.weight', 'hidden.0.bias'
 # Smallest threshold drawn, as a share of the one that is trained for.
 SMALLEST_THRESHOLD = 0.5
 
@@ -149,22 +148,7 @@ def without_input(tensors: dict[str, Tensor], column: int, value: float) -> dict
     """Networks, by name, without the input at that column, which is `value` for good."""
     changed = {}
     for name in first_weights(tensors):
-        weight, bias = tensors[name], name.replace(_WEIGHT, _BIAS)
+        weight, bias = tensors[name], name.removesuffix('weight') + 'bias'
         changed[name] = torch.cat([weight[:, :column], weight[:, column + 1 :]], dim=1)
         changed[bias] = tensors[bias] + value * weight[:, column]
     return tensors | changed
-
-
-def with_input(tensors: dict[str, Tensor], column: int) -> dict[str, Tensor]:
-    """Networks, by name, with one input more at that column, to which they are blind."""
-    changed = {}
-    for name in first_weights(tensors):
-        weight = tensors[name]
-        blind = weight.new_zeros((len(weight), 1))
-        changed[name] = torch.cat([weight[:, :column], blind, weight[:, column:]], dim=1)
-    return tensors | changed
-
-
-def first_weights(tensors: dict[str, Tensor]) -> list[str]:
-    """Names of the weights of layers that take the inputs."""
-    return [name for name in tensors if name.endswith(_WEIGHT)]

@@ -1,8 +1,9 @@
-"""Networks made wider without changing what they say.
+"""Give networks more inputs or wider hidden layers without changing their outputs.
 
-Every hidden unit is there several times, and what follows takes from each a part of what it took
-from the one (Net2Net, Chen et al. 2016, arXiv 1511.05641). The parts differ, so that copies learn
-different things. Each unit has as many copies, which leaves a LayerNorm as it was.
+New inputs have zero weights. A hidden layer becomes wider by copying each unit the same number of
+times, which leaves a LayerNorm unchanged. The next layer divides the unit's weight among the copies
+(Net2Net, Chen et al. 2016, arXiv 1511.05641). The shares differ, so that copies learn different
+things.
 """
 
 from __future__ import annotations
@@ -15,6 +16,21 @@ from torch import Tensor
 # Smallest share of a unit that one of two copies is given.
 _LEAST_SHARE = 0.3
 _HIDDEN, _OUTPUT = 'hidden.', 'output.weight'
+
+
+def with_inputs(tensors: dict[str, Tensor], column: int, count: int) -> dict[str, Tensor]:
+    """Return networks with `count` more inputs from `column` on; their weights are zero."""
+    changed = {}
+    for name in first_weights(tensors):
+        weight = tensors[name]
+        zeros = weight.new_zeros((len(weight), count))
+        changed[name] = torch.cat([weight[:, :column], zeros, weight[:, column:]], dim=1)
+    return tensors | changed
+
+
+def first_weights(tensors: dict[str, Tensor]) -> list[str]:
+    """Return the names of the weights of layers that take the inputs."""
+    return [name for name in tensors if name.endswith('hidden.0.weight')]
 
 
 def can_widen(before: Sequence[int], after: Sequence[int]) -> bool:

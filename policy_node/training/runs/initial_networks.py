@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from msgs_spec.tasks import task_spec
@@ -13,7 +14,7 @@ from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import to_flat
 from policy_node.training.configuration.groups import Critics
 from policy_node.training.learners.actor_critic import ActorCritic
-from policy_node.training.networks.conditions import acting_input, first_weights, with_input
+from policy_node.training.networks.conditions import acting_input
 from policy_node.training.networks.critics import (
     Ensemble,
     count_critics,
@@ -21,7 +22,12 @@ from policy_node.training.networks.critics import (
     is_ensemble,
 )
 from policy_node.training.networks.shape_from_config import network_shape
-from policy_node.training.networks.widening import can_widen, widened
+from policy_node.training.networks.widening import (
+    can_widen,
+    first_weights,
+    widened,
+    with_inputs,
+)
 from policy_node.training.runs.training_state import part_of
 
 # Updates of the critics alone where one starts from nothing beside an actor that is already good:
@@ -81,7 +87,7 @@ class InitialNetworks:
             ValueError: One line names the sizes of both.
         """
         ours = described(network_shape(config), config.network.goal_features)
-        theirs = described(self.shape, self.goal_features)
+        theirs = described(self._with_past_of(config).shape, self.goal_features)
         if can_widen(self.shape.hidden_sizes, config.network.hidden_sizes):
             theirs['hidden_sizes'] = config.network.hidden_sizes
         differing = [
@@ -98,7 +104,7 @@ class InitialNetworks:
 
         A critic whose hidden layers are normalised otherwise, or whose values are of other rewards,
         is left behind; one of another `gamma` is kept, and `critic_first` gives its values time.
-        Hidden layers may become wider.
+        Hidden layers may become wider, and past actions may become inputs.
 
         Where the position of an object did not count, the goal's position was always about the
         object's own: networks have learnt nothing from it, and what they do elsewhere is chance (an
@@ -109,17 +115,18 @@ class InitialNetworks:
             ValueError: If the run cannot start from them; one line names the sizes of both.
         """
         self.require_fit(config)
-        before, now, shape = task_spec(self.origin['task']), task_spec(config.task), self.shape
-        fitted = self
+        before, now = task_spec(self.origin['task']), task_spec(config.task)
+        fitted = self._with_past_of(config)
+        shape = fitted.shape
         # The critic's inputs are the actor's, then the action.
         if shape.goal_features is not None and now.position_counts and not before.position_counts:
             inputs = shape.goal_features.goal_position(shape.observation_size, shape.goal_size)
-            changed = {name: self.tensors[name].clone() for name in first_weights(self.tensors)}
+            changed = {name: fitted.tensors[name].clone() for name in first_weights(fitted.tensors)}
             for weight in changed.values():
                 weight[:, inputs] = 0.0
-            fitted = replace(self, tensors=self.tensors | changed)
+            fitted = replace(fitted, tensors=fitted.tensors | changed)
         if acting_input(config) is not None:
-            tensors = with_input(fitted.tensors, shape.feature_size)
+            tensors = with_inputs(fitted.tensors, shape.feature_size, 1)
             fitted = replace(fitted, tensors=tensors)
         critic = config.find(Critics) or Critics()
         values = {name: to_flat(config)[name] for name in self.valued_by}
@@ -132,6 +139,28 @@ class InitialNetworks:
         wider = replace(shape, hidden_sizes=config.network.hidden_sizes)
         tensors = widened(fitted.tensors, config.network.hidden_sizes)
         return replace(fitted, tensors=tensors, shape=wider)
+
+    def _with_past_of(self, config: TrainConfig) -> InitialNetworks:
+        """These networks with the past actions of a run as inputs, if they have none.
+
+        The weights of these inputs start at zero; the normaliser starts at mean 0 and deviation 1.
+        """
+        shape = replace(self.shape, past_actions=config.network.past_actions)
+        if self.shape.past_actions or not shape.past_actions:
+            return self
+        tensors = with_inputs(self.tensors, shape.past_start, shape.past_size)
+        added = {'mean': 0.0, 'std': 1.0, 'total': 0.0}
+        count = tensors.get('observation_statistics.count')
+        if count is not None:
+            added['total_square'] = float(count)
+        for name, tensor in tensors.items():
+            part, _, statistic = name.rpartition('.')
+            if part.endswith(('observation_normalizer', 'observation_statistics')) and (
+                statistic in added
+            ):
+                more = tensor.new_full((shape.past_size,), added[statistic])
+                tensors[name] = torch.cat([tensor, more])
+        return replace(self, tensors=tensors, shape=shape)
 
     def without_critic(self) -> InitialNetworks:
         """The actor and its normalisers alone."""

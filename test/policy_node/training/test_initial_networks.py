@@ -304,6 +304,26 @@ def test_a_run_may_have_wider_networks_than_it_starts_from(tmp_path: Path, block
         read_initial_networks(str(run)).fitted(tiny(task))
 
 
+@pytest.mark.parametrize('task', ['FetchPush', 'HandManipulateBlockRotateZ'])
+def test_past_actions_that_become_inputs_change_no_action_at_first(
+    tmp_path: Path, task: str
+) -> None:
+    config = tiny(task, past_actions=2, hidden_sizes=(256, 256, 256))
+    networks = read_initial_networks(task).fitted(config)
+    learner = Trainer(config, tmp_path, Workers(), init_from=networks).learner
+    rng, before, spec = np.random.default_rng(0), load_actor(task, task), TASKS[task]
+    observation = torch.tensor(rng.normal(size=(5, spec.observation_size)), dtype=torch.float32)
+    goal = torch.tensor(rng.normal(size=(5, spec.goal.size)), dtype=torch.float32)
+    past = torch.tensor(rng.uniform(-1, 1, (5, 2 * spec.robot.action_size)), dtype=torch.float32)
+    features = learner.actor.features(torch.cat([observation, past], dim=-1), goal)
+    torch.testing.assert_close(
+        learner.actor(features), before(before.features(observation, goal)), rtol=1e-4, atol=1e-4
+    )
+    start = network_shape(config).past_start
+    normalized = features[:, start : start + past.shape[1]]
+    torch.testing.assert_close(normalized, past, rtol=1e-3, atol=1e-3)
+
+
 def test_where_it_started_is_kept_through_resume_and_shipped(
     tmp_path: Path, block_run: Path
 ) -> None:
