@@ -29,7 +29,7 @@ from rich.table import Table  # noqa: E402
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder, RecordingContext  # noqa: E402
 from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
-from msgs_spec.cdr import TopicCodec  # noqa: E402
+from msgs_spec.codecs import TopicCodec  # noqa: E402
 from msgs_spec.tasks import TASKS  # noqa: E402
 from msgs_spec.tick import Tick, TickEncoder  # noqa: E402
 from msgs_spec.topics import TopicSpec, topic  # noqa: E402

@@ -30,8 +30,7 @@ import rclpy  # noqa: E402
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
-from msgs_spec.cdr import TopicCodec  # noqa: E402
-from msgs_spec.codecs import decode_status  # noqa: E402
+from msgs_spec.codecs import TopicCodec, decode_status  # noqa: E402
 from msgs_spec.observations import ObservationAssembler  # noqa: E402
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec  # noqa: E402
 from msgs_spec.tick import TickEncoder  # noqa: E402

@@ -27,9 +27,9 @@ import numpy as np  # noqa: E402
 import rclpy  # noqa: E402
 
 from msgs_spec.codecs import decode_status  # noqa: E402
-from msgs_spec.diagnostics import MISSED_TICKS  # noqa: E402
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic  # noqa: E402
+from node_runtime.diagnostics import MISSED_TICKS  # noqa: E402
 from node_runtime.event_loop import EventLoop  # noqa: E402
 from node_runtime.ros import rclpy_profile, ros_message_class  # noqa: E402
 from node_runtime.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402

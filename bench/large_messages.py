@@ -11,7 +11,7 @@ sys.path.insert(0, str(ROOT))
 
 import rclpy  # noqa: E402
 
-from msgs_spec.cdr import TopicCodec  # noqa: E402
+from msgs_spec.codecs import TopicCodec  # noqa: E402
 from msgs_spec.tasks import task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
 from node_runtime.ros import rclpy_profile, ros_message_class  # noqa: E402

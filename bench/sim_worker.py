@@ -79,7 +79,7 @@ class PhysicsWorker:
 def record_episode(task: str, num_envs: int) -> tuple[np.ndarray, Any]:
     """States (steps, N, state size) of an episode before each step, and the model."""
     from fetch_hand_sim.simulation import Simulation
-    from msgs_spec.actions import command_from_action
+    from msgs_spec.robots import command_from_action
 
     simulation = Simulation(task, num_envs=num_envs)
     simulation.reset(seed=0)

@@ -1,8 +1,14 @@
-"""Robot specifications: joints in order, and commands in ROS units."""
+"""Robot specifications: joints in order, commands in ROS units, normalised actions."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msgs_spec.arrays import Array
 
 # Metres at 25 Hz by which a gripper action of 1 moves the mocap target ahead of the gripper:
 # Plappert et al. 2018, section 1.1, and `fetch_env.py` of Gymnasium-Robotics.
@@ -55,6 +61,11 @@ class RobotSpec:
     def action_size(self) -> int:
         """Length of action and command: 4 for Fetch, 20 for the hand."""
         return len(self.command)
+
+    @property
+    def has_normalised_command(self) -> bool:
+        """True if commands equal actions in [-1, 1]."""
+        return all(part.lower == -1.0 and part.upper == 1.0 for part in self.command)
 
     def with_joint_prefix(self, prefix: str) -> RobotSpec:
         """Return the robot with another prefix of its joint names, such as `rh_`."""
@@ -152,3 +163,48 @@ SHADOW_HAND = RobotSpec(
 # Order of the fingertips in `achieved_goal`, `desired_goal` and `fingertip_poses` (MJCF sites
 # `robot0:S_<name>`).
 FINGERTIPS = ('fftip', 'mftip', 'rftip', 'lftip', 'thtip')
+
+
+# Commands and actions
+
+
+def command_limits(robot: RobotSpec) -> tuple[Array, Array]:
+    """Return lower and upper limits of the command, (action_size,) each, in command units."""
+    return (
+        np.array([part.lower for part in robot.command]),
+        np.array([part.upper for part in robot.command]),
+    )
+
+
+def command_from_action(robot: RobotSpec, action: ArrayLike) -> NDArray[Any]:
+    """Map actions (..., action_size), clipped to [-1, 1], to commands of the same shape.
+
+    Fetch: the command is the action. Its floating type is kept, because Gymnasium-Robotics scales
+    it in that type. Other robots: -1 and 1 are the limits of the command, as in `hand_env.py`.
+    """
+    clipped = np.asarray(np.clip(np.asarray(action), -1.0, 1.0))
+    if robot.has_normalised_command:
+        return clipped
+    lower, upper = command_limits(robot)
+    command = (upper + lower) / 2.0 + clipped * ((upper - lower) / 2.0)
+    return np.asarray(np.clip(command, lower, upper))
+
+
+def action_from_command(robot: RobotSpec, command: ArrayLike) -> Array:
+    """Map commands (..., action_size) to actions, clipped to [-1, 1]."""
+    values = np.asarray(command, dtype=np.float64)
+    if not robot.has_normalised_command:
+        lower, upper = command_limits(robot)
+        values = (values - (upper + lower) / 2.0) / ((upper - lower) / 2.0)
+    return np.clip(values, -1.0, 1.0)
+
+
+def resting_command(robot: RobotSpec) -> Array:
+    """Return the command of the zero action: the gripper stays, hand joints go mid-range."""
+    return np.asarray(command_from_action(robot, np.zeros(robot.action_size)), dtype=np.float64)
+
+
+def clip_command(robot: RobotSpec, command: ArrayLike) -> Array:
+    """Clip commands (..., action_size) to the limits of the robot."""
+    lower, upper = command_limits(robot)
+    return np.clip(np.asarray(command, dtype=np.float64), lower, upper)

@@ -1,52 +1,146 @@
 """The tasks as data: goals, observations, lengths, thresholds.
 
-Thirteen come from Plappert et al. 2018; other packages may add tasks (`foreign_tasks.py`).
+Thirteen come from Plappert et al. 2018. Other packages may add tasks by entry points: the group
+`fetch_hand_sim_tasks.specification` gives a `TaskSpec` of the entry point's name, without importing
+MuJoCo. An entry point of the same name in `fetch_hand_sim_tasks.simulation` gives the class that
+simulates the task. A broken package costs one warning and its own task;
+`fetch_hand_sim.simulation.check_task` finds subtle mistakes.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import logging
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
+from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 # Third-party tasks import it from here.
 from msgs_spec.arrays import Array as Array
-from msgs_spec.foreign_tasks import foreign_tasks
-from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND
-from msgs_spec.task_types import GoalKind, TaskFormulas, TaskSpec, VectorPart
-from msgs_spec.text import did_you_mean
-
-__all__ = [
-    'DEFAULT_CONTROL_HZ',
-    'PHYSICS_TIMESTEP',
-    'REWARD_TYPES',
-    'SUCCESS_RULES',
-    'TASKS',
-    'TIMINGS',
-    'GoalKind',
-    'RewardType',
-    'SuccessRule',
-    'TaskFormulas',
-    'TaskSpec',
-    'Timing',
-    'VectorPart',
-    'substeps_per_tick',
-    'task_spec',
-]
+from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, RobotSpec
+from msgs_spec.text import did_you_mean, one_line
 
 # One physics substep, seconds, and the paper's 20 substeps per action (25 Hz).
 PHYSICS_TIMESTEP = 0.002
 DEFAULT_CONTROL_HZ = 25.0
 
-# `GoalMetric` of the simulation explains them.
+# See `fetch_hand_sim.simulation.rewards.GoalMetric`.
 RewardType = Literal['sparse', 'dense']
 SuccessRule = Literal['gymnasium', 'paper']
-# What stays the same at rates other than 25 Hz: the seconds of an episode and the speed of a
-# gripper, or the ticks of an episode and the step of a gripper (as up to version 1.0).
+# Quantities that other rates than 25 Hz keep: seconds of an episode and speed of the gripper, or
+# ticks of an episode and gripper motion per tick (as up to version 1.0).
 Timing = Literal['seconds', 'ticks']
 REWARD_TYPES: tuple[RewardType, ...] = get_args(RewardType)
 SUCCESS_RULES: tuple[SuccessRule, ...] = get_args(SuccessRule)
 TIMINGS: tuple[Timing, ...] = get_args(Timing)
+
+
+class GoalKind(Enum):
+    """Kinds of goal vectors.
+
+    POINT: position of the gripper or object, 3 values, metres, world.
+    FINGERTIPS: five fingertip positions, 15 values, metres, world.
+    POSE: object position and quaternion wxyz, 7 values, metres, world.
+    """
+
+    POINT = 3
+    FINGERTIPS = 15
+    POSE = 7
+
+    @property
+    def size(self) -> int:
+        """Length of the goal vector."""
+        return self.value
+
+
+@dataclass(frozen=True, slots=True)
+class VectorPart:
+    """A named run of `size` numbers in the vector of an observation, a topic or a command."""
+
+    name: str
+    size: int
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class TaskFormulas:
+    """Formulas for the observation and the achieved goal of a task.
+
+    They accept any leading batch shape and return new arrays. Readings are vectors by topic, in the
+    layout of `msgs_spec.topics`.
+
+    Attributes:
+        topics: Topics that the formulas read.
+        observation: Readings and seconds of one control period -> (..., observation size).
+        achieved_goal: Readings -> (..., goal size).
+    """
+
+    topics: tuple[str, ...]
+    observation: Callable[[Mapping[str, Array], float], Array]
+    achieved_goal: Callable[[Mapping[str, Array]], Array]
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSpec:
+    """One task as data.
+
+    Attributes:
+        observation: Parts of the observation vector, in order.
+        episode_ticks: Steps per episode; in `TASKS` those at 25 Hz.
+        object_name: `object0` (Fetch), `object` (hand), or None for tasks without an object.
+        distance_threshold: Success within this distance, m.
+        rotation_threshold: Success within this rotation, rad; None for goals without rotation.
+        reference_id: Environment of Gymnasium-Robotics 1.4.2 that equals this task, or None.
+        achieved_goal: Part of the observation that is the achieved goal.
+        position_counts: Whether the position of a pose goal counts (False for the Rotate tasks).
+        ignores_z_rotation: Whether the rotation about the object's own z axis does not count (pen).
+        object_symmetry: `cube`, or `revolution` for an object that looks the same when turned about
+            its z axis or upside down; None unless goals are poses.
+        formulas: None for the thirteen tasks, and for tasks observed like one of them.
+        looks_like: The one of the thirteen tasks with the same camera view and goal region; a copy
+            by `dataclasses.replace` keeps it. None for the usual view of the robot.
+    """
+
+    name: str
+    robot: RobotSpec
+    goal: GoalKind
+    observation: tuple[VectorPart, ...]
+    episode_ticks: int
+    object_name: str | None
+    distance_threshold: float
+    rotation_threshold: float | None
+    reference_id: str | None
+    achieved_goal: str
+    position_counts: bool = True
+    ignores_z_rotation: bool = False
+    object_symmetry: str | None = None
+    formulas: TaskFormulas | None = None
+    looks_like: str | None = None
+
+    @property
+    def achieved_goal_start(self) -> int:
+        """Index at which the achieved goal begins in the observation vector."""
+        names = [part.name for part in self.observation]
+        return sum(part.size for part in self.observation[: names.index(self.achieved_goal)])
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation vector."""
+        return sum(part.size for part in self.observation)
+
+    @property
+    def has_object(self) -> bool:
+        """True if the task has an object."""
+        return self.object_name is not None
+
+    def with_joint_prefix(self, prefix: str) -> TaskSpec:
+        """Return the task with another prefix of its joint names."""
+        if prefix == JOINT_PREFIX:
+            return self
+        return replace(self, robot=self.robot.with_joint_prefix(prefix))
 
 
 _GRIPPER_STATE = VectorPart('gripper_state', 2, 'm, right and left finger')
@@ -160,16 +254,15 @@ TASKS: dict[str, TaskSpec] = {
 def task_spec(
     name: str, joint_prefix: str = JOINT_PREFIX, control_hz: float = DEFAULT_CONTROL_HZ
 ) -> TaskSpec:
-    """Returns the task called `name`.
+    """Return the task called `name`.
 
     Args:
         name: One of `TASKS`.
-        joint_prefix: What the names of its joints begin with on the network.
-        control_hz: Action frequency, Hz. At another than 25 Hz an episode has as many steps as fill
-            the same time, rounded.
+        joint_prefix: Prefix of the joint names on the network.
+        control_hz: Action frequency, Hz. An episode keeps its duration; its steps are rounded.
 
     Raises:
-        ValueError: If there is none, the message lists all of them; or the rate is not allowed.
+        ValueError: If the task is unknown (the message lists all), or the rate is not allowed.
     """
     try:
         task = TASKS[name]
@@ -184,17 +277,17 @@ def task_spec(
 
 
 def substeps_per_tick(control_hz: float) -> int:
-    """Returns the whole number of physics substeps in one control period.
+    """Return the number of physics substeps in one control period.
 
     Args:
-        control_hz: Action frequency in Hz, between 12.5 and 500.
+        control_hz: Action frequency, 12.5 ... 500 Hz.
 
     Raises:
         ValueError: If the period is not a whole number of substeps; the message names the nearest
             valid rates.
     """
     if not isinstance(control_hz, Real):
-        raise ValueError(f'control_hz {control_hz!r} is no number; allowed: 12.5 ... 500')
+        raise ValueError(f'control_hz {control_hz!r} given; allowed: 12.5 ... 500')
     smallest, largest = 1, 40
     period = 1.0 / (control_hz * PHYSICS_TIMESTEP) if control_hz > 0 else float('inf')
     substeps = round(period) if period < 1e9 else 10**9
@@ -212,5 +305,74 @@ def substeps_per_tick(control_hz: float) -> int:
     )
 
 
+# Tasks of other packages
+
+SPECS = 'fetch_hand_sim_tasks.specification'
+SIMULATIONS = 'fetch_hand_sim_tasks.simulation'
+
+_LOGGER = logging.getLogger(__name__)
+# Names become Gymnasium ids and file names.
+_NAME = re.compile(r'\w[\w.-]{0,63}')
+# Package of each accepted task.
+_PACKAGES: dict[str, str] = {}
+
+
+def third_party_tasks() -> dict[str, TaskSpec]:
+    """Return the third-party tasks by name; warn about each that is left out."""
+    tasks: dict[str, TaskSpec] = {}
+    for entry_point in entry_points(group=SPECS):
+        name = entry_point.name
+        try:
+            if name in tasks or name in TASKS:
+                raise ValueError('another task has this name')
+            tasks[name] = _accept(name, entry_point.load())
+            _PACKAGES[name] = _package(entry_point)
+        except (Exception, SystemExit) as error:  # third-party code
+            _LOGGER.warning('task %s is left out: %s', name, _failure(entry_point, error))
+    return tasks
+
+
+def _accept(name: str, spec: Any) -> TaskSpec:
+    """Return a third-party specification; raise `ValueError` if it cannot be listed."""
+    if not isinstance(spec, TaskSpec):
+        raise ValueError(f'{type(spec).__name__} given; allowed: a TaskSpec')
+    if spec.name != name:
+        raise ValueError(f'its TaskSpec has the name {spec.name!r}; allowed: {name!r}')
+    if not _NAME.fullmatch(name):
+        raise ValueError(f'name {name!r:.80}; allowed: up to 64 letters, digits, _, - and .')
+    # Specifications are keys of caches.
+    hash(spec)
+    # A copy of a reference task (`dataclasses.replace`) would else take over its environment id.
+    return replace(spec, reference_id=None)
+
+
+def third_party_simulation(name: str) -> Any:
+    """Return the class that simulates a third-party task.
+
+    Raises:
+        ValueError: If no package has one, or it cannot be imported.
+    """
+    found = entry_points(group=SIMULATIONS, name=name)
+    # Several packages may use the name: prefer the package of the specification.
+    own = [each for each in found if _package(each) == _PACKAGES.get(name)]
+    for entry_point in own or found:
+        try:
+            return entry_point.load()
+        except (Exception, SystemExit) as error:
+            raise ValueError(f'task {name}: {_failure(entry_point, error)}') from error
+    raise ValueError(
+        f'task {name} has no simulation: no installed package has an entry point of this name in '
+        f'{SIMULATIONS!r}'
+    )
+
+
+def _package(entry_point: EntryPoint) -> str:
+    return entry_point.dist.name if entry_point.dist is not None else 'a package'
+
+
+def _failure(entry_point: EntryPoint, error: BaseException) -> str:
+    return f'{_package(entry_point)}: {entry_point.value}: {one_line(error, longest=1000)}'
+
+
 # Third-party packages import this module, so this line comes last.
-TASKS.update(foreign_tasks(known=TASKS))
+TASKS.update(third_party_tasks())

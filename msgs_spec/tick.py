@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msgs_spec.arrays import Array
-from msgs_spec.cdr import TopicCodec
-from msgs_spec.codecs import build_status
+from msgs_spec.codecs import TopicCodec, build_status
 from msgs_spec.observations import Readings
 from msgs_spec.robots import JOINT_PREFIX, LONGEST_JOINT_PREFIX
 from msgs_spec.schemas import deserialize, message_class, serialize

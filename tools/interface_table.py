@@ -13,10 +13,9 @@ from pathlib import Path
 
 from msgs_spec.parameters import NODES, ParameterSpec
 from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND
-from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS, GoalKind, TaskSpec, VectorPart
 from msgs_spec.tick import PHASES, EpisodeStatus
-from msgs_spec.topics import MONITORING, QosSpec, TopicSpec, topics, view_topics
+from msgs_spec.topics import MONITORING, SERVICES, QosSpec, TopicSpec, topics, view_topics
 
 START, END = '<!-- interface table -->', '<!-- /interface table -->'
 

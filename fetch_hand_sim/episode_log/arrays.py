@@ -14,10 +14,10 @@ from fetch_hand_sim.episode_log.errors import EpisodeReadError
 from fetch_hand_sim.episode_log.files import expand_episodes
 from fetch_hand_sim.episode_log.metadata import EpisodeOutcome, EpisodeRecord, HasOutcome
 from fetch_hand_sim.episode_log.reader import Episode, MessageRows, read_episode
-from msgs_spec.actions import action_from_command
 from msgs_spec.arrays import Array, Flags
-from msgs_spec.cdr import TopicCodec
+from msgs_spec.codecs import TopicCodec
 from msgs_spec.observations import ObservationAssembler
+from msgs_spec.robots import action_from_command
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
 

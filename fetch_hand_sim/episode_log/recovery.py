@@ -43,7 +43,7 @@ from fetch_hand_sim.episode_log.records import (
     split_records,
 )
 from fetch_hand_sim.episode_log.writer import ReceivedAllowance
-from msgs_spec.cdr import TopicCodec
+from msgs_spec.codecs import TopicCodec
 from msgs_spec.text import one_line, printable
 from msgs_spec.topics import TopicSpec, relative_name
 

@@ -25,9 +25,9 @@ from fetch_hand_sim.episodes.recorder import (
 )
 from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS, RobotEpisode, sense
 from fetch_hand_sim.simulation import Observation, Simulation
-from msgs_spec.actions import clip_command, command_from_action
 from msgs_spec.arrays import Array
-from msgs_spec.cdr import TopicCodec
+from msgs_spec.codecs import TopicCodec
+from msgs_spec.robots import clip_command, command_from_action
 from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import topic
 

@@ -15,7 +15,7 @@ from fetch_hand_sim.episode_log.reader import Episode, read_episode
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.scene import Frame
 from msgs_spec.arrays import Array
-from msgs_spec.cdr import TopicCodec
+from msgs_spec.codecs import TopicCodec
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.topics import topic
 

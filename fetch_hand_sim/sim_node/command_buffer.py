@@ -15,9 +15,8 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msgs_spec.actions import clip_command, command_limits
 from msgs_spec.arrays import Array
-from msgs_spec.robots import RobotSpec
+from msgs_spec.robots import RobotSpec, clip_command, command_limits
 
 # Characters of a received name in an error line.
 _NAME_SHOWN = 40

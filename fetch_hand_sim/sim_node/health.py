@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
 from fetch_hand_sim.sim_node.robot import Messages, Robot
-from msgs_spec.cdr import TopicCodec
-from msgs_spec.diagnostics import (
+from msgs_spec.codecs import TopicCodec
+from msgs_spec.topics import DIAGNOSTICS, REAL_TIME_FACTOR
+from node_runtime.diagnostics import (
     ASKED_RATE,
     COMMANDERS,
     MISSED_TICKS,
@@ -24,7 +25,6 @@ from msgs_spec.diagnostics import (
     Report,
     encode_reports,
 )
-from msgs_spec.topics import DIAGNOSTICS, REAL_TIME_FACTOR
 from node_runtime.ros import seldom
 
 if TYPE_CHECKING:

@@ -29,12 +29,12 @@ from fetch_hand_sim.sim_node.robot import Messages, Robot
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.diagnostics import REPORT_PERIOD, next_report
 from msgs_spec.disturbances import read_disturbances
 from msgs_spec.parameters import SIM_NODE
 from msgs_spec.robots import read_joint_prefix
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import LATEST_TICK, MONITORING, TopicSpec, ground_truth_topics, topics
+from node_runtime.diagnostics import REPORT_PERIOD, next_report
 from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import NodeFailure, StopSignals
 from node_runtime.ros import (

@@ -12,10 +12,9 @@ from fetch_hand_sim.episodes.inputs import accept_goal, accept_perturbation
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.schedule import TickSchedule
-from msgs_spec.diagnostics import Durations
-from msgs_spec.services import MAX_STEPS
 from msgs_spec.tick import Tick, TickEncoder
-from msgs_spec.topics import TopicSpec
+from msgs_spec.topics import MAX_STEPS, TopicSpec
+from node_runtime.diagnostics import Durations
 
 Messages = list[tuple[TopicSpec, bytes]]
 

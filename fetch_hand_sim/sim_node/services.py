@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from fetch_hand_sim.sim_node.robot import Answer, Robot
-from msgs_spec.services import INTERFACE_SERVICES, MAX_STEPS, PAUSE, RESET, STEP
+from msgs_spec.topics import INTERFACE_SERVICES, MAX_STEPS, PAUSE, RESET, STEP
 from node_runtime.ros import ros_service_class
 
 if TYPE_CHECKING:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.tasks import Task
 from fetch_hand_sim.simulation.varied_physics import VariedPhysics, first_body, joint_dofs
-from msgs_spec.actions import command_limits
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import MOST_TICKS, Disturbances, PhysicsDisturbance
 from msgs_spec.observations import Readings
-from msgs_spec.robots import FINGERTIPS
+from msgs_spec.robots import FINGERTIPS, command_limits
 from msgs_spec.rotations import quaternion_multiply
 
 Ids = NDArray[np.intp]

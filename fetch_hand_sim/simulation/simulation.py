@@ -290,7 +290,7 @@ class Simulation:
         """Advance every simulation by one step, with commands in ROS units.
 
         Args:
-            commands: (N, action size), clipped to the limits (`msgs_spec.actions.clip_command`).
+            commands: (N, action size), clipped to the limits (`msgs_spec.robots.clip_command`).
                 Fetch: as actions. Hand: absolute joint positions in radians.
 
         Raises:

@@ -27,7 +27,10 @@ from fetch_hand_sim.view.robot_watch import (
 from fetch_hand_sim.view.web import FOLLOWING, OVERLOOKING
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode_status
-from msgs_spec.diagnostics import (
+from msgs_spec.tasks import TaskSpec, task_spec
+from msgs_spec.tick import EpisodeStatus
+from msgs_spec.topics import DIAGNOSTICS, topic
+from node_runtime.diagnostics import (
     ASKED_RATE,
     COMMANDERS,
     MISSED_TICKS,
@@ -36,9 +39,6 @@ from msgs_spec.diagnostics import (
     PERTURB_LIMIT,
     RATE,
 )
-from msgs_spec.tasks import TaskSpec, task_spec
-from msgs_spec.tick import EpisodeStatus
-from msgs_spec.topics import DIAGNOSTICS, topic
 from node_runtime.ros import full_name
 
 # A robot counts as fast above its real-time rate times this factor.

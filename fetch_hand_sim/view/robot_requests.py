@@ -27,12 +27,10 @@ from fetch_hand_sim.view.requests import (
 )
 from fetch_hand_sim.view.robot_watch import Replay
 from msgs_spec.arrays import Array
-from msgs_spec.cdr import TopicCodec
-from msgs_spec.codecs import build_message
+from msgs_spec.codecs import TopicCodec, build_message
 from msgs_spec.schemas import serialize
-from msgs_spec.services import PAUSE
 from msgs_spec.tasks import TaskSpec
-from msgs_spec.topics import topic
+from msgs_spec.topics import PAUSE, topic
 from node_runtime.ros import rclpy_profile, ros_message_class, ros_service_class
 
 _SET_PARAMETERS = 'rcl_interfaces/srv/SetParameters'

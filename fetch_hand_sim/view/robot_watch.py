@@ -16,14 +16,12 @@ from rclpy.node import Node, NodeNameNonExistentError
 
 from fetch_hand_sim.simulation.scene import Frame
 from msgs_spec.arrays import Array
-from msgs_spec.cdr import TopicCodec
-from msgs_spec.codecs import decode_status
+from msgs_spec.codecs import TopicCodec, decode_status
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.schemas import deserialize
-from msgs_spec.services import PAUSE, RESET
 from msgs_spec.tasks import TASKS, TaskSpec, task_spec
 from msgs_spec.tick import EpisodeStatus, split_messages
-from msgs_spec.topics import LATEST_TICK, QosSpec, TopicSpec, topic
+from msgs_spec.topics import LATEST_TICK, PAUSE, RESET, QosSpec, TopicSpec, topic
 from node_runtime.ros import count_publishers, full_name, rclpy_profile, ros_message_class
 
 # QoS of a viewer.

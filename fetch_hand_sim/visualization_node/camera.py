@@ -9,7 +9,7 @@ import numpy as np
 from fetch_hand_sim.simulation.rendering import SceneRenderer
 from fetch_hand_sim.simulation.scene import Frame, Scene
 from msgs_spec.arrays import Picture
-from msgs_spec.diagnostics import Durations
+from node_runtime.diagnostics import Durations
 
 
 class Camera:

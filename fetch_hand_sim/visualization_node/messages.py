@@ -20,7 +20,7 @@ from fetch_hand_sim.simulation.urdf import ROOT
 from fetch_hand_sim.view.robot_watch import SeenTick
 from fetch_hand_sim.visualization_node.transforms import Transform
 from msgs_spec.arrays import Array, Picture
-from msgs_spec.cdr import TopicCodec
+from msgs_spec.codecs import TopicCodec
 from msgs_spec.tasks import SuccessRule, TaskSpec
 from msgs_spec.topics import scalar_topics
 

@@ -27,11 +27,11 @@ from fetch_hand_sim.visualization_node.transforms import (
     view_transform,
 )
 from msgs_spec.arrays import Picture
-from msgs_spec.diagnostics import REPORT_PERIOD, Increase, Report, encode_reports, next_report
 from msgs_spec.parameters import VISUALIZATION_NODE
 from msgs_spec.tasks import TaskSpec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, SHOWN, TopicSpec, scalar_topics
+from node_runtime.diagnostics import REPORT_PERIOD, Increase, Report, encode_reports, next_report
 from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import NodeFailure, StopSignals
 from node_runtime.ros import (

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.actions import command_from_action
+from msgs_spec.robots import command_from_action
 from msgs_spec.tasks import task_spec
 from msgs_spec.text import one_line
 from policy_node.policies.policy import LoadedPolicy

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from msgs_spec.diagnostics import ASKED_RATE, MODE, PAUSED, RATE, Increase, Report
 from msgs_spec.tick import EpisodeStatus
+from node_runtime.diagnostics import ASKED_RATE, MODE, PAUSED, RATE, Increase, Report
 from node_runtime.ros import MEMORY_OF_THE_GRAPH
 from policy_node.node.responder import Responder
 

@@ -14,13 +14,13 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from msgs_spec.codecs import build_status, decode_status, message_stamp
-from msgs_spec.diagnostics import REPORT_PERIOD, encode_reports, next_report
 from msgs_spec.parameters import POLICY_NODE
 from msgs_spec.schemas import deserialize, require_short, serialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.tick import EpisodeStatus
 from msgs_spec.topics import DIAGNOSTICS, STATE, QosSpec, TopicSpec, topic
 from node_runtime.command_line import UsageError
+from node_runtime.diagnostics import REPORT_PERIOD, encode_reports, next_report
 from node_runtime.event_loop import BEAT, EventLoop
 from node_runtime.node_main import NodeFailure, StopSignals
 from node_runtime.ros import rclpy_profile, ros_message_class, seldom

@@ -10,13 +10,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.cdr import TopicCodec
-from msgs_spec.diagnostics import Durations
+from msgs_spec.codecs import TopicCodec
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import task_spec
 from msgs_spec.text import one_line
 from msgs_spec.tick import EpisodeStatus, Phase
 from msgs_spec.topics import topic
+from node_runtime.diagnostics import Durations
 from policy_node.node.commander import Commander
 from policy_node.node.stamp_join import StampJoin, Vectors
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from msgs_spec.cdr import LayoutError, TopicCodec
-from msgs_spec.codecs import build_message, decode, message_stamp
+from msgs_spec.codecs import LayoutError, TopicCodec, build_message, decode, message_stamp
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.topics import topic, topics

@@ -7,8 +7,8 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from msgs_spec.cdr import TopicCodec
 from msgs_spec.codecs import (
+    TopicCodec,
     build_message,
     build_status,
     decode,

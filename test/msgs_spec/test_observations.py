@@ -8,9 +8,9 @@ from gymnasium_robotics.utils import rotations as reference
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.actions import command_from_action
 from msgs_spec.codecs import decode
 from msgs_spec.observations import ObservationAssembler, achieved_goal, observation
+from msgs_spec.robots import command_from_action
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import TickEncoder

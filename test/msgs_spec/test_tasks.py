@@ -9,14 +9,18 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation.models import load_model
-from msgs_spec.actions import (
+from msgs_spec.robots import (
+    FETCH,
+    FINGERTIPS,
+    JOINT_PREFIX,
+    SHADOW_HAND,
     action_from_command,
     clip_command,
     command_from_action,
     command_limits,
+    read_joint_prefix,
     resting_command,
 )
-from msgs_spec.robots import FETCH, FINGERTIPS, JOINT_PREFIX, SHADOW_HAND, read_joint_prefix
 from msgs_spec.tasks import TASKS, substeps_per_tick, task_spec
 
 MODELS = {

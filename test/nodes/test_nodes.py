@@ -17,9 +17,9 @@ from std_srvs.srv import SetBool, Trigger
 
 from fetch_hand_sim.episode_log import find_leftovers
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.actions import command_from_action
 from msgs_spec.codecs import build_message, decode, message_stamp
 from msgs_spec.observations import ObservationAssembler
+from msgs_spec.robots import command_from_action
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import topic, topics

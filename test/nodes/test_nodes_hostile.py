@@ -15,8 +15,7 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from std_msgs.msg import Float64MultiArray
 
-from msgs_spec.cdr import TopicCodec
-from msgs_spec.codecs import message_stamp
+from msgs_spec.codecs import TopicCodec, message_stamp
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, task_spec
 from msgs_spec.topics import topic, topics
 from support.graph import (

@@ -17,9 +17,8 @@ from fetch_hand_sim.sim_node import services
 from fetch_hand_sim.simulation.scene import Frame, Scene
 from msgs_spec.codecs import decode, message_stamp
 from msgs_spec.rotations import quaternion_to_matrix
-from msgs_spec.services import INTERFACE_SERVICES, MAX_STEPS
 from msgs_spec.tasks import task_spec
-from msgs_spec.topics import QosSpec, topic
+from msgs_spec.topics import INTERFACE_SERVICES, MAX_STEPS, QosSpec, topic
 from node_runtime.ros import rclpy_profile, ros_message_class, ros_service_class
 from support.frames import tree
 from support.graph import POLICY_NODE, SIM_NODE, client, end, ros_args

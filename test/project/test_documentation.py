@@ -27,9 +27,8 @@ from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.parameters import NODES, validate
-from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS
-from msgs_spec.topics import topics
+from msgs_spec.topics import SERVICES, topics
 from support import ROOT, script_environment
 from support.shell_lines import commands, python_blocks, shell_lines
 

@@ -9,10 +9,9 @@ import pytest
 
 from msgs_spec.parameters import NODES
 from msgs_spec.robots import SHADOW_HAND
-from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import PHASES
-from msgs_spec.topics import topics, view_topics
+from msgs_spec.topics import SERVICES, topics, view_topics
 from support import ROOT
 
 PAGE = ROOT / 'docs' / 'interface.md'

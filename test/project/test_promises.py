@@ -11,10 +11,9 @@ from gymnasium.envs.registration import registry
 from fetch_hand_sim.__main__ import COMMANDS, Command
 from fetch_hand_sim.gym_envs.registration import reference_ids
 from msgs_spec.parameters import NODES
-from msgs_spec.services import SERVICES
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import PHASES, EpisodeStatus
-from msgs_spec.topics import MONITORING, topics
+from msgs_spec.topics import MONITORING, SERVICES, topics
 from policy_node.training.configuration.flat import FIELDS
 from support import ROOT
 

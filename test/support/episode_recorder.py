@@ -18,8 +18,8 @@ from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeWriter, episode_
 from fetch_hand_sim.episode_log.model import model_sha256
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.actions import command_from_action
-from msgs_spec.cdr import TopicCodec
+from msgs_spec.codecs import TopicCodec
+from msgs_spec.robots import command_from_action
 from msgs_spec.tasks import Timing
 from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import TopicSpec, topic

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.model_tuning import list_geom_pairs, skip_unread_stages
 from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task, weakly
-from msgs_spec.actions import command_from_action
 from msgs_spec.arrays import Array
-from msgs_spec.robots import FINGERTIPS
+from msgs_spec.robots import FINGERTIPS, command_from_action
 from msgs_spec.tasks import TaskSpec
 
 

@@ -29,8 +29,8 @@ from fetch_hand_sim.simulation.tasks.task import (
     joint_qvel_slice,
     weakly,
 )
-from msgs_spec.actions import resting_command
 from msgs_spec.arrays import Array
+from msgs_spec.robots import resting_command
 from msgs_spec.rotations import (
     euler_to_matrix,
     euler_to_quaternion,

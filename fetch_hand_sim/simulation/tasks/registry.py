@@ -8,7 +8,6 @@ from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
 from fetch_hand_sim.simulation.tasks.hand_reach import REACH_ASSET, HandReachTask
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task
-from msgs_spec.foreign_tasks import foreign_simulation
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
     PHYSICS_TIMESTEP,
@@ -16,6 +15,7 @@ from msgs_spec.tasks import (
     Timing,
     substeps_per_tick,
     task_spec,
+    third_party_simulation,
 )
 
 
@@ -65,7 +65,7 @@ def _family(spec: TaskSpec) -> Any:
         return HandReachTask
     if spec.name in MANIPULATE_CONFIGS:
         return HandManipulateTask
-    return foreign_simulation(spec.name)
+    return third_party_simulation(spec.name)
 
 
 def task_asset(name: str) -> str:
@@ -81,7 +81,7 @@ def task_asset(name: str) -> str:
         return MANIPULATE_CONFIGS[spec.name].asset
     if spec.name == 'HandReach':
         return REACH_ASSET
-    named = getattr(foreign_simulation(spec.name), 'ASSET', None)
+    named = getattr(third_party_simulation(spec.name), 'ASSET', None)
     if named is None:
         raise ValueError(f'the simulation of {spec.name} lacks ASSET, its MJCF file')
     return str(named)

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation.engine import keep_in_forks, prepare_engine
 from fetch_hand_sim.simulation.model_tuning import ListedPairs
 from fetch_hand_sim.simulation.rewards import GoalMetric
-from msgs_spec.actions import command_from_action
 from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
+from msgs_spec.robots import command_from_action
 from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec, Timing
 from msgs_spec.topics import sensor_topics
 

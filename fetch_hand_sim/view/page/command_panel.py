@@ -7,9 +7,8 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from fetch_hand_sim.view.page.widgets import ITEM_WIDTH, Send, say
 from fetch_hand_sim.view.picture import Facts, Picture
 from fetch_hand_sim.view.requests import SetCommand, SetCommanding
-from msgs_spec.actions import resting_command
 from msgs_spec.arrays import Array
-from msgs_spec.robots import CommandPart, RobotSpec
+from msgs_spec.robots import CommandPart, RobotSpec, resting_command
 from msgs_spec.tasks import TaskSpec
 
 _SELECTED = imgui.Vec4(0.1, 0.45, 0.85, 1.0)

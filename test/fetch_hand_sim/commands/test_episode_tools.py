@@ -32,9 +32,8 @@ from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
 from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.actions import action_from_command
-from msgs_spec.cdr import LayoutError, TopicCodec
-from msgs_spec.codecs import decode
+from msgs_spec.codecs import LayoutError, TopicCodec, decode
+from msgs_spec.robots import action_from_command
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import topic

@@ -24,7 +24,7 @@ from fetch_hand_sim.episodes import recorder as recorder_module
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder, Messages, episode_result
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.cdr import TopicCodec
+from msgs_spec.codecs import TopicCodec
 from msgs_spec.tasks import TASKS
 from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import TopicSpec, topic

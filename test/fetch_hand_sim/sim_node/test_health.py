@@ -11,9 +11,9 @@ import pytest
 
 from fetch_hand_sim.sim_node.health import Health, Surroundings
 from msgs_spec.codecs import message_stamp
-from msgs_spec.diagnostics import Level, encode_reports, next_report
 from msgs_spec.schemas import deserialize
 from msgs_spec.topics import DIAGNOSTICS
+from node_runtime.diagnostics import Level, encode_reports, next_report
 
 FINE = Surroundings(commanders=['/policy_node'], robots=['/sim_node'], log='episodes')
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.sim_node.receivers import Receivers
-from msgs_spec.cdr import TopicCodec
-from msgs_spec.codecs import build_message
+from msgs_spec.codecs import TopicCodec, build_message
 from msgs_spec.schemas import MAX_MESSAGE_BYTES, message_class, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics

@@ -7,8 +7,7 @@ import math
 import pytest
 
 from msgs_spec.codecs import build_message
-from msgs_spec.services import MAX_STEPS
-from msgs_spec.topics import topic
+from msgs_spec.topics import MAX_STEPS, topic
 
 
 def test_lockstep_takes_one_tick_per_valid_command_and_none_by_itself(make):

@@ -10,7 +10,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 from fetch_hand_sim.sim_node.services import SimulationInterfaces, open_services
-from msgs_spec.services import INTERFACE_SERVICES, SERVICES, STANDARD_SERVICES
+from msgs_spec.topics import INTERFACE_SERVICES, SERVICES, STANDARD_SERVICES
 
 
 class Features:

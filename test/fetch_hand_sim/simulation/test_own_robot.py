@@ -121,7 +121,7 @@ def make(monkeypatch, tmp_path):
         spec = replace(SPEC, **changes, **({'robot': robot} if robot else {}))
         monkeypatch.setitem(TASKS, spec.name, spec)
         own = type(kind.__name__, (kind,), {'ASSET': str(model)})
-        monkeypatch.setattr(registry, 'foreign_simulation', lambda name: own)
+        monkeypatch.setattr(registry, 'third_party_simulation', lambda name: own)
         return Simulation(spec.name, num_envs=num_envs, num_threads=1)
 
     return simulation

@@ -15,8 +15,7 @@ from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
 from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
 from fetch_hand_sim.simulation.tasks.task import BatchConfig
-from msgs_spec.actions import action_from_command, command_from_action
-from msgs_spec.robots import FETCH, CommandPart
+from msgs_spec.robots import FETCH, CommandPart, action_from_command, command_from_action
 from msgs_spec.tasks import TASKS, GoalKind, TaskFormulas
 from msgs_spec.topics import topics
 
@@ -48,7 +47,7 @@ def test_a_model_of_its_own_is_the_one_that_is_simulated(monkeypatch):
 
     with pytest.raises((FileNotFoundError, ValueError), match='nowhere'):
         Missing(TASKS['HandReach'], BatchConfig())
-    monkeypatch.setattr(registry, 'foreign_simulation', lambda name: object)
+    monkeypatch.setattr(registry, 'third_party_simulation', lambda name: object)
     monkeypatch.setattr(registry, 'task_spec', lambda name: replace(TASKS[BLOCK], name=name))
     with pytest.raises(ValueError, match='the simulation of Mine lacks ASSET'):
         registry.task_asset('Mine')
@@ -63,7 +62,7 @@ def test_a_model_may_be_named_by_its_path(monkeypatch):
         ASSET = asset_path('hand/reach.xml')
 
     monkeypatch.setitem(TASKS, 'Mine', replace(TASKS['HandReach'], name='Mine', reference_id=None))
-    monkeypatch.setattr(registry, 'foreign_simulation', lambda name: Mine)
+    monkeypatch.setattr(registry, 'third_party_simulation', lambda name: Mine)
     simulation = Simulation('Mine')
     simulation.reset(seed=0)
     assert simulation.asset == Mine.ASSET

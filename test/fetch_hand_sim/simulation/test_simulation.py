@@ -17,7 +17,7 @@ from gymnasium.error import ResetNeeded
 from mujoco.batch import SimulationError
 
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.actions import command_from_action
+from msgs_spec.robots import command_from_action
 from msgs_spec.rotations import quaternion_from_axis_angle, quaternion_multiply
 from msgs_spec.tasks import TASKS
 from support import peak_memory, reset_peak_memory

@@ -26,8 +26,7 @@ from fetch_hand_sim.episode_log import EpisodeDirectory
 from fetch_hand_sim.episode_log.arrays import load_episode
 from fetch_hand_sim.simulation.scene import Frame, Scene
 from fetch_hand_sim.view.page.ray import MousePlace, mouse_ray
-from msgs_spec.cdr import TopicCodec
-from msgs_spec.codecs import decode
+from msgs_spec.codecs import TopicCodec, decode
 from msgs_spec.tasks import TASKS
 from msgs_spec.topics import topic
 from support.browser import SIZE, Browser, find_browser

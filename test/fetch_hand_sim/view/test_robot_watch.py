@@ -13,11 +13,11 @@ from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.view import live
 from fetch_hand_sim.view.requests import SetCommand, SetCommanding, SetGoal
 from fetch_hand_sim.view.robot_watch import RobotWatch
-from msgs_spec.diagnostics import Report, encode_reports
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import task_spec
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import DIAGNOSTICS, topic
+from node_runtime.diagnostics import Report, encode_reports
 from node_runtime.ros import rclpy_profile, ros_message_class
 
 JOINTS = len(task_spec('FetchReach').robot.joints)

@@ -9,14 +9,13 @@ import pytest
 
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.actions import command_from_action
-from msgs_spec.cdr import TopicCodec
-from msgs_spec.codecs import decode
-from msgs_spec.diagnostics import Level, Report, encode_reports
+from msgs_spec.codecs import TopicCodec, decode
+from msgs_spec.robots import command_from_action
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import task_spec
 from msgs_spec.tick import TickEncoder
 from msgs_spec.topics import topic
+from node_runtime.diagnostics import Level, Report, encode_reports
 from policy_node.node.commander import Commander
 from policy_node.node.health import Health, Pace, read_pace
 from policy_node.node.responder import Responder
@@ -350,7 +349,7 @@ def test_two_robots_that_publish_in_turn_are_named_within_two_seconds(case, epis
 
 
 def test_a_machine_that_believes_it_is_later_than_2038_reports_all_the_same(monkeypatch):
-    monkeypatch.setattr('msgs_spec.diagnostics.time.time_ns', lambda: 2**31 * 10**9 + 5)
+    monkeypatch.setattr('node_runtime.diagnostics.time.time_ns', lambda: 2**31 * 10**9 + 5)
     message = deserialize(
         'diagnostic_msgs/msg/DiagnosticArray',
         encode_reports(Report('/policy_node', '', {}, 'well')),

@@ -18,7 +18,7 @@ import pytest
 import fetch_hand_sim  # noqa: F401  registers the environments
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.actions import command_from_action
+from msgs_spec.robots import command_from_action
 from msgs_spec.tasks import task_spec
 from policy_node.node.commander import Commander
 from policy_node.policies import checkpoint

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from msgs_spec import foreign_tasks
+from msgs_spec import tasks
 from msgs_spec.tasks import TASKS, task_spec
 
 PUSH = replace(TASKS['FetchPush'], name='Pushed')
@@ -44,45 +44,45 @@ class Point(Package):
 
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[Point]]:
-    points: dict[str, list[Point]] = {foreign_tasks.SPECS: [], foreign_tasks.SIMULATIONS: []}
+    points: dict[str, list[Point]] = {tasks.SPECS: [], tasks.SIMULATIONS: []}
 
     def entry_points(group: str, name: str | None = None) -> list[Point]:
         return [each for each in points[group] if name in (None, each.name)]
 
-    monkeypatch.setattr(foreign_tasks, 'entry_points', entry_points)
-    monkeypatch.setattr(foreign_tasks, '_PACKAGES', {})
+    monkeypatch.setattr(tasks, 'entry_points', entry_points)
+    monkeypatch.setattr(tasks, '_PACKAGES', {})
     return points
 
 
 def test_a_package_that_ends_the_program_costs_its_own_task(
     installed: dict[str, list[Point]], caplog: pytest.LogCaptureFixture
 ) -> None:
-    installed[foreign_tasks.SPECS] += [
+    installed[tasks.SPECS] += [
         Point('leaving', 'Left', SystemExit(2)),
         Point('staying', 'Pushed', PUSH),
     ]
     with caplog.at_level(logging.WARNING):
-        assert list(foreign_tasks.foreign_tasks(TASKS)) == ['Pushed']
+        assert list(tasks.third_party_tasks()) == ['Pushed']
     assert 'task Left is left out: leaving: leaving:Left: 2' in caplog.text
 
 
 def test_a_task_is_simulated_by_the_package_that_it_is_of(
     installed: dict[str, list[Point]],
 ) -> None:
-    installed[foreign_tasks.SPECS] += [
+    installed[tasks.SPECS] += [
         Point('broken', 'Pushed', ImportError('no such thing')),
         Point('whole', 'Pushed', PUSH),
         Point('lonely', 'Alone', replace(PUSH, name='Alone')),
     ]
-    installed[foreign_tasks.SIMULATIONS] += [
+    installed[tasks.SIMULATIONS] += [
         Point('broken', 'Pushed', 'its class'),
         Point('whole', 'Pushed', 'the class'),
         # Of a task whose specification is a package of its own.
         Point('elsewhere', 'Alone', 'another class'),
     ]
-    foreign_tasks.foreign_tasks(TASKS)
-    assert foreign_tasks.foreign_simulation('Pushed') == 'the class'
-    assert foreign_tasks.foreign_simulation('Alone') == 'another class'
+    tasks.third_party_tasks()
+    assert tasks.third_party_simulation('Pushed') == 'the class'
+    assert tasks.third_party_simulation('Alone') == 'another class'
 
 
 @pytest.mark.parametrize(
@@ -102,8 +102,8 @@ def test_a_specification_that_cannot_be_listed_costs_one_warning(
     given: Any,
     line: str,
 ) -> None:
-    installed[foreign_tasks.SPECS].append(Point('wrong', name, given))
-    assert foreign_tasks.foreign_tasks(TASKS) == {}
+    installed[tasks.SPECS].append(Point('wrong', name, given))
+    assert tasks.third_party_tasks() == {}
     assert len(caplog.messages) == 1 and line in caplog.text
 
 
@@ -111,6 +111,6 @@ def test_a_copy_of_a_reference_task_has_no_environment_id(
     installed: dict[str, list[Point]],
 ) -> None:
     assert PUSH.reference_id is not None
-    installed[foreign_tasks.SPECS].append(Point('own', 'Pushed', PUSH))
-    found = foreign_tasks.foreign_tasks(TASKS)
+    installed[tasks.SPECS].append(Point('own', 'Pushed', PUSH))
+    found = tasks.third_party_tasks()
     assert found == {'Pushed': replace(PUSH, reference_id=None)}
