@@ -20,16 +20,16 @@ from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import task_spec
 from policy_node import load_policy
 from policy_node.policies.policy import RandomPolicy
-from policy_node.training.collection.collector import Collector
-from policy_node.training.collection.gamble import is_over
-from policy_node.training.collection.simulations import make_simulation
 from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.collector import Collector
 from policy_node.training.experience.experience import Experience
+from policy_node.training.experience.gamble import is_over
 from policy_node.training.experience.sampling import make_sampler
+from policy_node.training.experience.simulations import make_simulation
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.learners.make_learner import make_learner
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.transitions import Transitions
 
 TASK = 'FetchPush'
 EPISODES = 600

@@ -8,8 +8,8 @@ import numpy as np
 
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.policy import Policy
-from policy_node.training.collection.exploration import ActionNoise
-from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.experience.exploration import ActionNoise
+from policy_node.training.experience.replay import Episodes
 
 
 def noisy_episodes(

@@ -58,7 +58,7 @@ def _linear(input_size: int, output_size: int) -> nn.Linear:
 class Normalizer(nn.Module):
     """Clips, centres and scales inputs with statistics that belong to the checkpoint.
 
-    `RunningStatistics` (`policy_node.training.networks.normalizer`) writes `mean` and `std` while
+    `RunningStatistics` (`policy_node.training.experience.statistics`) writes `mean` and `std` while
     training.
     """
 

@@ -29,7 +29,7 @@ from policy_node.training.configuration.groups import Held, Hierarchical, Ppo
 from policy_node.training.configuration.recipes import RECIPES, recipe_config
 
 if TYPE_CHECKING:
-    from policy_node.training.replay.episode_replay import Episodes
+    from policy_node.training.experience.replay import Episodes
 
 
 _NAME = 'fetch_hand_sim train'
@@ -152,7 +152,7 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
         raise ValueError('subgoal_every excludes --from-episodes: nobody gave them subgoals')
     if config.collect.gamble:
         raise ValueError('gamble excludes --from-episodes: gambles in them ended nothing')
-    from policy_node.training.replay.logged_episodes import read_experience
+    from policy_node.training.experience.logged_episodes import read_experience
 
     task = task_spec(config.task, control_hz=config.collect.control_hz)
     episodes, skipped = read_experience(directory, task, config.collect.control_hz)

@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
-from policy_node.training.collection.simulations import make_simulation
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import DEFAULTS, changed, config_from_dict, to_flat
 from policy_node.training.evaluation.episodes import FIRST_SEED
+from policy_node.training.experience.hindsight import RewardFunction
 from policy_node.training.experience.sampling import make_sampler
-from policy_node.training.goals.hindsight import RewardFunction
+from policy_node.training.experience.simulations import make_simulation
 from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.learners.make_learner import make_learner
 from policy_node.training.machine.distributed import Workers

@@ -10,7 +10,7 @@ from policy_node.policies.actor import Actor
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Hierarchical
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, wilson_interval
-from policy_node.training.goals.subgoals import GuidedPolicy, Proposer
+from policy_node.training.experience.subgoals import GuidedPolicy, Proposer
 
 # Seeds of evaluation episodes start here; those of training runs stay far below.
 EVALUATION_SEED = 1_000_000_000

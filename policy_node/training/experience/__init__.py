@@ -1,1 +1,1 @@
-"""What a worker has seen, and the batches that a learner gets of it."""
+"""Collect episodes, store them, relabel their goals and draw batches."""

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
-from policy_node.training.collection.gamble import without_landings
-from policy_node.training.replay.episode_replay import Episodes, has_moved
+from policy_node.training.experience.gamble import without_landings
+from policy_node.training.experience.replay import Episodes, has_moved
 
 _GRAVITY = 9.81
 # Most that one tick may add to the energy of an episode (Zhao & Tresp 2018: arm, hand).

@@ -10,14 +10,14 @@ from policy_node.policies.actor import Actor
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Drop, Held, Hierarchical
 from policy_node.training.experience.episode_weights import episode_weights, ticks_until_dropped
+from policy_node.training.experience.goal_choice import Judge
+from policy_node.training.experience.hindsight import complete_mixture, goal_mixture
+from policy_node.training.experience.replay import EpisodeReplay, Episodes
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.goals.goal_choice import Judge
-from policy_node.training.goals.hindsight import complete_mixture, goal_mixture
-from policy_node.training.goals.subgoals import subgoal_columns
+from policy_node.training.experience.statistics import RunningStatistics
+from policy_node.training.experience.subgoals import subgoal_columns
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.networks.normalizer import RunningStatistics
-from policy_node.training.replay.episode_replay import EpisodeReplay, Episodes
-from policy_node.training.replay.transitions import Transitions
 
 
 class Experience:

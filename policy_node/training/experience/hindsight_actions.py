@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from policy_node.training.configuration.groups import Hierarchical
 from policy_node.training.experience.experience import Experience
+from policy_node.training.experience.hindsight import draw_sources, goals_of, with_subgoals
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.goals.hindsight import draw_sources, goals_of, with_subgoals
-from policy_node.training.goals.subgoals import subgoals_of, tested
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.transitions import Starts, Transitions
+from policy_node.training.experience.subgoals import subgoals_of, tested
+from policy_node.training.experience.transitions import Starts, Transitions
 
 # Share of a batch that begins where something was proposed, and may have been tested: with tests of
 # 0.3 of the proposals about a tenth of a batch are penalties where all of them are missed.

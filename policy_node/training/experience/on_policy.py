@@ -9,6 +9,9 @@ from msgs_spec.tasks import TaskSpec
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Ppo
 from policy_node.training.experience.experience import Experience
+from policy_node.training.experience.hindsight import OUTCOME
+from policy_node.training.experience.outcomes import EPISODES, Outcomes, with_outcomes_achieved
+from policy_node.training.experience.replay import draw_by
 from policy_node.training.experience.rollouts import (
     Critique,
     RolloutMaker,
@@ -16,11 +19,8 @@ from policy_node.training.experience.rollouts import (
     goals_in_hindsight,
 )
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.goals.hindsight import OUTCOME
-from policy_node.training.goals.outcomes import EPISODES, Outcomes, with_outcomes_achieved
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.episode_replay import draw_by
-from policy_node.training.replay.transitions import Transitions
 
 
 class OnPolicyExperience(Experience):

@@ -22,15 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_spec.arrays import Array, Array32
-from policy_node.training.goals.hindsight import (
+from policy_node.training.experience.hindsight import (
     OUTCOME,
     RewardFunction,
     draw_sources,
     goals_of,
 )
-from policy_node.training.goals.outcomes import Outcomes
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.transitions import Starts, Transitions
+from policy_node.training.experience.outcomes import Outcomes
+from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.transitions import Starts, Transitions
 
 _SMALLEST_DEVIATION = 1e-6
 # Largest weight of an error, by the ratio of its action, and of what follows, by those of the

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array32
-from policy_node.training.collection.frame_skip import HeldSteps
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import (
     Chosen,
@@ -20,13 +19,14 @@ from policy_node.training.configuration.groups import (
     Sparse,
     Threshold,
 )
-from policy_node.training.goals.goal_choice import CANDIDATES, GOAL_CHOICES, Judge
-from policy_node.training.goals.graded import GradedReward
-from policy_node.training.goals.hindsight import RewardFunction, draw_sources, flat, goals_of
-from policy_node.training.networks.conditions import Condition, make_condition
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.multi_step import StepCounter, discounted_rewards
-from policy_node.training.replay.transitions import Starts, Transitions
+from policy_node.training.experience.conditions import Condition, make_condition
+from policy_node.training.experience.frame_skip import HeldSteps
+from policy_node.training.experience.goal_choice import CANDIDATES, GOAL_CHOICES, Judge
+from policy_node.training.experience.graded import GradedReward
+from policy_node.training.experience.hindsight import RewardFunction, draw_sources, flat, goals_of
+from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.returns import StepCounter, discounted_rewards
+from policy_node.training.experience.transitions import Starts, Transitions
 
 # Goals that choosing among several can improve.
 _LATER = ('future', 'near')

@@ -1,1 +1,1 @@
-"""What learns: DDPG, on-policy PPO, two levels of it."""
+"""The learners and their networks: DDPG and its variants, PPO."""

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from policy_node.policies.actor import MLP, Actor
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.goals.subgoals import Proposer
+from policy_node.training.experience.subgoals import Proposer
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.transitions import Transitions
 
 # What the names of its parts begin with, in a file that has both levels.
 HIGH_LEVEL = 'high_'

@@ -13,23 +13,23 @@ from msgs_spec.arrays import Array32
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.collection.frame_skip import plain_actor
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Density, Held, OffPolicy
+from policy_node.training.experience.conditions import acting_input, fold
+from policy_node.training.experience.frame_skip import plain_actor
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
-from policy_node.training.learners.density_ratio import DensityRatio, GoalView
-from policy_node.training.machine.devices import uses_bfloat16
-from policy_node.training.machine.distributed import Workers
-from policy_node.training.networks.conditions import acting_input, fold
-from policy_node.training.networks.critics import (
+from policy_node.training.learners.critics import (
     AGGREGATES,
     AdvantageCritic,
     Critic,
     Ensemble,
     make_critic,
 )
-from policy_node.training.networks.quantiles import pooled, quantile_costs
-from policy_node.training.replay.transitions import Transitions
+from policy_node.training.learners.density_ratio import DensityRatio, GoalView
+from policy_node.training.learners.quantiles import pooled, quantile_costs
+from policy_node.training.machine.devices import uses_bfloat16
+from policy_node.training.machine.distributed import Workers
 
 # Fields of `Transitions` that every batch has.
 _ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'discount')

@@ -19,11 +19,11 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.hindsight_actions import HierarchicalTransitions
-from policy_node.training.goals.subgoals import Proposer
+from policy_node.training.experience.subgoals import Proposer
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners.actor_critic import HIGH_LEVEL, Losses
 from policy_node.training.learners.ddpg import DDPG, Known
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.transitions import Transitions
 
 
 class HighLevel(DDPG):

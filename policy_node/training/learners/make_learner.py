@@ -16,9 +16,9 @@ from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.learners.hierarchy import HierarchicalDDPG
 from policy_node.training.learners.imagined import ImaginingDDPG
+from policy_node.training.learners.network_shape import network_shape
 from policy_node.training.learners.ppo import PPO
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.networks.shape_from_config import network_shape
 
 
 def make_learner(

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.learners.actor_critic import Losses
-from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.runs.state_checks import first_not_finite
 from policy_node.training.runs.training_state import Counters
 

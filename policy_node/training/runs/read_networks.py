@@ -15,8 +15,8 @@ from policy_node.policies.shipped import actor_path
 from policy_node.training.configuration.config import TrainConfig, unusual_networks
 from policy_node.training.configuration.flat import config_from_dict, to_flat
 from policy_node.training.configuration.groups import Critics
-from policy_node.training.networks.conditions import acting_input, without_input
-from policy_node.training.networks.shape_from_config import network_shape
+from policy_node.training.experience.conditions import acting_input, without_input
+from policy_node.training.learners.network_shape import network_shape
 from policy_node.training.runs.initial_networks import VALUED_BY, InitialNetworks
 from policy_node.training.runs.mean_networks import mean_of
 from policy_node.training.runs.origins import steps_behind

@@ -23,10 +23,10 @@ from node_runtime.command_line import (
 from node_runtime.signals import on_stop_signals
 from node_runtime.source_revision import source_revision
 from policy_node.training.configuration.config import TrainConfig, idle_parts
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import is_first_worker, join_workers, leave_workers
 from policy_node.training.machine.host import available_memory, why_too_large
-from policy_node.training.replay.episode_replay import Episodes
 from policy_node.training.runs.finite_checks import TrainingError
 from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.read_networks import read_initial_networks

@@ -11,11 +11,11 @@ from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo
-from policy_node.training.collection.frame_skip import plain_actor
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import to_flat
+from policy_node.training.experience.frame_skip import plain_actor
+from policy_node.training.experience.statistics import RunningStatistics
 from policy_node.training.learners.actor_critic import ActorCritic
-from policy_node.training.networks.normalizer import RunningStatistics
 from policy_node.training.runs.training_state import Counters, save_state
 
 STATE_FILE = 'training_state.safetensors'

@@ -13,9 +13,9 @@ from policy_node.policies.checkpoint import ActorInfo
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
 from policy_node.training.evaluation.evaluator import success_rate
 from policy_node.training.experience.experience import Experience
+from policy_node.training.experience.replay_file import save_replay
 from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.replay_file import save_replay
 from policy_node.training.runs.run_folder import BEST_FILE, LATEST_FILE, RunFolder
 from policy_node.training.runs.state_checks import is_finite
 from policy_node.training.runs.training_state import Counters

@@ -15,20 +15,20 @@ import torch
 
 from node_runtime.command_line import complain
 from policy_node.policies.actor import Actor
-from policy_node.training.collection.collector import Collector
-from policy_node.training.collection.simulations import make_simulation
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Critics, Ppo
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator, success_rate
+from policy_node.training.experience.collector import Collector
+from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.replay_file import load_replay
 from policy_node.training.experience.sampling import make_sampler
+from policy_node.training.experience.simulations import make_simulation
 from policy_node.training.learners.actor_critic import Losses
 from policy_node.training.learners.make_learner import make_learner
 from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.machine.host import split_threads
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.replay_file import load_replay
 from policy_node.training.runs.finite_checks import (
     require_finite_episodes,
     require_finite_losses,

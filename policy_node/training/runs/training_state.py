@@ -20,8 +20,8 @@ from policy_node.policies.tensor_file import (
     read_tensors,
     tensor_bytes,
 )
+from policy_node.training.experience.statistics import RunningStatistics
 from policy_node.training.learners.actor_critic import HIGH_LEVEL, ActorCritic
-from policy_node.training.networks.normalizer import RunningStatistics
 from policy_node.training.runs.state_checks import (
     require_adam,
     require_counters,

@@ -12,9 +12,9 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.policy import RestingPolicy
-from policy_node.training.collection.collector import Collector
 from policy_node.training.configuration.flat import from_flat
-from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.experience.collector import Collector
+from policy_node.training.experience.replay import Episodes
 
 torch.set_num_threads(1)
 

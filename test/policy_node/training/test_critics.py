@@ -11,9 +11,9 @@ import torch
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.flat import from_flat
+from policy_node.training.experience.transitions import Transitions
+from policy_node.training.learners.critics import AGGREGATES, Ensemble, make_critic
 from policy_node.training.learners.ddpg import DDPG
-from policy_node.training.networks.critics import AGGREGATES, Ensemble, make_critic
-from policy_node.training.replay.transitions import Transitions
 from support.learners import SHAPE, make_learner
 
 torch.set_num_threads(1)

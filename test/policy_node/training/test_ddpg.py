@@ -11,10 +11,10 @@ import torch
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine.devices import choose_device, uses_bfloat16
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.transitions import Transitions
 
 # Small products: more threads only wait for each other, and on a busy machine for very long.
 torch.set_num_threads(1)

@@ -13,7 +13,7 @@ from policy_node.training.machine.distributed import Workers, join_workers
 PROGRAM = """
 import torch
 from policy_node.training.machine.distributed import join_workers, leave_workers
-from policy_node.training.networks.normalizer import RunningStatistics
+from policy_node.training.experience.statistics import RunningStatistics
 from policy_node.policies.actor import Normalizer
 
 workers = join_workers(torch.device('cpu'))

@@ -13,10 +13,10 @@ from policy_node.training.experience.episode_weights import (
     ticks_until_dropped,
 )
 from policy_node.training.experience.experience import Experience
+from policy_node.training.experience.replay import EpisodeReplay, Episodes
+from policy_node.training.experience.returns import StepCounter
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.episode_replay import EpisodeReplay, Episodes
-from policy_node.training.replay.multi_step import StepCounter
 
 PEN = task_spec('HandManipulatePenRotate')
 TICKS = 10

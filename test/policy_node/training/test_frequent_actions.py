@@ -9,24 +9,24 @@ import torch
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.collection.collector import Collector
-from policy_node.training.collection.exploration import ParameterNoise
-from policy_node.training.collection.frame_skip import (
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.flat import from_flat, to_flat
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.collector import Collector
+from policy_node.training.experience.exploration import ParameterNoise
+from policy_node.training.experience.frame_skip import (
     HeldSteps,
     Holder,
     length_of,
     plain_actor,
     ticks_of,
 )
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.flat import from_flat, to_flat
-from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler, make_sampler
+from policy_node.training.experience.transitions import Starts, Transitions
 from policy_node.training.learners.ddpg import DDPG
+from policy_node.training.learners.network_shape import network_shape
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.networks.shape_from_config import network_shape
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.transitions import Starts, Transitions
 
 torch.set_num_threads(1)
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.collection.gamble import GambleSimulation
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.episode_weights import episode_weights
+from policy_node.training.experience.gamble import GambleSimulation
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners.ddpg import DDPG
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.transitions import Transitions
 from support.learners import make_learner
 
 torch.set_num_threads(1)

@@ -12,16 +12,16 @@ import torch
 from policy_node import load_policy
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
 from policy_node.policies.tensor_file import read_tensors
-from policy_node.training.collection.collector import Collector
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.collector import Collector
 from policy_node.training.experience.hindsight_actions import HierarchicalExperience, SubgoalSampler
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.goals.subgoals import GuidedPolicy
+from policy_node.training.experience.subgoals import GuidedPolicy
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners.hierarchy import HierarchicalDDPG
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.transitions import Transitions
 from policy_node.training.runs.run_log import RunLog, read_progress
 from policy_node.training.runs.trainer import Trainer
 

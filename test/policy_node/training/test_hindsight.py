@@ -11,15 +11,15 @@ import pytest
 from msgs_spec.rotations import quaternion_from_axis_angle
 from policy_node.training.configuration.flat import parse_value
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.goals.hindsight import (
+from policy_node.training.experience.hindsight import (
     complete_mixture,
     draw_sources,
     goal_mixture,
     goals_of,
 )
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.transitions import Starts
+from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.experience.transitions import Starts
 
 COUNT, TICKS = 6, 10
 

@@ -18,8 +18,8 @@ from policy_node.policies.shipped import shipped_actors
 from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.learners.network_shape import network_shape
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.networks.shape_from_config import network_shape
 from policy_node.training.runs.initial_networks import CRITIC_FIRST
 from policy_node.training.runs.mean_networks import mean_of
 from policy_node.training.runs.origins import steps_behind

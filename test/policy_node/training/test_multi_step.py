@@ -9,13 +9,13 @@ import pytest
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import task_spec
-from policy_node.training.collection.frame_skip import HeldSteps, length_of
+from policy_node.training.experience.conditions import Threshold
+from policy_node.training.experience.frame_skip import HeldSteps, length_of
 from policy_node.training.experience.hindsight_actions import SubgoalSampler
+from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.returns import StepCounter
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.networks.conditions import Threshold
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.multi_step import StepCounter
-from policy_node.training.replay.transitions import Transitions
+from policy_node.training.experience.transitions import Transitions
 
 COUNT, TICKS, LONGEST = 5, 9, 4
 ROW = np.tile(np.arange(COUNT), 80)

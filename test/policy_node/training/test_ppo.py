@@ -17,6 +17,8 @@ from msgs_spec.tasks import task_spec
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.outcomes import Outcomes
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.rollouts import (
     RolloutMaker,
     Rollouts,
@@ -26,13 +28,11 @@ from policy_node.training.experience.rollouts import (
     goals_in_hindsight,
 )
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.goals.outcomes import Outcomes
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners import ppo
 from policy_node.training.learners.make_learner import make_learner
 from policy_node.training.learners.ppo import PPO, log_probability
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.transitions import Transitions
 from policy_node.training.runs.trainer import Trainer
 
 torch.set_num_threads(1)

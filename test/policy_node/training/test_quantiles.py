@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from policy_node.training.networks.quantiles import levels, pooled, quantile_costs
-from policy_node.training.replay.transitions import Transitions
+from policy_node.training.experience.transitions import Transitions
+from policy_node.training.learners.quantiles import levels, pooled, quantile_costs
 from support.learners import make_learner
 
 torch.set_num_threads(1)

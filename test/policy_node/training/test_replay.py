@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from policy_node.training.replay.episode_replay import EpisodeReplay, Episodes, has_moved
+from policy_node.training.experience.replay import EpisodeReplay, Episodes, has_moved
 
 
 def numbered(first: int, count: int, ticks: int = 3) -> Episodes:

@@ -28,9 +28,9 @@ from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
+from policy_node.training.experience.replay import EpisodeReplay, Episodes
+from policy_node.training.experience.replay_file import load_replay, save_replay
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.replay.episode_replay import EpisodeReplay, Episodes
-from policy_node.training.replay.replay_file import load_replay, save_replay
 from policy_node.training.runs.run import _stop_on_signals, lock_run
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.trainer import Trainer

@@ -15,13 +15,13 @@ from msgs_spec.tasks import TaskSpec, task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.experience.conditions import Horizon, Threshold, fold
+from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.returns import StepCounter
 from policy_node.training.experience.sampling import TransitionSampler, make_sampler
+from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine.distributed import Workers
-from policy_node.training.networks.conditions import Horizon, Threshold, fold
-from policy_node.training.replay.episode_replay import Episodes
-from policy_node.training.replay.multi_step import StepCounter
-from policy_node.training.replay.transitions import Transitions
 
 torch.set_num_threads(1)
 

@@ -11,13 +11,13 @@ import torch
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.collection.collector import Collector
 from policy_node.training.configuration.flat import from_flat
+from policy_node.training.experience.collector import Collector
+from policy_node.training.experience.hindsight import with_subgoals
 from policy_node.training.experience.hindsight_actions import SubgoalSampler
+from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.goals.hindsight import with_subgoals
-from policy_node.training.goals.subgoals import TESTED, GuidedPolicy, Proposer
-from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.experience.subgoals import TESTED, GuidedPolicy, Proposer
 from policy_node.training.train_her import main
 
 torch.set_num_threads(1)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_spec.arrays import Array32
-from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.experience.replay import Episodes
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.past_actions import past_after
 from policy_node.policies.policy import Policy
-from policy_node.training.collection.exploration import ActionNoise, ParameterNoise
-from policy_node.training.collection.frame_skip import Holder
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Held, Hierarchical
-from policy_node.training.goals.subgoals import Guide, Proposer, subgoal_columns
-from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.experience.exploration import ActionNoise, ParameterNoise
+from policy_node.training.experience.frame_skip import Holder
+from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.subgoals import Guide, Proposer, subgoal_columns
 
 
 class Collector:

@@ -17,8 +17,8 @@ import numpy as np
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array32
-from policy_node.training.goals.hindsight import OUTCOME, displace
-from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.experience.hindsight import OUTCOME, displace
+from policy_node.training.experience.replay import Episodes
 
 # Episodes whose outcomes are drawn from, and states of each.
 EPISODES = 2000

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_spec.arrays import Array32
-from policy_node.training.replay.transitions import Transitions
+from policy_node.training.experience.transitions import Transitions
 
 # Future goals that one is chosen of.
 CANDIDATES = 8

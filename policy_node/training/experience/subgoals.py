@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from msgs_spec.arrays import Array32
 from policy_node.policies.network_shape import NORMALIZED_CLIP
 from policy_node.policies.policy import Policy
-from policy_node.training.replay.transitions import Starts
+from policy_node.training.experience.transitions import Starts
 
 # Share of proposals that are tested (Levy et al. 2019).
 TESTED = 0.3

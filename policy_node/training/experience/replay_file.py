@@ -9,7 +9,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from policy_node.training.replay.episode_replay import EpisodeReplay, Episodes
+from policy_node.training.experience.replay import EpisodeReplay, Episodes
 
 
 def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:

@@ -16,8 +16,8 @@ from msgs_spec.arrays import Array32
 from msgs_spec.rotations import quaternion_conjugate, quaternion_multiply
 from msgs_spec.tasks import GoalKind
 from policy_node.training.configuration.config import STRATEGIES
-from policy_node.training.goals.subgoals import subgoals_of
-from policy_node.training.replay.transitions import Starts
+from policy_node.training.experience.subgoals import subgoals_of
+from policy_node.training.experience.transitions import Starts
 
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 

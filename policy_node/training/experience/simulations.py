@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from fetch_hand_sim.simulation import Simulation
-from policy_node.training.collection.gamble import GambleSimulation
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Dense
+from policy_node.training.experience.gamble import GambleSimulation
 
 
 def make_simulation(config: TrainConfig, num_envs: int, num_threads: int) -> Simulation:

@@ -10,7 +10,7 @@ import numpy as np
 from fetch_hand_sim.episode_log import EpisodeArrays, load_episodes
 from fetch_hand_sim.episode_log.files import holds_no_episode
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TaskSpec
-from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.experience.replay import Episodes
 
 
 def read_experience(

@@ -21,7 +21,7 @@ from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration import groups
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.networks.widening import first_weights
+from policy_node.training.experience.widening import first_weights
 
 Goals = NDArray[np.float64]
 # Smallest threshold drawn, as a share of the one that is trained for.

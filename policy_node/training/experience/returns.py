@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_spec.arrays import Array32
-from policy_node.training.replay.transitions import Starts
+from policy_node.training.experience.transitions import Starts
 
 CORRECTIONS = ('none', 'lambda', 'cut')
 

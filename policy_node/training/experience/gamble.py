@@ -18,7 +18,7 @@ from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.arguments import Seeds
 from msgs_spec.arrays import Array
 from msgs_spec.tasks import TaskSpec
-from policy_node.training.replay.episode_replay import Episodes
+from policy_node.training.experience.replay import Episodes
 
 # The idle part of the action, and the value above which it is the gamble.
 GRIPPER_ACTION = 3

@@ -19,8 +19,8 @@ from msgs_spec.arrays import Array32
 from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import Actor
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.replay.multi_step import Act
-from policy_node.training.replay.transitions import Starts
+from policy_node.training.experience.returns import Act
+from policy_node.training.experience.transitions import Starts
 
 
 def ticks_of(length: Array32, most: int) -> NDArray[np.int64]:

@@ -1,1 +1,0 @@
-"""Episodes collected: the simulations, and noise on what the actor does there."""

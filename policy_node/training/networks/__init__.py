@@ -1,1 +1,0 @@
-"""Networks of the learners, and the statistics of their inputs."""

@@ -1,1 +1,0 @@
-"""Whole episodes, and the transitions that are drawn from them."""
