@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from msgs_spec.robots import command_from_action
 from msgs_spec.tasks import task_spec
-from msgs_spec.text import one_line
 from policy_node.policies.policy import LoadedPolicy
 
 Observation = dict[str, NDArray[np.float64]]
@@ -20,15 +19,15 @@ class Commander:
 
     Args:
         loaded: The policy.
-        control_hz: The robot's action frequency, Hz.
+        control_hz: Action frequency of the robot, Hz.
 
     Attributes:
-        spec: The task.
-        description: Who it is, for people.
-        sha256: Fingerprint of its file; empty if it has none.
+        spec: Specification of the task.
+        description: Format and file name of the policy.
+        sha256: SHA-256 of its file; empty without a file.
 
     Raises:
-        ValueError: If the policy was trained at another rate.
+        ValueError: If the policy was trained at another frequency.
     """
 
     def __init__(self, loaded: LoadedPolicy, control_hz: float) -> None:
@@ -44,28 +43,15 @@ class Commander:
         self._state: Any = None
 
     def start_episode(self) -> None:
-        """Forget the episode before; a policy without memory has nothing to forget."""
+        """Reset the memory of the policy."""
         self._state = None
 
     def command(self, observation: Observation) -> NDArray[np.float64]:
-        """Returns the command (action size,), command units, for one observation.
+        """Return the command (action size,), in command units, for one observation.
 
         Raises:
-            ValueError: If the policy fails, or gives something else than finite numbers, as many
-                as an action has.
+            PolicyError: If the policy fails or returns an invalid action.
         """
-        try:
-            action, state = self._loaded.predict(observation, self._state)
-            action = np.asarray(action, dtype=np.float64)
-        except Exception as error:
-            # Libraries raise types of their own, one observation in a thousand may be the cause.
-            raise ValueError(f'{self.description} fails: {one_line(error)}') from None
-        if not np.isfinite(action).all():
-            raise ValueError(f'{self.description} gives a value that is not finite')
-        if action.shape != (self.spec.robot.action_size,):
-            raise ValueError(
-                f'{self.description} gives shape {action.shape}; '
-                f'allowed: ({self.spec.robot.action_size},)'
-            )
-        self._state = state
-        return np.asarray(command_from_action(self.spec.robot, action), dtype=np.float64)
+        action, self._state = self._loaded.predict(observation, self._state)
+        command = command_from_action(self.spec.robot, action.astype(np.float64))
+        return np.asarray(command, dtype=np.float64)

@@ -13,7 +13,7 @@ from node_runtime.diagnostics import ASKED_RATE, MODE, PAUSED, RATE, Increase, R
 from node_runtime.ros import MEMORY_OF_THE_GRAPH
 from policy_node.node.responder import Responder
 
-# Seconds without a complete observation until the report names it. A paused robot publishes its
+# Seconds without a complete observation until the report warns. A paused robot publishes its
 # state once a second; the slowest motion is this many times slower than real time.
 _SILENCE = 2.0
 _SLOWEST = 100.0
@@ -26,9 +26,8 @@ class Pace:
     """The pace of a robot, from its diagnostics.
 
     Attributes:
-        is_paused: Whether it has none.
-        period: Seconds of wall time that it leaves a commander at each tick; infinite where it
-            waits for commands, 0 where it is as fast as possible.
+        is_paused: Whether the robot is paused.
+        period: Wall-clock time for a command, seconds; infinite in lockstep, 0 at full speed.
     """
 
     is_paused: bool
@@ -36,11 +35,7 @@ class Pace:
 
 
 def read_pace(message: Any, namespace: str) -> Pace | None:
-    """Returns the pace of the robot of a namespace, from a message on `/diagnostics`.
-
-    Returns:
-        None if the message belongs to another node.
-    """
+    """Return the pace of the robot in a namespace from a message on `/diagnostics`, or None."""
     for status in message.status:
         if status.name.rpartition('/')[0] == namespace.rstrip('/'):
             values = {pair.key: pair.value for pair in status.values}
@@ -59,11 +54,7 @@ def _period(values: Mapping[str, str]) -> float:
 
 
 class Health:
-    """Turns the counters of a responder into reports.
-
-    Args:
-        name: Fully qualified name of the node.
-    """
+    """Turn the counters of a responder into reports; `name` is the full name of the node."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -71,12 +62,12 @@ class Health:
         self._tick_duration = 0.0
         self._begin_counting()
         self._then = 0.0
-        # When there was one robot at most, and one source of each of its topics.
+        # Last time without a second robot and without a second publisher of a topic.
         self._alone_at = -math.inf
         self._said: set[str] = set()
 
     def start(self, responder: Responder, status: EpisodeStatus, now: float) -> None:
-        """Takes the robot that was found; a period begins, in seconds of the responder's clock."""
+        """Begin to report on a robot; `now` is in seconds of the responder's clock."""
         self._responder, self._then = responder, now
         self._tick_duration = 1.0 / status.control_hz
         self._begin_counting()
@@ -87,7 +78,7 @@ class Health:
         self._turned_back = Increase()
 
     def stop(self) -> None:
-        """Waits for a robot again."""
+        """Wait for a robot again."""
         self._responder = None
 
     def report(
@@ -99,15 +90,15 @@ class Health:
         missing: Sequence[str] = (),
         publishers: Mapping[str, int] = MappingProxyType({}),
     ) -> Report:
-        """Closes a period and reports on it.
+        """Report on the period since the last report.
 
         Args:
             now: Seconds of the responder's clock.
-            robots: How many publish `episode_status`.
-            pace: What the robot says of its pace; None counts as real time.
-            elsewhere: Namespaces of other robots, told where there is none here.
-            missing: Topics of the robot that nobody publishes, so that it cannot be answered.
-            publishers: How many publish each of its topics.
+            robots: Number of publishers of `episode_status`.
+            pace: Pace of the robot; None means real time.
+            elsewhere: Namespaces of other robots; reported if this namespace has none.
+            missing: Required topics without a publisher.
+            publishers: Number of publishers by topic.
         """
         if self._responder is None:
             report = Report(self._name, '', {'robots': str(robots)}, 'waits for a robot')
@@ -115,12 +106,14 @@ class Health:
             report = self._report(self._responder, now, robots, pace)
         if robots == 0 and elsewhere:
             report.warn(
-                f'no robot here: there is one in {", ".join(elsewhere)}; join it with '
+                f'no robot here: found in {", ".join(elsewhere)}; join it with '
                 f'--ros-args -r __ns:={elsewhere[0]}'
             )
         if robots and missing:
-            report.warn(f'no state: nobody publishes {", ".join(missing)}')
-        shared = [f'{count} publish {name}' for name, count in publishers.items() if count > 1]
+            report.warn(f'no state: no publisher of {", ".join(missing)}')
+        shared = [
+            f'{count} publishers of {name}' for name, count in publishers.items() if count > 1
+        ]
         is_mixed = self._turns_back() > _TURNS_OF_ONE
         if robots <= 1 and not shared:
             self._alone_at = now
@@ -129,11 +122,11 @@ class Health:
             if robots > 1:
                 report.warn(f'{robots} robots publish here; give each a namespace')
             else:
-                report.warn(f'state of several: {", ".join(shared)}')
+                report.warn(f'several sources of state: {", ".join(shared)}')
         return report
 
     def _turns_back(self) -> int:
-        """Return how many messages of one topic, on average, were older than the one before."""
+        """Return the mean number, per topic, of messages older than the one before."""
         if self._responder is None:
             return 0
         turned = self._turned_back.since(self._responder.turned_back)
@@ -192,5 +185,5 @@ class Health:
         return report
 
     def _longest_silence(self, responder: Responder) -> float:
-        """Seconds without an observation that are nothing to worry about at the robot's pace."""
+        """Return the longest normal time without an observation, seconds."""
         return max(_SILENCE, 2.0 * min(responder.interval, _SLOWEST * self._tick_duration))

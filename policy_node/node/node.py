@@ -33,24 +33,23 @@ from policy_node.policies.loading import TaskMissing, load_policy
 from policy_node.policies.policy import LoadedPolicy
 
 _WARN_PERIOD = 1.0
-# Seconds a robot may take to appear before others are named, and its topics before those that are
-# missing are; discovery takes a moment.
+# Seconds that discovery may take before reports name other robots or missing topics.
 _PATIENCE = 3.0
 _SERVED_AT_ONCE = 1000
-# Seconds for which the pace of a robot is valid; it is published once a second.
+# Seconds for which the pace of a robot is valid; robots publish it once a second.
 _PACE_HOLDS = 3.0
-# Robots beside the known one that need not be looked at twice.
+# Number of rejected robots to remember.
 _REMEMBERED = 7
 _ANY_TASK = next(iter(TASKS.values()))
 
 
 class PolicyNode(Node):
-    """Waits for a robot, checks that the policy fits it, then answers every tick with a command.
+    """Wait for a robot, check that the policy fits it, then answer every tick with a command.
 
-    A robot that comes back with another task or rate is a new robot.
+    A robot that returns with another task or frequency is a new robot.
 
     Raises:
-        UsageError: If a parameter is not allowed or there is no such policy.
+        UsageError: If a parameter is invalid or the policy cannot be loaded.
     """
 
     def __init__(self) -> None:
@@ -58,7 +57,7 @@ class PolicyNode(Node):
         self._settings = declare_parameters(self, POLICY_NODE)
         self._loaded = self._load_ahead()
         self._status: EpisodeStatus | None = None
-        # Robots that the policy does not fit, beside the one it is for.
+        # Further robots that the policy does not fit.
         self._refused: list[EpisodeStatus] = []
         self._status_stamp = 0
         self._responder: Responder | None = None
@@ -91,7 +90,7 @@ class PolicyNode(Node):
                 loop.wait(BEAT)
                 if self._has_robot_changed() or self._is_replaced:
                     self._leave()
-                    # The middleware releases topics only then; the next robot may have other types.
+                    # Releases the topics; the next robot may have other types.
                     loop.serve_pending(_SERVED_AT_ONCE)
                 if self._responder is not None:
                     self._answer(self._responder, loop)
@@ -103,7 +102,7 @@ class PolicyNode(Node):
 
     def _answer(self, responder: Responder, loop: EventLoop) -> None:
         if responder.is_due:
-            # Of a robot that is faster than its policy, what came meanwhile is newer.
+            # Prefer newer ticks if the robot is faster than the policy.
             loop.serve_pending(_SERVED_AT_ONCE)
         try:
             responder.answer()
@@ -144,7 +143,7 @@ class PolicyNode(Node):
                 return
             self._report_when_due(missing if time.monotonic() > began + _PATIENCE else ())
         self._announce(commander)
-        # Created last: the robot takes its appearance as the sign that the policy is ready.
+        # Created last: for the robot, this publisher means that the policy is ready.
         self._commands = self._publisher(topic(commander.spec, 'commands'))
         self._of_robot.append(self._commands)
         self._health.start(responder, status, time.monotonic())
@@ -163,7 +162,7 @@ class PolicyNode(Node):
         """
         wanted, name = self._settings['task'], self._settings['policy']
         if wanted and wanted != status.task:
-            raise ValueError(f'the robot does {status.task}, not {wanted}')
+            raise ValueError(f'the robot has task {status.task}, not {wanted}')
         if self._loaded is None or self._loaded.task != status.task:
             return load_policy(name, status.task, trust=self._settings['trust'])
         return self._loaded
@@ -188,14 +187,14 @@ class PolicyNode(Node):
         return result
 
     def _load_for_one(self, name: str) -> tuple[LoadedPolicy | None, EpisodeStatus | None]:
-        """Returns a policy and the robot it is for; None for what is not known yet.
+        """Return a policy and the robot that it fits; None for each that is not yet known.
 
         Raises:
-            ValueError: If the policy is not found, or fits none of the robots.
+            ValueError: If the policy cannot be loaded, or fits no robot.
         """
         is_there = self.count_publishers(self._status_name) > 0
         known: list[EpisodeStatus | None] = [self._status] if self._status else []
-        # After the end of a robot, one with another task may follow.
+        # If the robot has left, a robot with another task may follow.
         robots = [*known, *self._refused] if known and is_there else [None]
         problems = []
         for status in robots:
@@ -316,7 +315,7 @@ class PolicyNode(Node):
     def _may_follow(self, status: EpisodeStatus) -> bool:
         """Return whether a status comes from the known robot, its successor, or a robot that fits.
 
-        A stranger beside a robot does not end what is between that and its policy.
+        A second robot that does not fit is ignored.
         """
         known = self._status
         if known is None or status.is_of_same_robot(known):

@@ -27,11 +27,11 @@ _ASK_AGAIN = 1.0
 class Responder:
     """Answer the newest complete tick of one robot with one command.
 
-    Call `receive` for each message and `answer` when no more are waiting. If the robot is faster
-    than the policy, ticks are skipped; the delay does not grow.
+    Call `receive` for each message, then `answer` once all waiting messages are received. If the
+    robot is faster than the policy, ticks are skipped; the delay does not grow.
 
     Args:
-        commander: The policy of the robot.
+        commander: The policy.
         status: The robot's last `episode_status`.
         send: Publishes the CDR bytes of a command; returns False without a subscriber.
         clock: A steady clock, seconds.
@@ -41,15 +41,15 @@ class Responder:
         topics: The topics it needs.
         join: Joins them by stamp.
         answered: Commands sent.
-        overtaken: Complete ticks that were not answered because a newer one was there.
-        turned_back: Messages with an earlier stamp than the last one of their topic. One publisher
-            does this once when it restarts, two do it again and again.
-        unusable: Messages that could not be read, and ticks without a valid observation.
-        failed: Observations at which the policy failed.
-        last_failure: Error of the last of them.
-        inference: Wall time from a complete observation to its command.
-        received_at: When the last observation was complete, seconds of the clock.
-        interval: Seconds between the last two; infinite before.
+        overtaken: Complete ticks without an answer because a newer one was complete.
+        turned_back: Messages with an earlier stamp than the last one of their topic. A restarted
+            publisher causes one; two publishers cause many.
+        unusable: Invalid messages, and ticks without a valid observation.
+        failed: Observations for which the policy failed.
+        last_failure: Error of the last failure.
+        inference: Wall-clock time from a complete observation to its command.
+        received_at: Time of the last complete observation, seconds of the clock.
+        interval: Seconds between the last two complete observations; infinite before.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Responder:
         self._due: Vectors | None = None
         self._due_stamp = 0
         self._asked: dict[str, NDArray[np.float64]] | None = None
-        # The last answered tick, whether it was the first of an episode, and episode borders.
+        # The last answered tick, whether it began an episode, and stamps of episode ends.
         self._answered: tuple[int, dict[str, NDArray[np.float64]]] | None = None
         self._is_first = True
         self._starts_at = self._ends_at = -1
@@ -92,14 +92,10 @@ class Responder:
         self.interval = math.inf
 
     def receive(self, name: str, data: bytes) -> None:
-        """Take one message; the last message of a tick makes the tick due.
-
-        Args:
-            name: Its topic.
-            data: Its CDR bytes.
+        """Take one message, as CDR bytes; the last message of a tick makes the tick due.
 
         Raises:
-            ValueError: If the message cannot be used, in one line; it is counted and dropped.
+            ValueError: If the message is invalid. It is counted and dropped.
         """
         try:
             stamp, vector = self._sources[name].decode(data)
@@ -114,12 +110,7 @@ class Responder:
             self._due, self._due_stamp = vectors, stamp
 
     def note_phase(self, phase: Phase, stamp: int) -> None:
-        """Note the borders of episodes, at which the policy forgets.
-
-        Args:
-            phase: Of `episode_status`.
-            stamp: Its stamp, nanoseconds.
-        """
+        """Note the start and end of episodes from `episode_status`, stamped in nanoseconds."""
         if phase == 'finished':
             self._ends_at = stamp
         elif phase == 'reset':
@@ -136,13 +127,13 @@ class Responder:
         return self._due is not None
 
     def answer(self) -> None:
-        """Answers the tick that is due, if there is one.
+        """Answer the tick that is due, if any.
 
-        One that the policy had no command for is asked about again once a second until a newer one
-        is there: in lockstep there is none before it has an answer.
+        After a failure the policy gets the same tick once a second, until a newer one is complete:
+        in lockstep the robot waits for this answer.
 
         Raises:
-            ValueError: If there is no answer, in one line; it is counted.
+            ValueError: If the policy fails. The failure is counted.
         """
         if self._due is not None:
             vectors, self._due, self._asked = self._due, None, None
@@ -167,7 +158,7 @@ class Responder:
         self._starts_at = self._ends_at = -1
 
     def _forget_last_episode(self) -> None:
-        """Let the policy forget if an episode began since the last answered tick."""
+        """Reset the policy if an episode began since the last answered tick."""
         before, now = self._answered[0] if self._answered else -1, self._due_stamp
         self._is_first = before < self._starts_at <= now or before <= self._ends_at < now
         if self._is_first or self._answered is None:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 Vectors = dict[str, NDArray[np.float64]]
 
-# Nanoseconds: a stamp further back is no late message but a simulation started anew.
+# Nanoseconds. A stamp further back means that the simulation was started again.
 _LONGEST_DELAY = 1_000_000_000
-# Seconds after which no message is late any more.
+# Seconds after which a message is never late.
 _LATEST = 1.0
 
 
@@ -26,7 +26,7 @@ class StampJoin:
 
     Args:
         topics: Names of the topics to join.
-        max_pending: Incomplete stamps kept; the one that came first goes first.
+        max_pending: Number of incomplete stamps kept; the oldest is dropped first.
         clock: A steady clock, seconds.
 
     Attributes:
@@ -48,15 +48,9 @@ class StampJoin:
         self.dropped = 0
 
     def add(self, topic: str, stamp: int, vector: NDArray[np.float64]) -> Vectors | None:
-        """Adds one vector.
+        """Add the vector of a topic; return the vectors of all topics once the stamp is complete.
 
-        Args:
-            topic: Its topic.
-            stamp: Nanoseconds.
-            vector: The vector.
-
-        Returns:
-            The vectors of all topics if they are complete for this stamp, else None.
+        The stamp is in nanoseconds.
         """
         if self._last is not None and self._is_late(self._last - stamp):
             return None
@@ -84,7 +78,7 @@ class StampJoin:
     def _complete(self, stamp: int) -> None:
         self._last, self._completed_at = stamp, self._clock()
         del self._pending[stamp]
-        # Late by now, or of the time before a new beginning.
+        # Late, or from before a restart of the simulation.
         lost = [other for other in self._pending if not stamp < other <= stamp + _LONGEST_DELAY]
         self.dropped += len(lost)
         for other in lost:

@@ -1,1 +1,1 @@
-"""What acts: trained actors of every format, and the files they live in."""
+"""Policies of every format: load, run, export, and the files that contain them."""

@@ -1,4 +1,4 @@
-"""The actor as it learns, a torch module: normalised observation and goal in, action out."""
+"""The actor as a torch module, for training: from observation and goal to action."""
 
 from __future__ import annotations
 
@@ -11,20 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
-from policy_node.policies.past_actions import past_after, past_before
-from policy_node.policies.policy import observation_and_goal
+from policy_node.policies.policy import observation_and_goal, past_after, past_before
 
 
 class MLP(nn.Module):
-    """Hidden layers with ReLU and a linear output, Glorot weights and zero biases.
+    """Hidden layers with ReLU and a linear output; Glorot weights, zero biases.
 
-    The initialisation is that of the paper's code (`baselines/her/util.py`). The output layer stays
-    float32 under autocast: values near -50 would otherwise be rounded to steps of 0.25.
-
-    Args:
-        input_size: Of the first layer.
-        output_size: Of the last.
-        shape: Hidden layers, and whether they are normalised.
+    The initialisation equals that of the paper's code (`baselines/her/util.py`). The output layer
+    stays float32 under autocast, because bfloat16 rounds values near -50 to steps of 0.25.
     """
 
     def __init__(self, input_size: int, output_size: int, shape: NetworkShape) -> None:
@@ -41,7 +35,7 @@ class MLP(nn.Module):
         self.output = _linear(size, output_size)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Returns (..., output_size), float32."""
+        """Return (..., output_size), float32."""
         hidden = self.hidden(inputs).float()
         with torch.autocast(hidden.device.type, enabled=False):
             output: Tensor = self.output(hidden)
@@ -56,10 +50,9 @@ def _linear(input_size: int, output_size: int) -> nn.Linear:
 
 
 class Normalizer(nn.Module):
-    """Clips, centres and scales inputs with statistics that belong to the checkpoint.
+    """Clip, centre and scale inputs with the statistics of a checkpoint.
 
-    `RunningStatistics` (`policy_node.training.experience.statistics`) writes `mean` and `std` while
-    training.
+    During training, `policy_node.training.experience.statistics.RunningStatistics` sets them.
     """
 
     mean: Tensor
@@ -71,13 +64,13 @@ class Normalizer(nn.Module):
         self.register_buffer('std', torch.ones(size))
 
     def forward(self, values: Tensor) -> Tensor:
-        """Returns (..., size) values within +-5 standard deviations of the mean."""
+        """Return values (..., size) within +-5 standard deviations of the mean."""
         clipped = values.clamp(-INPUT_CLIP, INPUT_CLIP)
         return ((clipped - self.mean) / self.std).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
 
 
 class Actor(nn.Module):
-    """Deterministic policy: multilayer perceptron with tanh output on normalised inputs."""
+    """Deterministic policy: a multilayer perceptron with tanh output on normalised inputs."""
 
     def __init__(self, shape: NetworkShape) -> None:
         super().__init__()
@@ -88,7 +81,7 @@ class Actor(nn.Module):
 
     @classmethod
     def from_arrays(cls, shape: NetworkShape, arrays: Mapping[str, NDArray[np.float32]]) -> Actor:
-        """Returns an actor that acts and no longer learns, with the tensors of a checkpoint."""
+        """Return an actor for inference with the tensors of a checkpoint."""
         actor = cls(shape)
         actor.load_state_dict({name: torch.tensor(value) for name, value in arrays.items()})
         return actor.eval().requires_grad_(False)
@@ -97,8 +90,8 @@ class Actor(nn.Module):
         """Return the normalised network input (..., feature_size).
 
         Args:
-            observation: (..., input_size) observation and past actions.
-            goal: (..., goal_size).
+            observation: Observation and past actions, (..., input_size).
+            goal: Desired goal, (..., goal_size).
         """
         normalized = self.observation_normalizer(observation), self.goal_normalizer(goal)
         if self.shape.goal_features is None:
@@ -111,7 +104,7 @@ class Actor(nn.Module):
         return torch.cat([inputs, normalized[0][..., size:]], dim=-1)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Actions (..., action_size) in [-1, 1] for `features`."""
+        """Return actions (..., action_size) in [-1, 1] for `features`."""
         return torch.tanh(self.network(features))
 
     @torch.inference_mode()
@@ -122,23 +115,23 @@ class Actor(nn.Module):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """Returns the action for one observation or a batch, as Stable-Baselines3's `predict` does.
+        """Return the action for one observation or a batch, as Stable-Baselines3's `predict` does.
 
         Args:
             observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
-                in the units of the task, where one of them may be one for the whole batch; other
-                keys are ignored.
-            state: What the last call returned; None at the start of an episode. Ignored by an
-                actor without past actions.
+                in the units of the task. One of the two may serve a whole batch. Other keys are
+                ignored.
+            state: State that the last call returned; None at the start of an episode. Only an
+                actor with past actions uses it.
             episode_start: Booleans (...,), True where an episode starts.
-            deterministic: Ignored: the policy has no noise, as Stable-Baselines3's DDPG.
+            deterministic: Ignored, because the policy has no noise.
 
         Returns:
             Actions (..., action_size) in [-1, 1], float32, and the state for the next call; None
             for an actor without past actions.
 
         Raises:
-            ValueError: If a part is missing or has the wrong length, or their batches do not fit.
+            ValueError: If a part is missing or has a wrong shape.
         """
         shape = self.shape
         parts = observation_and_goal(observation, shape.observation_size, shape.goal_size)
@@ -150,6 +143,6 @@ class Actor(nn.Module):
         return action, None if past is None else past_after(past, action)
 
     def _input(self, values: NDArray[np.float32]) -> Tensor:
-        # Read-only ones are copied, about which torch would warn.
+        # torch would warn of read-only arrays.
         values = np.require(values, requirements=['C_CONTIGUOUS', 'WRITEABLE'])
         return torch.from_numpy(values).to(self.goal_normalizer.mean.device)

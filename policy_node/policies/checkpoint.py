@@ -1,7 +1,7 @@
-"""Actor checkpoints: safetensors files whose metadata say what the weights fit. Never pickle.
+"""Actor checkpoints: safetensors files with metadata, never pickle.
 
-What a file declares is compared with its task and its tensors before anything is made of it, so a
-damaged or crafted one costs no more than its size.
+The metadata must agree with the task and with the tensors before a network is built. A damaged or
+crafted file therefore costs no more memory than its size.
 """
 
 from __future__ import annotations
@@ -18,16 +18,10 @@ from numpy.typing import NDArray
 
 from msgs_spec.tasks import TASKS, TaskSpec, substeps_per_tick, task_spec
 from msgs_spec.text import one_line
-from policy_node.policies.files import read_file, sha256, write_file
+from policy_node.policies.files import parse_tensors, read_file, sha256, tensor_bytes, write_file
 from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.policy import LoadedPolicy, Policy
-from policy_node.policies.tensor_file import (
-    TensorHeader,
-    parse_header,
-    parse_tensors,
-    tensor_bytes,
-)
 
 if TYPE_CHECKING:
     from policy_node.policies.actor import Actor
@@ -40,25 +34,25 @@ MOST_LAYERS = 64
 
 @dataclass(frozen=True, slots=True)
 class ActorInfo:
-    """What a checkpoint says about its actor.
+    """The metadata of an actor.
 
     Attributes:
-        task: Task it was trained on.
+        task: Task of its training.
         observation_layout: (name, size) of each part of the observation, in order.
         goal_size: Length of the goal.
         action_size: Length of the action.
         hidden_sizes: Width of each hidden layer.
         layer_norm: Whether hidden layers are normalised.
-        control_hz: Action frequency it was trained at, Hz.
+        control_hz: Action frequency of its training, Hz.
         seed: Seed of the training run.
-        command: Command line that trained it.
-        source_revision: Revision of the source that trained it.
-        env_steps: Environment steps behind the weights.
-        config: The training configuration.
+        command: Command line of the training.
+        source_revision: Git revision of the training code.
+        env_steps: Environment steps of the training.
+        config: Training configuration by field.
         success: Measured success and how it was measured; empty if unmeasured.
-        goal_features: How observation and goal become inputs: `plain`, `relative`, `symmetric`.
-        init_from: What its training started from: name, task, environment steps, and what that
-            had started from; empty if from nothing.
+        goal_features: Inputs made from observation and goal: `plain`, `relative`, `symmetric`.
+        init_from: Name, task, environment steps and `init_from` of the networks that its training
+            started from; empty for random networks.
         past_actions: Number of past actions among the inputs.
     """
 
@@ -81,7 +75,7 @@ class ActorInfo:
 
     @property
     def shape(self) -> NetworkShape:
-        """Shape of the network the weights belong to."""
+        """Shape of its network."""
         return NetworkShape(
             observation_size=sum(size for _, size in self.observation_layout),
             goal_size=self.goal_size,
@@ -95,12 +89,12 @@ class ActorInfo:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """The contents of a file, checked.
+    """The checked contents of a file.
 
     Attributes:
-        info: What it says about its actor.
+        info: The metadata.
         tensors: Weights and normalisers by their names in `Actor`, float32, all finite.
-        sha256: Fingerprint of the file.
+        sha256: SHA-256 of the file, hexadecimal.
     """
 
     info: ActorInfo
@@ -109,29 +103,29 @@ class Checkpoint:
 
 
 def observation_layout(spec: TaskSpec) -> tuple[tuple[str, int], ...]:
-    """(name, size) of each part of a task's observation, in order."""
+    """Return (name, size) of each part of a task's observation, in order."""
     return tuple((part.name, part.size) for part in spec.observation)
 
 
 def save(path: str | Path, actor: Actor, info: ActorInfo) -> None:
-    """Writes weights, normaliser and metadata to `path`; the file is complete or not there."""
+    """Write weights, normalisers and metadata; the file is complete or not written."""
     write_file(Path(path), to_bytes(actor, info))
 
 
 def to_bytes(actor: Actor, info: ActorInfo) -> bytes:
-    """Returns what `save` writes.
+    """Return the contents of a checkpoint file.
 
     Raises:
-        ValueError: If the metadata are of an actor of another shape.
+        ValueError: If the metadata belong to an actor of another shape.
     """
     if actor.shape != info.shape:
-        raise ValueError(f'actor has shape {actor.shape}, its metadata say {info.shape}')
+        raise ValueError(f'actor has shape {actor.shape}; its metadata have {info.shape}')
     tensors = {name: value.detach().cpu() for name, value in actor.state_dict().items()}
     return tensor_bytes(tensors, to_metadata(info))
 
 
 def to_metadata(info: ActorInfo) -> dict[str, str]:
-    """Returns the metadata of an actor's file, whatever its format."""
+    """Return the metadata of a checkpoint or ONNX file."""
     metadata = {'format': FORMAT, 'format_version': str(FORMAT_VERSION)}
     for name, value in dataclasses.asdict(info).items():
         metadata[name] = json.dumps(value)
@@ -139,39 +133,36 @@ def to_metadata(info: ActorInfo) -> dict[str, str]:
 
 
 def read(path: str | Path, task: str | None = None) -> Checkpoint:
-    """Reads a checkpoint.
+    """Read a checkpoint.
 
     Args:
         path: Checkpoint file.
-        task: Refuse a checkpoint of any other task.
+        task: Reject a checkpoint of any other task.
 
     Raises:
-        ValueError: If the file is no checkpoint, of an unknown version, of another task, its sizes
-            do not fit the task, or a weight is not finite; one line names what was found and what
-            is allowed.
+        ValueError: If the file is invalid, of an unknown version, or of another task. The message
+            is one line.
     """
     data = read_file(Path(path))
-    header = parse_header(data, path)
-    info = parse_metadata(header.metadata, path)
+    tensors, metadata = parse_tensors(data, path)
+    info = parse_metadata(metadata, path)
     if task is not None and info.task != task:
         raise ValueError(f'{path} was trained on {info.task}, not on {task}')
-    _check_tensors(path, header, info.shape)
-    tensors = parse_tensors(data, path)
-    _check_values(path, tensors)
+    _check_tensors(path, tensors, info.shape)
     return Checkpoint(info, tensors, sha256(data))
 
 
 def read_info(path: str | Path) -> ActorInfo:
-    """Reads only the metadata of an actor checkpoint.
+    """Read only the metadata of a checkpoint.
 
     Raises:
-        ValueError: If it is no actor checkpoint of this version.
+        ValueError: If the file is not an actor checkpoint of this version.
     """
-    return parse_metadata(parse_header(read_file(Path(path)), path).metadata, path)
+    return parse_metadata(parse_tensors(read_file(Path(path)), path)[1], path)
 
 
 def load(path: str | Path, task: str | None = None) -> tuple[Actor, ActorInfo]:
-    """Loads an actor as a torch module, and what is known about it.
+    """Load an actor as a torch module, and its metadata.
 
     Raises:
         ValueError: As `read`.
@@ -183,30 +174,23 @@ def load(path: str | Path, task: str | None = None) -> tuple[Actor, ActorInfo]:
 
 
 def loaded_actor(policy: Policy, info: ActorInfo, path: Path, digest: str) -> LoadedPolicy:
-    """An actor of this project and what its file says about it, whatever the format.
-
-    Args:
-        policy: What acts.
-        info: What the metadata say.
-        path: The file.
-        digest: Its fingerprint.
-    """
+    """Return an actor of this project, from a checkpoint or ONNX file with this SHA-256."""
     return LoadedPolicy(policy, info.task, f'actor {path.name}', info.control_hz, digest)
 
 
 def checkpoint_hash(path: str | Path) -> str:
-    """SHA-256 of the file, hexadecimal."""
+    """Return the SHA-256 of a file, hexadecimal."""
     return sha256(read_file(Path(path)))
 
 
 def parse_metadata(metadata: dict[str, str], path: str | Path) -> ActorInfo:
-    """Returns what the metadata of an actor's file say, whatever its format.
+    """Return the checked metadata of a checkpoint or ONNX file.
 
     Raises:
-        ValueError: If they are none of this version or do not fit a task; `path` names the file.
+        ValueError: If they have another version or do not fit a task. `path` names the file.
     """
     _check_format(path, metadata)
-    # Files from before there were goal features have plain ones, and started from nothing.
+    # Older files lack these fields.
     metadata = {'goal_features': '"plain"', 'init_from': '{}', 'past_actions': '0', **metadata}
     fields = {field.name: field.type for field in dataclasses.fields(ActorInfo)}
     missing = [name for name in fields if name not in metadata]
@@ -227,8 +211,8 @@ def parse_metadata(metadata: dict[str, str], path: str | Path) -> ActorInfo:
 def _check_format(path: str | Path, metadata: dict[str, str]) -> None:
     if metadata.get('format') != FORMAT:
         raise ValueError(
-            f'{path} is no policy of this project (format {metadata.get("format")!r:.80}); '
-            'allowed: files that fetch_hand_sim train and export write'
+            f'{path} has format {metadata.get("format")!r:.80}; '
+            'allowed: files of fetch_hand_sim train and export'
         )
     version = metadata.get('format_version')
     if version != str(FORMAT_VERSION):
@@ -260,73 +244,69 @@ def _check_sizes(path: str | Path, info: ActorInfo) -> None:
             raise ValueError(f'{path} has {name} {given!s:.200}; {info.task} has {wanted}')
 
 
-def _check_tensors(path: str | Path, header: TensorHeader, shape: NetworkShape) -> None:
-    wanted, found = shape.tensor_shapes(), header.shapes
+def _check_tensors(
+    path: str | Path, tensors: dict[str, NDArray[np.float32]], shape: NetworkShape
+) -> None:
+    wanted = shape.tensor_shapes()
+    found = {name: values.shape for name, values in tensors.items()}
     for name in sorted(wanted.keys() | found.keys()):
         if found.get(name) != wanted.get(name):
             given, allowed = found.get(name, 'none'), wanted.get(name, 'none')
             raise ValueError(
                 f'{path} has tensor {one_line(name, 80)} {given!s:.80}; '
-                f'its metadata ask for {allowed}'
+                f'its metadata require {allowed}'
             )
-        if header.types[name] != 'F32':
-            raise ValueError(f'{path} has tensor {name} of {header.types[name]:.8}; allowed: F32')
-
-
-def _check_values(path: str | Path, tensors: dict[str, NDArray[np.float32]]) -> None:
     for name, values in tensors.items():
+        if values.dtype != np.float32:
+            raise ValueError(f'{path} has tensor {name} of {values.dtype}; allowed: float32')
         if not np.isfinite(values).all():
             raise ValueError(f'{path} has tensor {name} with a value that is not finite')
         if name.endswith('_normalizer.std') and not (values > 0).all():
             raise ValueError(f'{path} has tensor {name} with a value that is not above 0')
 
 
-# What a value of the metadata may be.
+# Readers of metadata values.
 
 
-def _of_type(kind: type, complaint: str) -> Callable[[object], Any]:
-    """What reads a value of a type of JSON, for which true is no number."""
+def _of_type(kind: type, name: str) -> Callable[[object], Any]:
+    """Return a reader of values of one JSON type; true and false are not numbers."""
 
     def read_value(value: object) -> Any:
         if type(value) is not kind:
-            raise TypeError(f'{value!r:.80} {complaint}')
+            raise TypeError(f'{value!r:.80} is not {name}')
         return value
 
     return read_value
 
 
-_text = _of_type(str, 'is no text')
-_whole = _of_type(int, 'is no whole number')
-_flag = _of_type(bool, 'is neither true nor false')
-_object = _of_type(dict, 'is no object')
+_text = _of_type(str, 'text')
+_whole = _of_type(int, 'a whole number')
+_list = _of_type(list, 'a list')
 
 
 def _rate(value: object) -> float:
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        raise TypeError(f'{value!r:.80} is no number')
-    substeps_per_tick(float(value))
-    return float(value)
+    rate = float(value) if type(value) is int else _of_type(float, 'a number')(value)
+    substeps_per_tick(rate)
+    return float(rate)
 
 
 def _widths(value: object) -> tuple[int, ...]:
-    if not isinstance(value, list):
-        raise TypeError(f'{value!r:.80} is no list')
-    widths = tuple(_whole(width) for width in value)
+    widths = tuple(_whole(width) for width in _list(value))
     if any(width < 1 for width in widths):
         raise ValueError(f'{value!r:.80}; allowed: widths of 1 or more')
     return widths
 
 
-def _layout(value: Any) -> tuple[tuple[str, int], ...]:
-    return tuple((_text(name), _whole(size)) for name, size in value)
+def _layout(value: object) -> tuple[tuple[str, int], ...]:
+    return tuple((_text(name), _whole(size)) for name, size in _list(value))
 
 
 _READERS: dict[Any, Callable[[Any], Any]] = {
     'str': _text,
     'int': _whole,
-    'bool': _flag,
+    'bool': _of_type(bool, 'true or false'),
     'float': _rate,
-    'dict[str, Any]': _object,
+    'dict[str, Any]': _of_type(dict, 'an object'),
     'tuple[int, ...]': _widths,
     'tuple[tuple[str, int], ...]': _layout,
 }

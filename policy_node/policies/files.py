@@ -1,28 +1,35 @@
-"""Files of policies: read whole and within bounds, written whole or not at all."""
+"""Read and write the files of policies and runs: whole, and within size limits."""
 
 from __future__ import annotations
 
 import contextlib
-import glob
 import hashlib
 import json
 import os
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-# The largest actor of the paper's size has 0.7 MB.
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load as from_bytes
+from safetensors.numpy import save as to_bytes
+
+from msgs_spec.text import one_line
+
+# Bytes. The largest actor of the paper's size has 0.7 MB, a training state a few megabytes.
 LARGEST_POLICY = 64 * 2**20
-# Seconds.
-_LONGEST_WRITE = 3600.0
+LARGEST_TENSOR_FILE = 2**30
+# Parsed JSON needs many times the memory of its text; the header of an actor has a few kilobytes.
+LARGEST_HEADER = 2**20
 
 
 def read_file(path: Path, largest: int = LARGEST_POLICY) -> bytes:
-    """Reads a regular file.
+    """Read a regular file.
 
     Raises:
-        ValueError: If it cannot be read, is none, or has more than `largest` bytes.
+        ValueError: If the file is missing, unreadable, not regular or larger than `largest` bytes.
     """
     try:
         if not path.is_file():
@@ -32,20 +39,19 @@ def read_file(path: Path, largest: int = LARGEST_POLICY) -> bytes:
     except OSError as error:
         raise ValueError(f'{path} cannot be read: {error.strerror or error}') from None
     if len(data) > largest:
-        raise ValueError(f'{path} has more than {largest} bytes, which is the most allowed')
+        raise ValueError(f'{path} has more than {largest} bytes, the largest size allowed')
     return data
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Writes a file under a temporary name and moves it into place.
+    """Write a file under a temporary name and move it into place.
 
-    What is no regular file, such as a pipe or a link, is written to as it is.
+    Links, pipes and devices such as `/dev/stdout` are written directly.
 
     Raises:
-        OSError: If that fails, and names the file; nothing is left behind.
+        OSError: If writing fails. The error names the file, and no partial file remains.
     """
     is_special = path.exists() and not path.is_file() and not path.is_dir()
-    # `/dev/stdout` is one, to whatever the output goes to.
     if is_special or path.is_symlink():
         with _named(path):
             path.write_bytes(data)
@@ -54,22 +60,21 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
-    """Writes files that belong together: none is replaced before there was room for all.
+    """Write files that belong together: replace none before all are on disk.
 
-    Of two processes that write one at once the later one's stays, whole.
+    If two processes write at once, the later file stays, whole.
 
     Args:
         files: Contents by path.
 
     Raises:
-        OSError: If that fails, and names the file; nothing is left behind.
+        OSError: If writing fails. The error names the file, and no partial file remains.
     """
     partials = {path: path.with_name(f'.{path.name}.{os.getpid()}.partial') for path in files}
     try:
         for path, partial in partials.items():
             with _named(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
-                _clear_away_leftovers(path)
                 with partial.open('wb') as file:
                     file.write(files[path])
                     file.flush()
@@ -84,20 +89,9 @@ def write_files(files: Mapping[Path, bytes]) -> None:
         raise
 
 
-def _clear_away_leftovers(path: Path) -> None:
-    """Removes what processes left that were killed while they wrote a file."""
-    for left in path.parent.glob(f'.{glob.escape(path.name)}.*.partial'):
-        number = left.name.split('.')[-2]
-        with contextlib.suppress(OSError):
-            # Of this machine, or of one that shares the disk: an hour is longer than writing takes.
-            is_old = time.time() - left.stat().st_mtime > _LONGEST_WRITE
-            if is_old and number.isdigit() and not Path(f'/proc/{number}').exists():
-                left.unlink()
-
-
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Names the file in errors: Python names none for a full disk, and else the partial one."""
+    """Name the file in errors; Python names no file for a full disk."""
     try:
         yield
     except OSError as error:
@@ -105,10 +99,53 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def to_json(values: Mapping[str, Any]) -> bytes:
-    """Contents of a JSON file, as all commands here write and print it."""
+    """Return the contents of a JSON file, with two spaces per level."""
     return (json.dumps(values, indent=2) + '\n').encode()
 
 
 def sha256(data: bytes) -> str:
-    """Fingerprint of a policy's file, hexadecimal."""
+    """Return the SHA-256 of the contents of a file, hexadecimal."""
     return hashlib.sha256(data).hexdigest()
+
+
+def write_tensors(
+    path: str | Path, tensors: Mapping[str, ArrayLike], metadata: dict[str, str]
+) -> None:
+    """Write arrays, or torch tensors on the CPU, as a safetensors file."""
+    write_file(Path(path), tensor_bytes(tensors, metadata))
+
+
+def tensor_bytes(tensors: Mapping[str, ArrayLike], metadata: dict[str, str]) -> bytes:
+    """Return the contents of a safetensors file."""
+    arrays = {name: np.asarray(value, order='C') for name, value in tensors.items()}
+    return to_bytes(arrays, metadata)
+
+
+def read_tensors(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Read arrays and metadata.
+
+    Raises:
+        ValueError: If the file cannot be read or is not a safetensors file.
+    """
+    return parse_tensors(read_file(Path(path), LARGEST_TENSOR_FILE), path)
+
+
+def parse_tensors(data: bytes, path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Return the arrays and the metadata of a safetensors file.
+
+    Args:
+        data: Contents of the file.
+        path: Its path, for errors.
+
+    Raises:
+        ValueError: If the contents are invalid, or the header is larger than 1 MiB.
+    """
+    end = 8 + int.from_bytes(data[:8], 'little')
+    try:
+        if len(data) >= end > LARGEST_HEADER:
+            raise ValueError(f'header of {end} bytes; allowed: up to {LARGEST_HEADER}')
+        arrays = from_bytes(data)
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f'{path} is not a readable safetensors file: {one_line(error)}') from None
+    # The library has checked the header but returns no metadata for bytes.
+    return arrays, json.loads(data[8:end]).get('__metadata__') or {}

@@ -1,9 +1,8 @@
-"""Inputs of actor and critic that know geometry: how far the goal is, how the object is symmetric.
+"""Network inputs made from observation and goal: the difference to the goal, object symmetry.
 
-They are functions of observation and goal alone, so an actor with them sees no more than one
-without them; it only need not learn to multiply quaternions, nor that a cube has no front. They are
-the same functions for NumPy arrays, with which actors run, and for torch tensors, with which they
-learn.
+The inputs are functions of observation and goal alone and add no information. They spare the
+network from learning quaternion products and symmetries. The same functions serve NumPy arrays
+(running actors) and torch tensors (training).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy as np
 
 from msgs_spec.tasks import GoalKind, TaskSpec
 
-# A NumPy array or a torch tensor; functions return what they are given.
+# A NumPy array or a torch tensor; functions return the same kind.
 Array = Any
 # Observation (..., observation size) and goal (..., goal size).
 Seen = tuple[Array, Array]
@@ -38,19 +37,21 @@ _POSITION_SCALES = {GoalKind.POINT: 10.0, GoalKind.POSE: 50.0, GoalKind.FINGERTI
 class RelativeGoal:
     """The difference between the desired goal and the achieved one, in the world frame.
 
-    Positions: 10 (Fetch) or 50 (hand) times the difference, clipped to +-5; for points also the
-    difference itself, because Fetch goals lie further away than the clip. Rotations: goal
-    quaternion times conjugate of the object's with its sign, because the `gymnasium` success rule
-    tells q from -q, and 10 times its vector part, clipped. For the pen, whose rotation about its
-    own axis does not count, the cross and dot products of the two axes take the place of the
-    quaternion. Parts that do not count for the task are zero, so that tasks of one object share
-    their networks.
+    - Positions: 10 (Fetch) or 50 (hand) times the difference, clipped to +-5. Points also have the
+      plain difference, because Fetch goals lie further away than the clip.
+    - Rotations: the quaternion from the achieved to the desired goal, and 10 times its vector part,
+      clipped. The quaternion keeps its sign, because the `gymnasium` success rule distinguishes q
+      from -q.
+    - Pen: rotations about its own axis do not count. The cross and dot products of the two axes
+      replace the quaternion.
+
+    Parts that do not count for the task are zero. So tasks with the same object can share networks.
 
     Attributes:
-        goal: What the goals are.
+        goal: Kind of goal.
         start: Index of the achieved goal in the observation.
         position_counts: Whether the position of a pose goal counts.
-        ignores_z_rotation: Whether the rotation about the object's own z axis does not count.
+        ignores_z_rotation: Whether rotations about the object's own z axis do not count.
     """
 
     goal: GoalKind
@@ -60,30 +61,29 @@ class RelativeGoal:
 
     @property
     def difference_size(self) -> int:
-        """Number of values of `difference`."""
+        """Length of `difference`."""
         return {GoalKind.POINT: 6, GoalKind.FINGERTIPS: 15, GoalKind.POSE: 10}[self.goal]
 
     def size(self, observation_size: int, goal_size: int) -> int:
-        """Number of inputs: observation, goal and the difference."""
+        """Return the number of inputs: observation, goal and difference."""
         return observation_size + goal_size + self.difference_size
 
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Inputs (..., size), from what is seen in the units of the task and normalised.
+        """Return the inputs (..., size): normalised observation and goal, then the difference.
 
-        They are the normalised observation and goal, then the difference.
+        Args:
+            seen: Observation and goal in the units of the task.
+            normalized: Observation and goal, normalised.
         """
         return _concatenate(*normalized, self.difference(*seen))
 
     def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
-        """Indices of the inputs that say where a pose goal is, not how it is turned.
-
-        They are the first three of the goal and the last three of the difference.
-        """
+        """Return the indices of the inputs that depend on the position of a pose goal."""
         end = self.size(observation_size, goal_size)
         return [*range(observation_size, observation_size + 3), *range(end - 3, end)]
 
     def difference(self, observation: Array, goal: Array) -> Array:
-        """The difference (..., difference_size) of both in the units of the task."""
+        """Return the difference (..., difference_size) of both in the units of the task."""
         achieved = observation[..., self.start : self.start + self.goal.size]
         scale = _POSITION_SCALES[self.goal]
         if self.goal is not GoalKind.POSE:
@@ -100,31 +100,30 @@ class RelativeGoal:
 
 @dataclass(frozen=True, slots=True)
 class SymmetricObject:
-    """Inputs that are the same for poses which no contact can tell apart.
+    """Inputs that are equal for poses of an object that differ only by its symmetry.
 
-    A cube turned onto another face is the same cube, an egg or a pen turned about its axis or
-    upside down the same egg or pen. Instead of the object's quaternion the networks see polynomials
-    of its rotation matrix that its symmetry leaves as they are and that determine it up to that
-    symmetry: of a cube the sum of the fourth tensor powers of its three axes, of a body of
-    revolution the second power of its axis. Its angular velocity is in the world frame, the goal is
-    seen as `RelativeGoal.difference` alone.
+    A cube looks the same on another face. An egg or a pen looks the same when turned about its axis
+    or upside down. Polynomials of the rotation matrix replace the object's quaternion. They are
+    invariant under the symmetry and determine the rotation up to it: for a cube the sum of the
+    fourth tensor powers of its three axes, for a body of revolution the second power of its axis.
+    The angular velocity is in the world frame. The goal appears only in `RelativeGoal.difference`.
 
     Attributes:
         relative: The difference to the goal.
-        symmetry: `cube`, or `revolution` for a body that also looks alike upside down.
+        symmetry: `cube`, or `revolution` for a body of revolution that can be turned upside down.
     """
 
     relative: RelativeGoal
     symmetry: str
 
     def size(self, observation_size: int, goal_size: int) -> int:
-        """Number of inputs: shape and world velocity instead of 7 values, and the difference."""
+        """Return the number of inputs; shape and velocity replace 7 values of the observation."""
         del goal_size
         shape_size = 15 if self.symmetry == 'cube' else 6
         return observation_size - 7 + shape_size + 3 + self.relative.difference_size
 
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Inputs (..., size); the object's velocity must precede its pose in the observation."""
+        """Return the inputs (..., size); in the observation, the velocity precedes the pose."""
         (observation, goal), (normalized_observation, _) = seen, normalized
         start = self.relative.start
         rotation = _rotation_matrix(observation[..., start + 3 : start + 7])
@@ -139,20 +138,20 @@ class SymmetricObject:
         )
 
     def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
-        """As `RelativeGoal` has them: the last three of the difference."""
+        """Return the indices of the inputs that depend on the position of a pose goal."""
         end = self.size(observation_size, goal_size)
         return [*range(end - 3, end)]
 
 
 GoalFeatures = RelativeGoal | SymmetricObject
-"""What turns an observation and a goal into inputs of the networks."""
+"""Makes network inputs from an observation and a goal."""
 
 
 def goal_features(kind: str, spec: TaskSpec) -> GoalFeatures | None:
-    """Returns the features `kind` of a task; None for `plain`, observation and goal as they are.
+    """Return the features `kind` of a task; None for `plain`, observation and goal unchanged.
 
     Raises:
-        ValueError: If there is no such kind, or the task has no symmetric object.
+        ValueError: If the kind is unknown, or the task has no symmetric object.
     """
     if kind not in GOAL_FEATURES:
         raise ValueError(f'goal_features {kind!r}; allowed: {", ".join(GOAL_FEATURES)}')
@@ -164,12 +163,14 @@ def goal_features(kind: str, spec: TaskSpec) -> GoalFeatures | None:
     if kind == 'relative':
         return relative
     if spec.object_symmetry is None:
-        raise ValueError(f'goal_features symmetric: {spec.name} has no object pose as its goal')
+        raise ValueError(
+            f'goal_features symmetric is not possible: the goal of {spec.name} is no object pose'
+        )
     return SymmetricObject(relative, spec.object_symmetry)
 
 
 def _rotation_matrix(quaternion: Array) -> Array:
-    """Matrices (..., 3, 3) of unit quaternions wxyz."""
+    """Return the matrices (..., 3, 3) of unit quaternions wxyz."""
     w, x, y, z = _parts(quaternion)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -181,7 +182,7 @@ def _rotation_matrix(quaternion: Array) -> Array:
 
 
 def _cube_shape(rotation: Array) -> Array:
-    """Sum over the axes a of the products a_i a_j a_k a_l, (..., 15), centred and about +-1."""
+    """Return the sums over the axes a of a_i a_j a_k a_l, (..., 15), centred and about +-1."""
     second = _second_powers(rotation)
     xx, xy, xz, yy, yz, zz = (second[..., i, :] for i in range(6))
     products = [xx * second[..., i, :] for i in range(6)]
@@ -194,19 +195,19 @@ def _cube_shape(rotation: Array) -> Array:
 
 
 def _axis_shape(rotation: Array) -> Array:
-    """Products a_i a_j of the z axis a, (..., 6), centred and about +-1."""
+    """Return the products a_i a_j of the z axis a, (..., 6), centred and about +-1."""
     second = _second_powers(rotation[..., 2:]).squeeze(-1)
     return 1.5 * (second - _like(second, [1 / 3, 0, 0, 1 / 3, 0, 1 / 3]))
 
 
 def _second_powers(axes: Array) -> Array:
-    """Products xx, xy, xz, yy, yz, zz (..., 6, n) of the columns of (..., 3, n)."""
+    """Return xx, xy, xz, yy, yz, zz (..., 6, n) of the columns of (..., 3, n)."""
     x, y, z = (axes[..., i, :] for i in range(3))
     return _library(axes).stack([x * x, x * y, x * z, y * y, y * z, z * z], -2)
 
 
 def _relative_quaternion(achieved: Array, goal: Array) -> tuple[Array, Array]:
-    """Real part (..., 1) and vector part (..., 3) of goal times conjugate of achieved, wxyz."""
+    """Return real (..., 1) and vector part (..., 3) of goal times conjugate of achieved, wxyz."""
     real, vector = achieved[..., :1], achieved[..., 1:]
     goal_real, goal_vector = goal[..., :1], goal[..., 1:]
     scalar = (achieved * goal).sum(-1)[..., None]
@@ -214,7 +215,7 @@ def _relative_quaternion(achieved: Array, goal: Array) -> tuple[Array, Array]:
 
 
 def _axis_turn(achieved: Array, goal: Array) -> tuple[Array, Array]:
-    """Dot (..., 1) and cross product (..., 3) of the z axes of two quaternions wxyz."""
+    """Return dot (..., 1) and cross product (..., 3) of the z axes of two quaternions wxyz."""
     first, second = _z_axis(achieved), _z_axis(goal)
     return (first * second).sum(-1)[..., None], _cross(first, second)
 
@@ -226,7 +227,7 @@ def _z_axis(quaternion: Array) -> Array:
 
 
 def _library(array: Array) -> ModuleType:
-    """NumPy or torch, whichever the array belongs to: the names used here are theirs alike."""
+    """Return the library of an array, NumPy or torch; the names used here exist in both."""
     if isinstance(array, np.ndarray):
         return np
     import torch
@@ -235,21 +236,21 @@ def _library(array: Array) -> ModuleType:
 
 
 def _concatenate(*parts: Array) -> Array:
-    """The parts one after the other along the last axis."""
+    """Concatenate along the last axis."""
     return _library(parts[0]).concatenate(parts, -1)
 
 
 def _like(array: Array, values: list[float]) -> Array:
-    """The values as an array of the same kind."""
+    """Return the values as an array of the same kind."""
     return np.asarray(values) if isinstance(array, np.ndarray) else array.new_tensor(values)
 
 
 def _parts(array: Array) -> list[Array]:
-    """What lies along the last axis, one by one."""
+    """Return the slices along the last axis."""
     return [array[..., i] for i in range(array.shape[-1])]
 
 
 def _cross(first: Array, second: Array) -> Array:
-    """Cross product of vectors (..., 3)."""
+    """Return the cross product of vectors (..., 3)."""
     library = _library(first)
     return np.cross(first, second) if library is np else library.linalg.cross(first, second)

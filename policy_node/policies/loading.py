@@ -1,23 +1,37 @@
-"""Load a policy by one name, in every format that the node and the commands accept."""
+"""Load a policy of any format by its name."""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from msgs_spec.tasks import TASKS, TaskSpec, task_spec
+from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.text import one_line
-from policy_node.policies.policy import LoadedPolicy, Policy, RandomPolicy, RestingPolicy
-from policy_node.policies.python_policy import is_python_name, load_python
+from policy_node.policies.policy import (
+    LoadedPolicy,
+    Observation,
+    Policy,
+    RandomPolicy,
+    RestingPolicy,
+)
 from policy_node.policies.shipped import actor_path, shipped_actors, shipped_name
 
 if TYPE_CHECKING:
     from policy_node.policies.actor import Actor
 
 RANDOM, RESTING, ROBUST = 'random', 'resting', 'robust'
+# The first answers of a library take longest.
 _WARM_UP_CALLS = 20
+_PYTHON_NAME = re.compile(r'[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*')
 # For help texts and descriptions of parameters.
 POLICY_NAMES = (
     'a shipped actor (FetchReach), a file (.safetensors, .onnx; .zip of Stable-Baselines3 if you '
@@ -28,18 +42,18 @@ POLICY_NAMES = (
 
 
 class TaskMissing(ValueError):
-    """A policy that fits any task, or does not say which, was asked for without one."""
+    """A policy that does not name its task was loaded without a task."""
 
 
 def load_actor(name_or_path: str | Path, task: str | None = None) -> Actor:
-    """Loads an actor as a torch module, ready to `predict` on the CPU.
+    """Load an actor as a torch module, ready to `predict` on the CPU.
 
     Args:
         name_or_path: Task name of a shipped actor (`FetchReach`), or a checkpoint file.
-        task: Refuse a checkpoint of any other task.
+        task: Reject a checkpoint of any other task.
 
     Raises:
-        ValueError: If there is no such actor or it does not fit; one line says why.
+        ValueError: If the actor is unknown or invalid; the message is one line.
     """
     from policy_node.policies import checkpoint
 
@@ -49,42 +63,52 @@ def load_actor(name_or_path: str | Path, task: str | None = None) -> Actor:
 def load_policy(
     name: str | Path = '', task: str | None = None, *, trust: bool = False
 ) -> LoadedPolicy:
-    """Loads the policy called `name`; torch is imported only for those of Stable-Baselines3.
+    """Load a policy and try it once. Only models of Stable-Baselines3 need torch.
 
     Args:
-        name: Task name of a shipped actor; file of an actor of this project, as checkpoint or ONNX;
-            .zip of Stable-Baselines3; `module:function` of somebody's code (`python_policy.py`);
-            `random`, `resting`; '' for the shipped actor of `task`, `robust` for its robust one.
-        task: Refuse a policy of any other task. Needed where the name does not tell.
-        trust: Whether code may be run: a .zip of Stable-Baselines3 holds some, a function is some.
+        name: Task name of a shipped actor, a file (`.safetensors`, `.onnx`, `.zip` of
+            Stable-Baselines3), `module:function`, `random`, `resting`, `robust` for the robust
+            shipped actor of `task`, or '' for the usual one. A function gets the task name. It
+            returns an object with `predict`, or a function from one observation to one action.
+        task: Reject a policy of any other task. Required if the policy does not name its task.
+        trust: Allow policies that run code of their own: `.zip` files and `module:function`.
 
     Raises:
         TaskMissing: If the policy needs a task and none is given.
-        ValueError: If there is no such policy, or it does not fit; one line says why.
+        ValueError: If the policy is unknown, invalid or fails; the message is one line.
     """
     name = str(name)
     if name in (RANDOM, RESTING):
         return _untrained(name, task)
     if is_python_name(name) and not Path(name).exists():
-        loaded = _made_by(name, task, trust)
+        if not trust:
+            raise ValueError(
+                f'{name} runs code. If you trust it, add --trust (policy_node: trust:=true)'
+            )
+        loaded = _load_python(name, _require_task(name, task))
     else:
         if name in ('', ROBUST):
             path = _shipped(task, name)
         else:
             path = actor_path(name, (RANDOM, RESTING, ROBUST))
         loaded = _read(path, task, trust)
-    _try_out(loaded, task_spec(loaded.task))
+    spec = task_spec(loaded.task)
+    goal = np.zeros(spec.goal.size)
+    zeros = {'observation': np.zeros(spec.observation_size), 'achieved_goal': goal}
+    for _ in range(_WARM_UP_CALLS):
+        loaded.predict(zeros | {'desired_goal': goal})
     return loaded
 
 
 def _untrained(name: str, task: str | None) -> LoadedPolicy:
-    size = task_spec(_require_task(name, task)).robot.action_size
+    task = _require_task(name, task)
+    size = task_spec(task).robot.action_size
     policy: Policy = RandomPolicy(size) if name == RANDOM else RestingPolicy(size)
-    return LoadedPolicy(policy, _require_task(name, task), f'a {name} policy')
+    return LoadedPolicy(policy, task, f'a {name} policy')
 
 
 def _shipped(task: str | None, kind: str) -> Path:
-    """Return the shipped policy of a task: the usual one (kind ''), or the robust one."""
+    """Return the shipped actor of a task: the usual one (kind ''), or the robust one."""
     what = f'{kind} actor' if kind else 'actor'
     task, shipped = _require_task(f'the shipped {what}', task), shipped_actors()
     if shipped_name(task, kind) not in shipped:
@@ -97,7 +121,7 @@ def _shipped(task: str | None, kind: str) -> Path:
 
 
 def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:
-    """Reads a file by the ending of its name; each format brings its own libraries."""
+    """Read a file by its suffix; each format imports its own libraries."""
     if path.suffix == '.onnx':
         from policy_node.policies.onnx import load_onnx
 
@@ -107,22 +131,13 @@ def _read(path: Path, task: str | None, trust: bool) -> LoadedPolicy:
 
         if not trust:
             raise ValueError(
-                f'{path} is a model of Stable-Baselines3: loading it runs the code in it; if you '
-                'trust who made it, say so (--trust; trust:=true for policy_node)'
+                f'{path} is a model of Stable-Baselines3, which can run code when it is loaded. '
+                'If you trust its author, add --trust (policy_node: trust:=true)'
             )
         return load_stable_baselines3(path, _require_task(path.name, task))
     from policy_node.policies.numpy_actor import load_checkpoint
 
     return load_checkpoint(path, task)
-
-
-def _made_by(name: str, task: str | None, trust: bool) -> LoadedPolicy:
-    if not trust:
-        raise ValueError(
-            f'{name} is code that would be run; if you trust it, say so (--trust; trust:=true for '
-            'policy_node)'
-        )
-    return load_python(name, _require_task(name, task))
 
 
 def _require_task(name: str, task: str | None) -> str:
@@ -131,22 +146,69 @@ def _require_task(name: str, task: str | None) -> str:
     return task
 
 
-def _try_out(loaded: LoadedPolicy, spec: TaskSpec) -> None:
-    """Refuses a policy that cannot answer; the first answers of a library take longest, too."""
-    zeros = {
-        'observation': np.zeros(spec.observation_size),
-        'achieved_goal': np.zeros(spec.goal.size),
-        'desired_goal': np.zeros(spec.goal.size),
-    }
+# Policies of the user's own code.
+
+
+class _FunctionPolicy:
+    """A function from one observation to one action; it gets a batch row by row."""
+
+    def __init__(self, act: Callable[[Observation], Any]) -> None:
+        self._act = act
+
+    def predict(
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], None]:
+        del state, episode_start, deterministic
+        parts = {name: np.asarray(values) for name, values in observation.items()}
+        leading = parts['observation'].shape[:-1]
+        if not leading:
+            return np.asarray(self._act(parts)), None
+        rows = [
+            self._act({name: values[index] for name, values in parts.items()})
+            for index in np.ndindex(leading)
+        ]
+        return np.reshape(np.asarray(rows), (*leading, -1)), None
+
+
+def is_python_name(name: str) -> bool:
+    """Return whether this names a function of a module, such as `my_policies.reach:make`."""
+    return _PYTHON_NAME.fullmatch(name) is not None
+
+
+@contextlib.contextmanager
+def working_directory_first() -> Iterator[None]:
+    """Find modules of the working directory first; afterwards find them last.
+
+    Executables search their own folder first. Later imports find their own modules again.
+    """
+    here = os.getcwd()
+    sys.path.insert(0, here)
     try:
-        for _ in range(_WARM_UP_CALLS):
-            action, _ = loaded.predict(zeros)
-        action = np.asarray(action, dtype=np.float64)
-    except Exception as error:
-        # Libraries raise types of their own for a model that loads but does not run.
-        raise ValueError(f'{loaded.description} does not run: {one_line(error)}') from None
-    if action.shape != (spec.robot.action_size,) or not np.isfinite(action).all():
+        yield
+    finally:
+        sys.path.remove(here)
+        sys.path.append(here)
+
+
+def _load_python(name: str, task: str) -> LoadedPolicy:
+    """Import a module, also from the working directory, and call its function with the task."""
+    module_name, _, function_name = name.partition(':')
+    try:
+        with working_directory_first():
+            made = getattr(import_module(module_name), function_name)(task)
+        control_hz = getattr(made, 'control_hz', None)
+        control_hz = None if control_hz is None else float(control_hz)
+    except (Exception, SystemExit) as error:
+        problem = f'{type(error).__name__}: {one_line(error)}'
+        raise ValueError(f'{name} returned no policy: {problem}') from None
+    if not (callable(made) or hasattr(made, 'predict')):
         raise ValueError(
-            f'{loaded.description} answers with {one_line(action)}; '
-            f'allowed: {spec.robot.action_size} finite numbers'
+            f'{name} returned {one_line(type(made).__name__)}; allowed: an object with predict, or '
+            'a function from observation to action'
         )
+    policy: Policy = made if hasattr(made, 'predict') else _FunctionPolicy(made)
+    return LoadedPolicy(policy, task, name, control_hz)

@@ -1,4 +1,4 @@
-"""What determines the network of an actor: sizes, inputs and the names of its tensors."""
+"""The shape of an actor's network: sizes, inputs and names of its tensors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class NetworkShape:
         action_size: Length of the action.
         hidden_sizes: Width of each hidden layer.
         layer_norm: Whether a LayerNorm precedes each activation.
-        goal_features: How observation and goal become inputs; None for both as they are.
+        goal_features: Inputs made from observation and goal; None for the plain ones.
         past_actions: Number of past actions among the inputs, after the observation.
     """
 
@@ -35,7 +35,7 @@ class NetworkShape:
 
     @property
     def past_size(self) -> int:
-        """Length of the past actions."""
+        """Total length of the past actions."""
         return self.past_actions * self.action_size
 
     @property
@@ -62,18 +62,18 @@ class NetworkShape:
 
     @property
     def layer_names(self) -> list[str]:
-        """Names of the hidden layers in `Actor`; a LayerNorm has the number after its layer's."""
+        """Names of the hidden layers in `Actor`; the LayerNorm of layer i is `norm_names[i]`."""
         stride = 3 if self.layer_norm else 2
         return [f'network.hidden.{stride * i}' for i in range(len(self.hidden_sizes))]
 
     @property
     def norm_names(self) -> list[str]:
-        """Names of the LayerNorms in `Actor`, in the order of the layers they follow."""
+        """Names of the LayerNorms in `Actor`; empty without `layer_norm`."""
         count = len(self.hidden_sizes) if self.layer_norm else 0
         return [f'network.hidden.{3 * i + 1}' for i in range(count)]
 
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Name and shape of every tensor in the state of an `Actor`, without making one."""
+        """Return the shape of every tensor in the state of an `Actor`, by name."""
         shapes: dict[str, tuple[int, ...]] = {}
         for part, size in (('observation', self.input_size), ('goal', self.goal_size)):
             for statistic in ('mean', 'std'):

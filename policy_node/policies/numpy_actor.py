@@ -1,11 +1,11 @@
-"""The actor as it acts: NumPy alone, which starts seconds before torch and answers sooner.
+"""The actor in NumPy alone, for running: it loads seconds faster than torch and answers faster.
 
-It computes in float64 with the float32 weights and rounds the action to float32, so that neither
-the size of a batch nor the order in which a library adds changes more than, rarely, the last bit.
-torch computes in float32 throughout; `docs/training.md` has the difference.
+It computes in float64 with the float32 weights and rounds the action to float32. So the batch size
+and the order of sums rarely change more than the last bit. torch computes in float32;
+`docs/training.md` has the difference.
 
-One thread: matrices of this size gain nothing from more, and the threads of a BLAS wait busily, on
-cores that the simulation needs.
+It uses one thread. Matrices of this size gain nothing from more, and waiting BLAS threads would
+take cores from the simulation.
 """
 
 from __future__ import annotations
@@ -23,20 +23,25 @@ from threadpoolctl import ThreadpoolController
 from msgs_spec.arrays import Array
 from policy_node.policies import checkpoint
 from policy_node.policies.network_shape import INPUT_CLIP, NORMALIZED_CLIP, NetworkShape
-from policy_node.policies.past_actions import past_after, past_before
-from policy_node.policies.policy import LoadedPolicy, Observation, observation_and_goal
+from policy_node.policies.policy import (
+    LoadedPolicy,
+    Observation,
+    observation_and_goal,
+    past_after,
+    past_before,
+)
 
-# As torch.nn.LayerNorm.
+# The default of torch.nn.LayerNorm.
 _NORM_EPSILON = 1e-5
-# Two that set the number of threads and set it back between each other would leave it at one.
+# Two overlapping changes of the number of threads would leave it at one.
 _ONE_AT_A_TIME = Lock()
 
 
 class NumpyActor:
-    """Deterministic policy: multilayer perceptron with tanh output on normalised inputs.
+    """Deterministic policy: a multilayer perceptron with tanh output on normalised inputs.
 
     Args:
-        shape: Its sizes.
+        shape: Sizes of the network.
         tensors: Weights and normalisers by their names in `Actor`.
     """
 
@@ -51,23 +56,10 @@ class NumpyActor:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """Returns the action for one observation or a batch.
-
-        Args:
-            observation: `observation` (..., observation_size) and `desired_goal` (..., goal_size)
-                in the units of the task, where one of them may be one for the whole batch; other
-                keys are ignored.
-            state: What the last call returned; None at the start of an episode. Ignored by an
-                actor without past actions.
-            episode_start: Booleans (...,), True where an episode starts.
-            deterministic: Ignored: the policy has no noise.
-
-        Returns:
-            Actions (..., action_size) in [-1, 1], float32, and the state for the next call; None
-            for an actor without past actions.
+        """Return actions (..., action_size), float32, and the state, as `Actor.predict` does.
 
         Raises:
-            ValueError: If a part is missing or has the wrong length, or their batches do not fit.
+            ValueError: If a part is missing or has a wrong shape.
         """
         del deterministic
         shape = self.shape
@@ -121,12 +113,12 @@ class NumpyActor:
 
 @cache
 def _blas() -> ThreadpoolController:
-    """The libraries behind NumPy's matrix products."""
+    """Return the libraries of NumPy's matrix products."""
     return ThreadpoolController().select(user_api='blas')
 
 
 def load_checkpoint(path: Path, task: str | None = None) -> LoadedPolicy:
-    """Loads a checkpoint to act with.
+    """Load a checkpoint for running.
 
     Raises:
         ValueError: As `checkpoint.read`.

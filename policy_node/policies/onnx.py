@@ -1,13 +1,12 @@
 """Actors as ONNX files: written by `fetch_hand_sim export`, run without torch.
 
 The graph takes `observation` (n, observation size) and `desired_goal` (n, goal size), float32, in
-the units of the task, normalisation included, and returns `action` (n, action size) in [-1, 1]. The
-file's metadata are those of a checkpoint.
+the units of the task. It normalises them and returns `action` (n, action size) in [-1, 1]. The
+metadata are those of a checkpoint.
 
-A few hundred bytes of ONNX can ask for gigabytes, so a file is first loaded and run once in a
-process of its own, whose memory and time are limited: `python -m policy_node.policies.onnx`. That
-bounds what it costs to load a file and to answer one observation; only a graph that was made to
-cost more for other observations is not found out.
+A few hundred bytes of ONNX can request gigabytes. So a file first runs once in its own process,
+`python -m policy_node.policies.onnx`, with limited memory and time. This limits the cost of loading
+and of one observation; a crafted graph can still cost more for other observations.
 """
 
 from __future__ import annotations
@@ -30,34 +29,34 @@ from policy_node.policies.policy import LoadedPolicy, Observation, observation_a
 
 INPUTS = ('observation', 'desired_goal')
 OUTPUT = 'action'
-# Entry `location` of a tensor whose weights are in another file, in protobuf's encoding.
+# Field `location` of a tensor with weights in another file, encoded by protobuf.
 _EXTERNAL = b'\n\x08location\x12'
 
-# Limits of the trial: 100 MiB and .1 s go to onnxruntime itself.
+# Limits of the trial; onnxruntime itself needs 100 MiB and 0.1 s.
 _TRIAL_MEMORY = 400 * 2**20
 _TRIAL_CPU_SECONDS = 2
 _TRIAL_TIMEOUT = 30.0
 
 
 class OnnxActor:
-    """Runs the bytes of an ONNX file on one thread.
+    """Run an ONNX file on one thread.
 
     Args:
-        data: The file.
-        path: Its name, for errors.
+        data: Contents of the file.
+        path: Its path, for errors.
 
     Attributes:
-        info: What its metadata say about the actor.
+        info: The metadata of the actor.
 
     Raises:
-        ValueError: If onnxruntime is missing, or the file is no actor of this project or does not
-            fit its task; one line says why.
+        ValueError: If onnxruntime is missing, or the file is invalid or does not fit its task. The
+            message is one line.
     """
 
     def __init__(self, data: bytes, path: Path) -> None:
         self._session = _session(data, path)
         metadata = self._session.get_modelmeta().custom_metadata_map
-        # Files from before the version was written are of the first.
+        # Old files have version 1 and do not contain it.
         self.info: ActorInfo = parse_metadata({'format_version': '1', **metadata}, path)
         self._check_sizes(path)
 
@@ -68,7 +67,7 @@ class OnnxActor:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Returns the action (..., action size) in [-1, 1] for one observation or a batch."""
+        """Return actions (..., action size) in [-1, 1] for one observation or a batch."""
         del state, episode_start, deterministic
         sizes = self.info.shape.observation_size, self.info.goal_size
         parts = dict(zip(INPUTS, observation_and_goal(observation, *sizes), strict=True))
@@ -90,14 +89,14 @@ class OnnxActor:
 
 
 def load_onnx(path: Path, task: str | None = None) -> LoadedPolicy:
-    """Loads an ONNX file to act with.
+    """Load an ONNX file for running.
 
     Raises:
-        ValueError: If it cannot be used, costs too much, or was trained on another task.
+        ValueError: If it is invalid, needs too much memory or time, or was trained on another task.
     """
     data = read_file(path)
     if _EXTERNAL in data:
-        # They would be read from the working directory, and the SHA-256 would not cover them.
+        # onnxruntime would read them from the working directory; the SHA-256 would not cover them.
         raise ValueError(f'{path} keeps weights in other files; allowed: one file with all weights')
     _require_onnxruntime(path)
     _try_out(data, path)
@@ -123,13 +122,13 @@ def _session(data: bytes, path: Path) -> Any:
     try:
         return onnxruntime.InferenceSession(data, options, providers=['CPUExecutionProvider'])
     except Exception as error:
-        # onnxruntime raises a type of its own for each kind of damage.
+        # onnxruntime raises its own type for each kind of damage.
         raise ValueError(f'{path} is not a readable ONNX file: {one_line(error)}') from None
 
 
 def _try_out(data: bytes, path: Path) -> None:
-    """Raises ValueError for what cannot be loaded and run within the limits."""
-    # Python files of the working directory are none of ours.
+    """Load and run the file within the limits; raise ValueError if it fails."""
+    # -P: do not import modules of the working directory.
     command = [sys.executable, '-P', '-m', __name__, str(path)]
     environment = os.environ | {'PYTHONPATH': os.pathsep.join(p or os.getcwd() for p in sys.path)}
     try:
@@ -142,18 +141,18 @@ def _try_out(data: bytes, path: Path) -> None:
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise ValueError(f'{path} cannot be tried out: {one_line(error)}') from None
+        raise ValueError(f'{path} cannot be tried: {one_line(error)}') from None
     if trial.returncode == 1:
         raise ValueError(one_line(trial.stderr.decode(errors='replace')))
     if trial.returncode != 0:
         raise ValueError(
-            f'{path} needs more than {_TRIAL_MEMORY >> 20} MiB or {_TRIAL_CPU_SECONDS} s to answer '
-            f'one observation, which is the most allowed; its trial {_ending(trial.returncode)}'
+            f'{path} needs more than {_TRIAL_MEMORY >> 20} MiB or {_TRIAL_CPU_SECONDS} s for one '
+            f'observation, the largest values allowed; its trial {_ending(trial.returncode)}'
         )
 
 
 def _ending(code: int) -> str:
-    """How a process ended, by its return code as `subprocess` has it."""
+    """Describe how a process ended, from its return code in `subprocess`."""
     try:
         return f'was ended by {signal.Signals(-code).name}'
     except ValueError:
@@ -161,7 +160,7 @@ def _ending(code: int) -> str:
 
 
 def _trial(path: Path) -> int:
-    """Loads the file on standard input and runs it once; returns 1 with a line if it cannot."""
+    """Run the ONNX file on standard input once; return 1 after an error line if it fails."""
     data = sys.stdin.buffer.read()
     try:
         _require_onnxruntime(path)

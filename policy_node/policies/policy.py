@@ -1,4 +1,4 @@
-"""The interface of policies, and two policies without training."""
+"""The interface of policies, `LoadedPolicy` with checked answers, two untrained policies."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from msgs_spec.tasks import TASKS
+from msgs_spec.text import one_line
 
 Observation = Mapping[str, ArrayLike]
 
@@ -22,12 +25,12 @@ class Policy(Protocol):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Acts on one observation or on a batch.
+        """Return actions for one observation or a batch.
 
         Args:
             observation: `observation` (..., observation size), `achieved_goal` and `desired_goal`
                 (..., goal size) in the units of the task.
-            state: The state that the last call returned; None at the start of an episode.
+            state: State that the last call returned; None at the start of an episode.
             episode_start: Booleans (...,), True where an episode starts.
             deterministic: Without exploration noise.
 
@@ -38,16 +41,21 @@ class Policy(Protocol):
         ...
 
 
+class PolicyError(ValueError):
+    """A policy failed or returned an invalid action; the message is one line."""
+
+
 @dataclass(frozen=True, slots=True)
 class LoadedPolicy:
-    """A policy for one task and what is known about it.
+    """A policy for one task, whose answers are checked.
 
     Attributes:
-        policy: What acts.
+        policy: The policy itself, unchecked.
         task: Name of the task.
-        description: Who it is, for people.
-        control_hz: Action frequency it was trained at, Hz; None where any will do.
-        sha256: Fingerprint of its file; empty if it has none.
+        description: Format and file name, for logs and errors.
+        control_hz: Action frequency of its training, Hz; None if any frequency is allowed.
+        sha256: SHA-256 of its file; empty without a file.
+        is_bounded: Whether actions outside [-1, 1] are errors.
     """
 
     policy: Policy
@@ -55,6 +63,7 @@ class LoadedPolicy:
     description: str
     control_hz: float | None = None
     sha256: str = ''
+    is_bounded: bool = False
 
     def predict(
         self,
@@ -63,31 +72,55 @@ class LoadedPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Act as `policy` does; a policy without memory may take only the observation."""
-        if state is None and episode_start is None:
-            answer: Any = self.policy.predict(observation, deterministic=deterministic)
-        else:
-            answer = self.policy.predict(observation, state, episode_start, deterministic)
-        # A policy of the user's own may return the action alone.
-        return answer if isinstance(answer, tuple) and len(answer) == 2 else (answer, None)
+        """Return actions and state as `Policy.predict` does.
+
+        A policy without memory may take only the observation, and may return only the action.
+
+        Raises:
+            PolicyError: If the policy fails, or returns anything but finite numbers of the right
+                shape.
+        """
+        try:
+            shape = _action_shape(observation, TASKS[self.task].robot.action_size)
+            if state is None and episode_start is None:
+                answer: Any = self.policy.predict(observation, deterministic=deterministic)
+            else:
+                answer = self.policy.predict(observation, state, episode_start, deterministic)
+            if not (isinstance(answer, tuple) and len(answer) == 2):
+                answer = answer, None
+            action = np.asarray(answer[0])
+            is_finite = action.dtype.kind in 'iuf' and bool(np.isfinite(action).all())
+        except Exception as error:
+            # Libraries raise their own types, for single observations or for all.
+            problem = f'{type(error).__name__}: {one_line(error)}'
+            raise PolicyError(f'{self.description} fails: {problem}') from None
+        if action.shape != shape or not is_finite:
+            raise PolicyError(
+                f'{self.description} returned {one_line(action, 100)} of shape {action.shape}; '
+                f'allowed: finite numbers, shape {shape}'
+            )
+        if self.is_bounded and (np.abs(action) > 1.0).any():
+            raise PolicyError(
+                f'{self.description} returned {np.abs(action).max():g}; allowed: -1 ... 1'
+            )
+        return action, answer[1]
 
 
-# Apart from other streams of random numbers that a seed stands for.
-_OF_ACTIONS = 1
+# Keeps the random numbers of actions apart from those of resets with the same seed.
+_ACTION_STREAM = 1
 
 
 class RandomPolicy:
-    """Uniformly random actions, alike for equal seeds."""
+    """Uniformly random actions, equal for equal seeds."""
 
     def __init__(self, action_size: int, seed: int = 0) -> None:
         self._action_size = action_size
         self._generator = np.random.default_rng(seed)
-        self._of_rows: list[np.random.Generator] = []
+        self._row_generators: list[np.random.Generator] = []
 
     def start(self, seeds: Sequence[int]) -> None:
-        """Begins an episode in each row of a batch; equal seeds have equal actions from then on."""
-        # Not the numbers that resets draw from the same seeds.
-        self._of_rows = [np.random.default_rng((seed, _OF_ACTIONS)) for seed in seeds]
+        """Begin an episode in each row of a batch; rows with equal seeds get equal actions."""
+        self._row_generators = [np.random.default_rng((seed, _ACTION_STREAM)) for seed in seeds]
 
     def predict(
         self,
@@ -96,11 +129,11 @@ class RandomPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Returns actions (..., action size) in [-1, 1] for any observation."""
+        """Return random actions (..., action size) in [-1, 1]."""
         del state, episode_start, deterministic
         shape = _action_shape(observation, self._action_size)
-        if shape == (len(self._of_rows), self._action_size):
-            rows = [generator.uniform(-1.0, 1.0, shape[1:]) for generator in self._of_rows]
+        if shape == (len(self._row_generators), self._action_size):
+            rows = [generator.uniform(-1.0, 1.0, shape[1:]) for generator in self._row_generators]
             return np.array(rows, np.float32), None
         return self._generator.uniform(-1.0, 1.0, shape).astype(np.float32), None
 
@@ -118,7 +151,7 @@ class RestingPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Return zeros (..., action size) for any observation."""
+        """Return zeros (..., action size)."""
         del state, episode_start, deterministic
         return np.zeros(_action_shape(observation, self._action_size), np.float32), None
 
@@ -131,16 +164,10 @@ def _action_shape(observation: Observation, action_size: int) -> tuple[int, ...]
 def _require_mapping(observation: object, key: str) -> None:
     if not isinstance(observation, Mapping):
         given = type(observation).__name__
-        raise TypeError(f'an observation is a mapping with {key!r}, not of type {given}')
+        raise TypeError(f'observation of type {given}; allowed: a mapping with {key!r}')
 
 
-def observation_part(observation: Observation, key: str, size: int) -> NDArray[np.float32]:
-    """Returns one part of an observation (..., size), as actors take it.
-
-    Raises:
-        ValueError: If it is missing or has the wrong length.
-        TypeError: If the observation is no mapping, as one that was flattened.
-    """
+def _part(observation: Observation, key: str, size: int) -> NDArray[np.float32]:
     _require_mapping(observation, key)
     if key not in observation:
         raise ValueError(f'observation has no {key!r}; given: {", ".join(observation)}')
@@ -153,26 +180,60 @@ def observation_part(observation: Observation, key: str, size: int) -> NDArray[n
 def observation_and_goal(
     observation: Observation, observation_size: int, goal_size: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns observation and desired goal, (..., size) each, of as many rows.
+    """Return observation and desired goal, (..., size) each, with the same leading axes.
 
     One goal for a batch of observations, or one observation for several goals, is repeated.
 
     Raises:
-        ValueError: If a part is missing or has the wrong length, or the batches do not fit.
-        TypeError: If the observation is no mapping, as one that was flattened.
+        ValueError: If a part is missing or has a wrong shape.
+        TypeError: If the observation is not a mapping.
     """
-    seen = observation_part(observation, 'observation', observation_size)
-    goal = observation_part(observation, 'desired_goal', goal_size)
+    seen = _part(observation, 'observation', observation_size)
+    goal = _part(observation, 'desired_goal', goal_size)
     if seen.shape[:-1] == goal.shape[:-1]:
         return seen, goal
     try:
         leading = np.broadcast_shapes(seen.shape[:-1], goal.shape[:-1])
     except ValueError:
         raise ValueError(
-            f'observation has shape {seen.shape}, desired_goal {goal.shape}: allowed are batches '
-            'of one size, or a batch and one of the other'
+            f'observation has shape {seen.shape}, desired_goal {goal.shape}; allowed: batches of '
+            'equal size, or one of the two for a whole batch'
         ) from None
     return (
         np.broadcast_to(seen, (*leading, observation_size)),
         np.broadcast_to(goal, (*leading, goal_size)),
     )
+
+
+# Past actions, the memory of policies for robots with a delay.
+
+
+def past_before(
+    state: Any, episode_start: Any, leading: tuple[int, ...], size: int
+) -> NDArray[np.float32]:
+    """Return the past actions (*leading, size) before a prediction, newest first.
+
+    Args:
+        state: State that the last prediction returned; None at the start of all episodes.
+        episode_start: Booleans (*leading,), True where an episode starts; its past is zeros.
+        leading: Leading axes of the observation.
+        size: Number of past actions times the action size.
+
+    Raises:
+        ValueError: If the state belongs to another batch or policy.
+    """
+    past = np.zeros((*leading, size), np.float32)
+    if state is None:
+        return past
+    given = np.asarray(state, dtype=np.float32)
+    if given.shape != past.shape:
+        raise ValueError(f'state has shape {given.shape}; allowed: {past.shape}')
+    if episode_start is None:
+        return given
+    return np.where(np.asarray(episode_start, dtype=np.bool_)[..., None], past, given)
+
+
+def past_after(past: NDArray[np.float32], action: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the past actions after `action` (..., action size)."""
+    kept = past[..., : past.shape[-1] - action.shape[-1]]
+    return np.concatenate([action, kept], axis=-1).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The actors that come with the package; looking does not load torch."""
+"""The actors in this package, found without torch."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from pathlib import Path
 
 from msgs_spec.text import did_you_mean
 
-# What a run of `fetch_hand_sim train` leaves, and how the files of actors end.
+# The best actor of a run of `fetch_hand_sim train`, and the suffixes of policy files.
 _BEST_OF_A_RUN = 'best.safetensors'
-_ENDINGS = ('.safetensors', '.onnx', '.zip')
+_SUFFIXES = ('.safetensors', '.onnx', '.zip')
 
 
 def shipped_actors() -> dict[str, Path]:
-    """Returns task name -> checkpoint of the actors that come with the package."""
+    """Return task name -> checkpoint of the actors in this package."""
     folder = Path(__file__).parents[1] / 'actors'
-    # `<task>.training.safetensors` holds the critic of an actor.
+    # `<task>.training.safetensors` contains the critic of an actor.
     files = sorted(folder.glob('*.safetensors'))
     return {path.stem: path for path in files if '.' not in path.stem}
 
@@ -26,16 +26,16 @@ def shipped_name(task: str, kind: str) -> str:
     return f'{task}_{kind}' if kind else task
 
 
-def actor_path(name_or_path: str | Path, besides: Sequence[str] = ()) -> Path:
-    """Returns the file called `name_or_path`: the name of a shipped actor, or a file.
+def actor_path(name_or_path: str | Path, others: Sequence[str] = ()) -> Path:
+    """Return the file of a shipped actor, or the path if it is a file.
 
     Args:
-        name_or_path: The name or the file.
-        besides: Names of what is no file and would have been taken as well, for the error.
+        name_or_path: Name of a shipped actor, or a path.
+        others: Further names that the caller accepts, for the error.
 
     Raises:
-        ValueError: If there is neither; the message lists the shipped actors, or names the actor
-            in a folder that is a run.
+        ValueError: If neither exists. The message lists the shipped actors; for the folder of a
+            run it names its best actor.
     """
     shipped = shipped_actors()
     if str(name_or_path) in shipped:
@@ -46,16 +46,18 @@ def actor_path(name_or_path: str | Path, besides: Sequence[str] = ()) -> Path:
             return path
         is_run = (path / _BEST_OF_A_RUN).is_file()
     except OSError as error:
-        # Raised for a name that is too long, or a folder that may not be entered.
+        # For example a name that is too long, or a folder without permission.
         is_run, reason = False, f' ({error.strerror})'
     if is_run:
-        raise ValueError(f'no actor but a run: {path}; its best actor is {path / _BEST_OF_A_RUN}')
-    if path.suffix in _ENDINGS:
+        raise ValueError(
+            f'{path} is a run, not an actor; its best actor is {path / _BEST_OF_A_RUN}'
+        )
+    if path.suffix in _SUFFIXES:
         raise ValueError(f'no actor {str(path)!r}: there is no such file{reason}')
     names = ', '.join(shipped) or 'none'
-    others = f', {", ".join(map(repr, besides[:-1]))} or {besides[-1]!r}' if besides else ''
-    hint = did_you_mean(str(name_or_path), [*shipped, *besides])
+    choices = f', {", ".join(map(repr, others[:-1]))} or {others[-1]!r}' if others else ''
+    hint = did_you_mean(str(name_or_path), [*shipped, *others])
     raise ValueError(
         f'no actor {str(name_or_path)!r}{reason}; shipped: {names}; '
-        f'or the path of a file{others}{hint}'
+        f'or the path of a file{choices}{hint}'
     )

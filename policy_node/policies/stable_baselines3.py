@@ -1,7 +1,7 @@
-"""Actors that Stable-Baselines3 trained on the same dict observation: its `.zip` files.
+"""Models of Stable-Baselines3, trained on the same dict observation: its `.zip` files.
 
-Such a file holds pickles, and loading one runs the code in it: load only those you trust. It does
-not say which task or rate it was trained at, so only sizes can be checked. A model that was trained
+**Such a file contains pickles, and loading it can run code**: load only files of authors you trust.
+It contains neither task nor action frequency, so only sizes are checked. A model that was trained
 under `VecNormalize` needs its statistics in `vecnormalize.pkl` beside it.
 """
 
@@ -23,14 +23,14 @@ from msgs_spec.text import one_line
 from policy_node.policies.files import read_file, sha256
 from policy_node.policies.policy import LoadedPolicy, Observation
 
-# Packages of policy classes, and the algorithm that loads each.
+# Algorithm by package of the policy class.
 _ALGORITHMS = {
     'stable_baselines3.sac': 'SAC',
     'stable_baselines3.td3': 'TD3',
     'stable_baselines3.common': 'PPO',
     'sb3_contrib.tqc': 'TQC',
 }
-# A stored replay buffer class may ask for an environment, and any buffer for its full memory.
+# A stored replay buffer could require an environment or its full memory.
 _WITHOUT_TRAINING: dict[str, Any] = {
     'replay_buffer_class': None,
     'replay_buffer_kwargs': {},
@@ -38,19 +38,18 @@ _WITHOUT_TRAINING: dict[str, Any] = {
     'learning_rate': 0.0,
     'lr_schedule': lambda progress: 0.0,
 }
-# Unpacked; an actor and its critics of the paper's size have 10 MB with their optimisers.
-_LARGEST_CONTENTS = 256 * 2**20
-_LARGEST_DESCRIPTION = 16 * 2**20
+# Networks of the paper's size have 10 MB with optimisers.
+_LARGEST_FILE = 256 * 2**20
 # Statistics of `VecNormalize` beside a model, as rl-zoo3 names them.
 _STATISTICS = 'vecnormalize.pkl'
 
 
 class StableBaselines3Policy:
-    """A policy of that library, which explores unless it is told not to.
+    """A policy of a model; by default it acts without exploration.
 
     Args:
-        policy: The policy of a model.
-        statistics: The `VecNormalize` that it was trained under, or None.
+        policy: Policy of the model.
+        statistics: `VecNormalize` of its training, or None.
     """
 
     def __init__(self, policy: Any, statistics: Any = None) -> None:
@@ -64,7 +63,7 @@ class StableBaselines3Policy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Returns actions (..., action size) in [-1, 1] for one observation or a batch."""
+        """Return actions (..., action size) in [-1, 1] for one observation or a batch."""
         seen: Any = dict(observation)
         if self._statistics is not None:
             seen = self._statistics.normalize_obs(seen)
@@ -73,16 +72,12 @@ class StableBaselines3Policy:
 
 
 def load_stable_baselines3(path: Path, task: str) -> LoadedPolicy:
-    """Loads a model to act with, which runs the code in its file.
-
-    Args:
-        path: The file.
-        task: The task whose sizes it must have.
+    """Load a model for running; this can run code in its file.
 
     Raises:
-        ValueError: If the library is missing, the file cannot be read or its sizes do not fit.
+        ValueError: If the library is missing, the file is invalid or its sizes do not fit the task.
     """
-    data = read_file(path, _LARGEST_CONTENTS)
+    data = read_file(path, _LARGEST_FILE)
     algorithm = _algorithm(data, path)
     try:
         model = algorithm.load(io.BytesIO(data), device='cpu', custom_objects=_WITHOUT_TRAINING)
@@ -103,30 +98,25 @@ def load_stable_baselines3(path: Path, task: str) -> LoadedPolicy:
 
 
 def _statistics(file: Path) -> Any:
-    """Load the `VecNormalize` of a training, which runs the code in its file.
-
-    Raises:
-        ValueError: If the file cannot be read or holds something else.
-    """
+    """Load the `VecNormalize` of a training; this can run code in its file."""
     try:
-        statistics = pickle.loads(read_file(file, _LARGEST_DESCRIPTION))
+        statistics = pickle.loads(read_file(file))
         is_right = type(statistics).__name__ == 'VecNormalize' and statistics.obs_rms is not None
     except Exception as error:
         # Unpickling a file of another version can raise anything.
         raise ValueError(f'{file} cannot be loaded: {one_line(error)}') from None
     if not is_right:
-        raise ValueError(f'{file} holds {type(statistics).__name__}; allowed: VecNormalize')
+        raise ValueError(f'{file} contains {type(statistics).__name__}; allowed: VecNormalize')
     return statistics
 
 
 def _algorithm(data: bytes, path: Path) -> Any:
-    """The class that loads a file, told by the policy class in it."""
+    """Return the algorithm class of a file, found by the policy class in it."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
-            _check_contents(path, file)
             module = json.loads(file.read('data'))['policy_class']['__module__']
     except Exception as error:
-        # Each compression method raises types of its own for a damaged file.
+        # Each compression method raises its own types for a damaged file.
         line = one_line(error)
         raise ValueError(f'{path} is not a file of Stable-Baselines3: {line}') from None
     for package, name in _ALGORITHMS.items():
@@ -140,17 +130,6 @@ def _algorithm(data: bytes, path: Path) -> Any:
     raise ValueError(
         f'{path} has a policy of {one_line(module)}; allowed: {", ".join(_ALGORITHMS.values())}'
     )
-
-
-def _check_contents(path: Path, file: zipfile.ZipFile) -> None:
-    """A megabyte of zip can hold a gigabyte of zeros."""
-    total = sum(member.file_size for member in file.infolist())
-    description = file.getinfo('data').file_size
-    if total > _LARGEST_CONTENTS or description > _LARGEST_DESCRIPTION:
-        raise ValueError(
-            f'{path} unpacks to {total} bytes, {description} of them its description; '
-            f'allowed: {_LARGEST_CONTENTS} and {_LARGEST_DESCRIPTION}'
-        )
 
 
 def _check_sizes(path: Path, spec: TaskSpec, policy: Any) -> None:
@@ -167,7 +146,7 @@ def _check_sizes(path: Path, spec: TaskSpec, policy: Any) -> None:
         raise ValueError(f'{path} has shapes {found}; {spec.name} has {wanted}')
     limits = [getattr(policy.action_space, name, 0.0) for name in ('low', 'high')]
     if not (np.all(limits[0] == -1.0) and np.all(limits[1] == 1.0)):
-        # Whatever rescaled them in training is not in the file.
+        # The file does not contain the scaling of its training.
         raise ValueError(
             f'{path} has actions in {one_line(policy.action_space)}; allowed: -1 ... 1'
         )

@@ -7,6 +7,7 @@ import csv
 import io
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,25 +35,25 @@ from policy_node.training.evaluation.episodes import (
 )
 from policy_node.training.evaluation.table import print_table
 from policy_node.training.policy_options import (
-    CheckedPolicy,
     add_batch_options,
     add_disturbances_option,
     add_policy_options,
     add_reward_options,
     load_chosen_policy,
     make_chosen_simulation,
+    policy_errors,
     require_writable,
 )
 
 _NAME = 'fetch_hand_sim evaluate'
-# What `--json` without a file means.
+# `--json` without a file.
 _STDOUT = Path('-')
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parses the command line."""
+    """Parse the command line."""
     parser = CommandParser(prog=_NAME, description=__doc__)
-    add_policy_options(parser, former='--actor')
+    add_policy_options(parser)
     add_batch_options(parser, num_envs=100)
     add_disturbances_option(parser)
     add_reward_options(parser)
@@ -71,7 +72,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit status."""
+    """Run the command and return its exit code."""
     options = parse_arguments(arguments)
     return run_command(_NAME, lambda: _run(options))
 
@@ -84,7 +85,8 @@ def _run(options: argparse.Namespace) -> int:
         require_writable(file)
     if len({file.resolve() for file in files}) < len(files) and _is_replaced(files[0]):
         raise UsageError(f'--json and --csv are one file, {files[0]}: the second would replace it')
-    outcomes, code = _evaluate(options, simulation, CheckedPolicy(loaded))
+    with policy_errors():
+        outcomes, code = _evaluate(options, simulation, replace(loaded, is_bounded=True))
     report = {
         'policy': options.policy or loaded.task,
         'task': loaded.task,
@@ -98,7 +100,7 @@ def _run(options: argparse.Namespace) -> int:
         try:
             _show(report, options.json)
         finally:
-            # Nobody may read the table any more; the files are there for that.
+            # Also if the terminal was closed.
             _write(report, outcomes, options)
     except BrokenPipeError:
         raise
@@ -108,18 +110,18 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _disturbed(simulation: Simulation) -> dict[str, Any]:
-    """Return the disturbances for the report; nothing where there are none."""
+    """Return the disturbances for the report; empty without disturbances."""
     disturbances = simulation.disturbances
     return {} if disturbances.is_off else {'disturbances': disturbances.as_dict()}
 
 
 def _is_replaced(file: Path) -> bool:
-    """Whether writing takes away what was there, as of `/dev/null` or a pipe it does not."""
+    """Return whether writing replaces the contents; not so for `/dev/null` or a pipe."""
     return file.is_file() or not file.exists()
 
 
 def _show(report: dict[str, Any], json_file: Path | None) -> None:
-    """Prints the summary: a table, or JSON where that was asked for without a file."""
+    """Print the summary as a table, or as JSON for `--json` without a file."""
     if json_file == _STDOUT:
         print(to_json(report).decode(), end='', flush=True)
     else:
@@ -127,11 +129,7 @@ def _show(report: dict[str, Any], json_file: Path | None) -> None:
 
 
 def _write(report: dict[str, Any], outcomes: EpisodeOutcomes, options: argparse.Namespace) -> None:
-    """Writes the files that were asked for.
-
-    Raises:
-        OSError: If there is no room for one.
-    """
+    """Write the files of `--json` and `--csv`."""
     if options.json not in (None, _STDOUT):
         write_file(options.json, to_json(report))
     if options.csv is not None:
@@ -141,7 +139,7 @@ def _write(report: dict[str, Any], outcomes: EpisodeOutcomes, options: argparse.
 def _evaluate(
     options: argparse.Namespace, simulation: Simulation, policy: Policy
 ) -> tuple[EpisodeOutcomes, int]:
-    """Returns what happened and the exit code; after Ctrl-C what had happened by then."""
+    """Return the outcomes and the exit code; after Ctrl-C the outcomes until then."""
     finished: list[EpisodeOutcomes] = []
     with progress('episodes', options.episodes) as advance:
 
@@ -160,7 +158,7 @@ def _evaluate(
 
 
 def to_csv(outcomes: EpisodeOutcomes) -> bytes:
-    """A CSV file with a row per episode."""
+    """Return a CSV file with a row per episode."""
     names = EpisodeOutcomes.__slots__
     file = io.StringIO()
     writer = csv.writer(file, lineterminator='\n')

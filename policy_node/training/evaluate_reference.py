@@ -1,7 +1,7 @@
-"""`evaluate_reference`: success of an actor in Gymnasium-Robotics itself, by its own `is_success`.
+"""`evaluate_reference`: success of a policy in Gymnasium-Robotics itself, by its `is_success`.
 
-On MuJoCo >= 3.17 that package stops at an `assert` that compares an enum with a NumPy integer, so
-this has to run without asserts: `python -O -m policy_node.training.evaluate_reference`.
+On MuJoCo >= 3.17 an `assert` of that package fails, because it compares an enum with a NumPy
+integer. So run without asserts: `python -O -m policy_node.training.evaluate_reference`.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
 from policy_node.training.policy_options import (
     add_policy_options,
     load_chosen_policy,
+    policy_errors,
     require_writable,
 )
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parses the command line."""
+    """Parse the command line."""
     parser = CommandParser(prog='evaluate_reference', description=__doc__)
-    add_policy_options(parser, former='--actor')
+    add_policy_options(parser)
     add = parser.add_argument
     add('--episodes', type=whole_number(1), default=1000, help='default: 1000')
     seed = whole_number(0, LARGEST_SEED)
@@ -49,14 +50,16 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 def success_in_reference(
     policy: Policy, reference_id: str, ticks: int, seeds: Sequence[int]
 ) -> int:
-    """Counts the episodes that end in success.
+    """Return the number of episodes that end in success.
+
+    Each episode of a hand task gets a new environment, because the reference carries state from one
+    episode to the next.
 
     Args:
-        policy: What acts.
+        policy: The policy.
         reference_id: Environment of Gymnasium-Robotics, for example `FetchPush-v4`.
         ticks: Steps per episode.
-        seeds: Seed of each episode; each gets a fresh environment, because the reference's hand
-            tasks carry state from one episode to the next.
+        seeds: Seed of each episode.
     """
     warnings.filterwarnings('ignore')
     import gymnasium
@@ -81,14 +84,14 @@ def success_in_reference(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit status."""
+    """Run the command and return its exit code."""
     options = parse_arguments(arguments)
     return run_command('evaluate_reference', lambda: _run(options))
 
 
 def _run(options: argparse.Namespace) -> int:
     if __debug__:
-        raise UsageError('asserts are on; start it with python -O')
+        raise UsageError('asserts are enabled; start with python -O')
     loaded = load_chosen_policy(options)
     spec = task_spec(loaded.task)
     if loaded.control_hz not in (None, DEFAULT_CONTROL_HZ):
@@ -97,7 +100,8 @@ def _run(options: argparse.Namespace) -> int:
     if spec.reference_id is None:
         raise UsageError(f'{spec.name} is no task of Gymnasium-Robotics')
     report = _report_to_add_to(options.json)
-    successes = success_in_reference(loaded, spec.reference_id, spec.episode_ticks, seeds)
+    with policy_errors():
+        successes = success_in_reference(loaded, spec.reference_id, spec.episode_ticks, seeds)
     lower, upper = wilson_interval(successes, options.episodes)
     result = {
         'environment': spec.reference_id,
@@ -112,30 +116,17 @@ def _run(options: argparse.Namespace) -> int:
             flush=True,
         )
     finally:
-        # The terminal may be closed by now; the file keeps the result.
+        # Also if the terminal was closed.
         if options.json is not None:
-            _write(options.json, {**report, 'reference': result})
+            try:
+                write_file(options.json, to_json({**report, 'reference': result}))
+            except OSError as error:
+                raise CommandError(str(error)) from None
     return EXIT_SUCCESS
 
 
-def _write(file: Path, report: dict[str, Any]) -> None:
-    """Writes a JSON file.
-
-    Raises:
-        CommandError: If there is no room for it.
-    """
-    try:
-        write_file(file, to_json(report))
-    except OSError as error:
-        raise CommandError(str(error)) from None
-
-
 def _report_to_add_to(file: Path | None) -> dict[str, Any]:
-    """Return the contents of a JSON file, read before long evaluations.
-
-    Raises:
-        UsageError: If it cannot be written, or holds something else.
-    """
+    """Return the contents of the JSON file; it is read before the long evaluation."""
     if file is None:
         return {}
     require_writable(file)
@@ -144,7 +135,7 @@ def _report_to_add_to(file: Path | None) -> dict[str, Any]:
     except ValueError as error:
         raise UsageError(f'{file} is no JSON: {error}') from None
     if not isinstance(report, dict):
-        raise UsageError(f'{file} holds no JSON object that a result could be added to')
+        raise UsageError(f'{file} contains no JSON object, so no result can be added')
     return report
 
 

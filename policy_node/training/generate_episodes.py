@@ -34,20 +34,20 @@ from node_runtime.command_line import (
 )
 from policy_node.policies.policy import RandomPolicy
 from policy_node.training.policy_options import (
-    CheckedPolicy,
     add_batch_options,
     add_disturbances_option,
     add_policy_options,
     add_reward_options,
     load_chosen_policy,
     make_chosen_simulation,
+    policy_errors,
 )
 
 _NAME = 'fetch_hand_sim episodes generate'
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parses the command line."""
+    """Parse the command line."""
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_policy_options(parser)
     add_batch_options(parser, num_envs=64)
@@ -61,23 +61,21 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simulation]:
-    """Returns what makes the episodes, and its simulation.
+    """Return the generator of episodes and its simulation.
 
     Raises:
-        UsageError: If the policy is not found, or an option does not fit it.
+        UsageError: If the policy cannot be loaded, or an option does not fit it.
     """
     loaded = load_chosen_policy(options)
     simulation = make_chosen_simulation(options, loaded)
     context = RecordingContext(simulation, with_compiled_model=options.compiled_model)
     context.checkpoint_sha256 = loaded.sha256 or None
-    policy = CheckedPolicy(loaded, is_clipped=True)
-
     random = loaded.policy if isinstance(loaded.policy, RandomPolicy) else None
     state: Any = None
 
     def act(observation: Observation) -> NDArray[Any]:
         nonlocal state
-        action, state = policy.predict(observation, state)
+        action, state = loaded.predict(observation, state)
         return action
 
     def start(seeds: Sequence[int]) -> None:
@@ -90,7 +88,7 @@ def make_generator(options: argparse.Namespace) -> tuple[EpisodeGenerator, Simul
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
+    """Run the command and return its exit code."""
     options = parse_arguments(arguments)
     return run_command(_NAME, lambda: _run(options))
 
@@ -100,11 +98,11 @@ def _run(options: argparse.Namespace) -> int:
     if last > LARGEST_SEED:
         raise UsageError(f'the last seed would be {last}; allowed: 0 ... {LARGEST_SEED}')
     generator, simulation = make_generator(options)
-    _say_what_is_there(options, simulation.spec.name)
+    _warn_of_repeated_seeds(options, simulation.spec.name)
     began, cpu_began = time.perf_counter(), time.process_time()
     count = steps = successes = 0
     try:
-        with progress('episodes', options.episodes) as advance:
+        with policy_errors(), progress('episodes', options.episodes) as advance:
             for logged in generator.generate(options.episodes, options.first_seed):
                 count += 1
                 steps += logged.status.tick
@@ -123,18 +121,18 @@ def _run(options: argparse.Namespace) -> int:
     return EXIT_SUCCESS
 
 
-def _say_what_is_there(options: argparse.Namespace, task: str) -> None:
-    """Warns of episodes that would be in the folder twice, as who learns from it would not see."""
+def _warn_of_repeated_seeds(options: argparse.Namespace, task: str) -> None:
+    """Warn of episodes that the folder already contains; training would see them twice."""
     try:
         seeds = named_seeds(options.output, task)
     except OSError:
-        return  # Writing will report the error.
+        return  # Writing reports the error.
     series = range(options.first_seed, options.first_seed + options.episodes)
     if twice := sum(seed in seeds for seed in series):
         complain(
             _NAME,
-            f'{options.output} holds {twice} of these seeds of {task} already; --first-seed '
-            f'{max(seeds) + 1} goes on after them',
+            f'{options.output} already contains {twice} of these seeds of {task}; '
+            f'--first-seed {max(seeds) + 1} avoids them',
         )
 
 

@@ -1,46 +1,29 @@
-"""The options of commands that run a policy, and the policy they name."""
+"""The options of commands that run a policy, and the policy and simulation they choose."""
 
 from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
-from fetch_hand_sim.simulation.arguments import finite_numbers
-from msgs_spec.tasks import (
-    DEFAULT_CONTROL_HZ,
-    REWARD_TYPES,
-    SUCCESS_RULES,
-    TASKS,
-    task_spec,
-)
-from msgs_spec.text import one_line
-from node_runtime.command_line import CommandError, FormerOption, UsageError, complain, whole_number
+from msgs_spec.tasks import DEFAULT_CONTROL_HZ, REWARD_TYPES, SUCCESS_RULES, TASKS
+from node_runtime.command_line import CommandError, UsageError, whole_number
 from policy_node.policies.loading import POLICY_NAMES, load_policy
-from policy_node.policies.policy import LoadedPolicy, Observation
+from policy_node.policies.policy import LoadedPolicy, PolicyError
 
 
-def add_policy_options(parser: argparse.ArgumentParser, former: str | None = None) -> None:
-    """Adds `--policy`, `--task` and `--trust`.
-
-    Args:
-        parser: Gets them.
-        former: What `--policy` was called in this command.
-    """
+def add_policy_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--policy`, `--task` and `--trust`."""
     add = parser.add_argument
     add('--policy', default='', help=POLICY_NAMES)
-    if former is not None:
-        add(former, dest='policy', action=FormerOption, help=argparse.SUPPRESS)
     add('--task', choices=list(TASKS), metavar='TASK', help='default: the task of the policy')
     add(
         '--trust',
         action='store_true',
-        help='load a .zip of Stable-Baselines3, or module:function, which runs the code in it',
+        help='allow a .zip of Stable-Baselines3 or module:function, which run code of their own',
     )
 
 
@@ -61,69 +44,33 @@ def add_disturbances_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_reward_options(parser: argparse.ArgumentParser) -> None:
-    """Adds `--success-rule` and `--reward-type`."""
+    """Add `--success-rule` and `--reward-type`."""
     add = parser.add_argument
     add('--success-rule', choices=SUCCESS_RULES, default='gymnasium', help='of the reward')
     add('--reward-type', choices=REWARD_TYPES, default='sparse', help='of the return')
 
 
 def load_chosen_policy(options: argparse.Namespace) -> LoadedPolicy:
-    """Loads the policy that the options of `add_policy_options` name.
+    """Load the policy of the options of `add_policy_options`.
 
     Raises:
         UsageError: If the policy cannot be loaded.
     """
-    name: str = options.policy
-    if not name and options.task is None:
+    if not options.policy and options.task is None:
         raise UsageError(f'--policy is missing; allowed: {POLICY_NAMES}')
-    if name.startswith('sb3:'):
-        # Formerly sb3:<class>:<file.zip>; the file tells its class.
-        name = name.split(':', 2)[-1]
-        complain('--policy', f'sb3:<class>: is not needed any more; give {name} and --trust')
     try:
-        return load_policy(name, options.task, trust=options.trust)
+        return load_policy(options.policy, options.task, trust=options.trust)
     except ValueError as error:
         raise UsageError(str(error)) from None
 
 
-class CheckedPolicy:
-    """A policy whose failures and invalid actions end a command with one line.
-
-    Args:
-        loaded: The policy.
-        is_clipped: Accept actions beyond [-1, 1], because the caller clips them.
-    """
-
-    def __init__(self, loaded: LoadedPolicy, *, is_clipped: bool = False) -> None:
-        self._loaded = loaded
-        self._is_clipped = is_clipped
-        self._size = task_spec(loaded.task).robot.action_size
-
-    def predict(
-        self,
-        observation: Observation,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[Any], Any]:
-        """Asks the policy about a batch.
-
-        Raises:
-            CommandError: If it fails, or answers with something else than an action for each.
-        """
-        try:
-            answer, state = self._loaded.predict(observation, state, episode_start, deterministic)
-            shape = len(np.asarray(observation['observation'])), self._size
-            actions = finite_numbers('actions', answer, shape, self._loaded.task)
-            if not self._is_clipped and (np.abs(actions) > 1.0).any():
-                raise ValueError(f'actions lie in [-1, 1], not at {np.abs(actions).max():g}')
-        except Exception as error:
-            # Libraries raise types of their own.
-            kind = '' if isinstance(error, ValueError) else f'{type(error).__name__}: '
-            raise CommandError(
-                f'{self._loaded.description} fails: {kind}{one_line(error)}'
-            ) from None
-        return actions, state
+@contextmanager
+def policy_errors() -> Iterator[None]:
+    """End the command with one line if the policy fails."""
+    try:
+        yield
+    except PolicyError as error:
+        raise CommandError(str(error)) from None
 
 
 def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) -> Simulation:
@@ -147,10 +94,10 @@ def make_chosen_simulation(options: argparse.Namespace, loaded: LoadedPolicy) ->
 
 
 def require_writable(file: Path) -> None:
-    """Makes the folder of a file that will be written, so that no work is done for nothing.
+    """Create the folder of a file before long work, and check that the file can be written.
 
     Raises:
-        UsageError: If it could not be written.
+        UsageError: If it cannot.
     """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -158,9 +105,5 @@ def require_writable(file: Path) -> None:
         raise UsageError(f'{file} cannot be written: {error.strerror}') from None
     if file.is_dir():
         raise UsageError(f'{file} cannot be written: it is a folder')
-    needed = [file] if file.exists() else []
-    # A regular file is replaced by the new one, which its folder must take.
-    if not file.exists() or (file.is_file() and not file.is_symlink()):
-        needed.append(file.parent)
-    if not all(os.access(each, os.W_OK) for each in needed):
+    if not os.access(file if file.exists() else file.parent, os.W_OK):
         raise UsageError(f'{file} cannot be written: it is read-only')

@@ -183,7 +183,7 @@ def test_robots_in_other_namespaces_are_named(start_process: Start) -> None:
         assert line, lines
         lines.append(line)
     assert 'waiting for a robot on /episode_status' in lines[0]
-    assert 'no robot here: there is one in /arm1; join it with --ros-args -r __ns:=/arm1' in line
+    assert 'no robot here: found in /arm1; join it with --ros-args -r __ns:=/arm1' in line
     end(policy)
     end(sim)
 
@@ -228,9 +228,9 @@ def test_topics_that_a_robot_lacks_are_named(start_process: Start) -> None:
             reports = robot.reports('/policy_node')
             return str(reports[-1].message) if reports else ''
 
-        robot.spin_until(lambda: 'nobody publishes /joint_states, ' in line(), 'report')
+        robot.spin_until(lambda: 'no publisher of /joint_states, ' in line(), 'report')
     output = end(policy)
-    assert 'no state: nobody publishes /joint_states, ' in output
+    assert 'no state: no publisher of /joint_states, ' in output
     assert 'commands come from' not in output
 
 

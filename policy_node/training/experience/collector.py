@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Simulation
-from policy_node.policies.past_actions import past_after
-from policy_node.policies.policy import Policy
+from policy_node.policies.policy import Policy, past_after
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Held, Hierarchical
 from policy_node.training.experience.exploration import ActionNoise, ParameterNoise

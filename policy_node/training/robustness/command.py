@@ -11,6 +11,7 @@ import csv
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +37,11 @@ from policy_node.training.evaluation.episodes import (
     wilson_interval,
 )
 from policy_node.training.policy_options import (
-    CheckedPolicy,
     add_batch_options,
     add_policy_options,
     load_chosen_policy,
     make_chosen_simulation,
+    policy_errors,
     require_writable,
 )
 from policy_node.training.robustness.figure import draw
@@ -82,7 +83,8 @@ def _run(options: argparse.Namespace) -> int:
     for file in files.values():
         require_writable(file)
     result = _start(options, loaded, simulation, files['json'])
-    _measure(result, simulation, CheckedPolicy(loaded), files['json'])
+    with policy_errors():
+        _measure(result, simulation, replace(loaded, is_bounded=True), files['json'])
     success = {key: point['success'] for key, point in result['points'].items()}
     result['sentence'] = sentence(task_spec(loaded.task), result['control_hz'], success)
     write_file(files['json'], to_json(result))
@@ -125,7 +127,7 @@ def _start(
 
 
 def _measure(
-    result: dict[str, Any], simulation: Simulation, policy: CheckedPolicy, file: Path
+    result: dict[str, Any], simulation: Simulation, policy: LoadedPolicy, file: Path
 ) -> None:
     """Evaluate the points that are missing; write the file after each."""
     missing = [each for each in points(simulation.spec) if each.key not in result['points']]

@@ -12,13 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from policy_node.policies.files import LARGEST_POLICY, read_file, write_file
-from policy_node.policies.tensor_file import (
+from policy_node.policies.files import (
     LARGEST_HEADER,
+    LARGEST_POLICY,
     LARGEST_TENSOR_FILE,
-    parse_header,
     read_tensors,
     tensor_bytes,
+    write_file,
 )
 from policy_node.training.experience.statistics import RunningStatistics
 from policy_node.training.learners.actor_critic import HIGH_LEVEL, ActorCritic
@@ -149,8 +149,7 @@ def read_counters(path: Path) -> Counters:
     Raises:
         ValueError: If the file is no training state of this version, or damaged.
     """
-    metadata = parse_header(read_file(path, LARGEST_TENSOR_FILE), path).metadata
-    return _described(path, metadata)[0]
+    return _described(path, read_tensors(path)[1])[0]
 
 
 def read_state(path: Path) -> TrainingState:

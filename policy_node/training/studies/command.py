@@ -44,7 +44,7 @@ from node_runtime.command_line import (
     whole_number,
 )
 from policy_node.policies.files import write_file
-from policy_node.policies.python_policy import is_python_name, working_directory_first
+from policy_node.policies.loading import is_python_name, working_directory_first
 from policy_node.training.configuration.flat import whole, with_assignments
 from policy_node.training.configuration.recipes import FROM_NOTHING
 from policy_node.training.runs.run_folder import BEST_FILE

@@ -83,14 +83,14 @@ def test_layer_norm_changes_the_function_and_the_parameters() -> None:
 
 def test_predict_refuses_what_does_not_fit() -> None:
     actor, observation = make_actor(), make_observation(2)
-    with pytest.raises(ValueError, match="no 'desired_goal'; given: observation, achi"):
+    with pytest.raises(ValueError, match="'desired_goal'"):
         actor.predict({k: v for k, v in observation.items() if k != 'desired_goal'})
-    with pytest.raises(ValueError, match=r'has shape \(2, 9\); allowed: \(\.\.\., 10\)'):
+    with pytest.raises(ValueError, match=r'\(2, 9\)'):
         actor.predict({**observation, 'observation': observation['observation'][:, :9]})
 
 
 def test_an_unknown_actor_is_refused_with_the_names_of_the_shipped(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"no actor 'FetchFly'; shipped: .*FetchReach") as caught:
+    with pytest.raises(ValueError, match=r"'FetchFly'.*FetchReach") as caught:
         load_actor('FetchFly')
     assert '\n' not in str(caught.value)
     with pytest.raises(ValueError, match='no actor'):

@@ -77,8 +77,7 @@ def test_one_goal_may_be_that_of_a_whole_batch(load: Callable[[str], Policy]) ->
     one = {**batch, 'desired_goal': batch['desired_goal'][2]}
     each = {**batch, 'desired_goal': np.tile(one['desired_goal'], (5, 1))}
     np.testing.assert_array_equal(policy.predict(one)[0], policy.predict(each)[0])
-    message = r'observation has shape \(5, 25\), desired_goal \(4, 3\): allowed are batches of one'
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r'\(5, 25\), desired_goal \(4, 3\)'):
         policy.predict({**batch, 'desired_goal': batch['desired_goal'][:4]})
 
 
@@ -134,15 +133,15 @@ def test_no_name_is_the_shipped_actor_of_the_task(monkeypatch: pytest.MonkeyPatc
     others = {task: path for task, path in shipped_actors().items() if task != 'HandReach'}
     monkeypatch.setattr(loading, 'shipped_actors', lambda: others)
     assert load_policy('robust', 'FetchReach').description == 'actor FetchReach_robust.safetensors'
-    with pytest.raises(ValueError, match=r'no actor is shipped for HandReach .*FetchReach'):
+    with pytest.raises(ValueError, match=r'HandReach .*FetchReach'):
         load_policy('', 'HandReach')
-    with pytest.raises(ValueError, match=r'no robust actor is shipped for HandReach .*FetchReach'):
+    with pytest.raises(ValueError, match=r'robust .*HandReach .*FetchReach'):
         load_policy('robust', 'HandReach')
 
 
 @pytest.mark.parametrize('name', ['random', 'resting', ''])
 def test_a_task_that_is_missing_is_told_apart(name: str) -> None:
-    with pytest.raises(TaskMissing, match='needs a task; allowed: FetchReach, '):
+    with pytest.raises(TaskMissing, match='FetchReach, '):
         load_policy(name)
 
 
@@ -155,9 +154,7 @@ def test_a_file_in_the_home_directory_is_found_there(
 
 
 def test_unknown_and_unfitting_names_are_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(
-        ValueError, match=r"no actor 'zzz'; shipped: .*, 'random', 'resting' or 'robust'$"
-    ):
+    with pytest.raises(ValueError, match=r"'zzz'.*FetchReach.*'random', 'resting' or 'robust'$"):
         load_policy('zzz', 'FetchReach')
     for mistyped, meant in {'rnd': 'random', 'fetchreach': 'FetchReach'}.items():
         with pytest.raises(ValueError, match=rf"'robust'; did you mean '{meant}'\?$"):
@@ -166,12 +163,12 @@ def test_unknown_and_unfitting_names_are_refused_in_one_line(tmp_path: Path) -> 
         load_policy('FetchReach', 'FetchPush')
     with pytest.raises(ValueError, match='no actor'):
         load_policy(tmp_path)
-    with pytest.raises(ValueError, match=r"no actor 'x+' \(File name too long\); shipped: "):
+    with pytest.raises(ValueError, match='File name too long'):
         load_policy('x' * 300, 'FetchReach')
-    with pytest.raises(ValueError, match=r"no actor '.*gone\.onnx': there is no such file$"):
+    with pytest.raises(ValueError, match=r'gone.onnx'):
         load_policy(tmp_path / 'gone.onnx')
     (tmp_path / 'best.safetensors').touch()
-    with pytest.raises(ValueError, match=r'a run: .*; its best actor is .*/best\.safetensors$'):
+    with pytest.raises(ValueError, match=r'/best\.safetensors$'):
         load_policy(tmp_path)
 
 
@@ -206,7 +203,7 @@ def test_acting_needs_no_torch(name: str) -> None:
 @pytest.mark.parametrize('name', ['FetchReach', 'random'])
 def test_an_observation_that_was_flattened_is_said_to_be_no_mapping(name: str) -> None:
     policy = load_policy(name, 'FetchReach').policy
-    with pytest.raises(TypeError, match=r"is a mapping with 'observation', not of type ndarray"):
+    with pytest.raises(TypeError, match='ndarray'):
         policy.predict(np.zeros(16))  # type: ignore[arg-type]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.films.playing import film_episode
-from policy_node.policies.past_actions import past_after, past_before
+from policy_node.policies.policy import past_after, past_before
 
 
 def test_the_newest_action_comes_first_and_the_oldest_leaves() -> None:

@@ -14,8 +14,8 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
+from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.policies.shipped import shipped_actors
-from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.machine.host import available_memory

@@ -197,22 +197,6 @@ def test_an_actor_is_evaluated_at_the_rate_it_was_trained_at(tmp_path: Path) -> 
     assert -500.0 <= json.loads(json_file.read_text())['mean_return'] < -50.0
 
 
-def test_former_names_work_and_say_what_they_are_called_now(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ['--episodes', '2', '--threads', '1', '--task', 'FetchReach']
-    assert main(['--actor', 'resting', *arguments]) == 0
-    captured = capsys.readouterr()
-    assert 'FetchReach: resting, 2 episodes' in captured.out
-    assert captured.err == 'fetch_hand_sim evaluate: --actor is now called --policy\n'
-    path = tmp_path / 'model.zip'
-    path.write_bytes(b'')
-    assert main(['--policy', f'sb3:SAC:{path}', '--trust', *arguments]) == 2
-    captured = capsys.readouterr()
-    assert f'is not needed any more; give {path} and --trust' in captured.err
-    assert f'{path} is not a file of Stable-Baselines3' in captured.err
-
-
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
@@ -293,7 +277,7 @@ def test_ctrl_c_reports_the_episodes_that_are_finished(
 
 @pytest.mark.parametrize(
     ('content', 'message'),
-    [('{', 'is no JSON: '), ('[1]', 'holds no JSON object'), (None, 'cannot be written: ')],
+    [('{', 'is no JSON: '), ('[1]', 'contains no JSON object'), (None, 'cannot be written: ')],
 )
 def test_what_the_reference_cannot_add_to_is_said_before_it_plays(
     tmp_path: Path, content: str | None, message: str

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from policy_node import load_policy
+from policy_node.policies.files import read_tensors
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
-from policy_node.policies.tensor_file import read_tensors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.collector import Collector

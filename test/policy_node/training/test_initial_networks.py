@@ -13,9 +13,9 @@ import torch
 
 from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
+from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.policies.loading import load_actor
 from policy_node.policies.shipped import shipped_actors
-from policy_node.policies.tensor_file import read_tensors, write_tensors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.learners.network_shape import network_shape

@@ -24,7 +24,7 @@ import torch
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
-from policy_node.policies.tensor_file import read_tensors, write_tensors
+from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.evaluation.episodes import EpisodeOutcomes

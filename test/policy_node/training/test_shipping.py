@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from policy_node.policies.tensor_file import read_tensors, write_tensors
+from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.runs.run_log import RunLog

@@ -16,7 +16,7 @@ import torch
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
-from policy_node.policies.tensor_file import read_tensors
+from policy_node.policies.files import read_tensors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
