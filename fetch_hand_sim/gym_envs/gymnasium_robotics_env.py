@@ -7,9 +7,8 @@ endings are there; `docs/gymnasium_robotics.md` lists what is equal and what dif
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
-from importlib import import_module
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -17,13 +16,18 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fetch_hand_sim.gym_envs import joint_access
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
-from fetch_hand_sim.gym_envs.goal_env import import_goal_env
-from fetch_hand_sim.gym_envs.pictures import RENDER_MODES
+from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Image
+from fetch_hand_sim.gym_envs.reference import (
+    depth_in_metres,
+    import_goal_env,
+    mujoco_renderer,
+    mujoco_utils,
+)
 from fetch_hand_sim.simulation import Observation
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
+from fetch_hand_sim.simulation.tasks.hand import fingertip_sites
 from fetch_hand_sim.simulation.tasks.hand_manipulate import (
     MANIPULATE_CONFIGS,
     TARGET_RANGE,
@@ -57,20 +61,11 @@ CAMERAS: dict[str, dict[str, Any]] = {
 }
 
 
-# Functions of the reference that fail with today's MuJoCo.
-_JOINT_FUNCTIONS = (
-    'get_joint_qpos',
-    'get_joint_qvel',
-    'set_joint_qpos',
-    'set_joint_qvel',
-    'robot_get_obs',
-)
 # Hooks of the reference that nothing here would ask.
 _NOT_ASKED = (
     '_env_setup',
     '_initialize_simulation',
     '_mujoco_step',
-    '_render_callback',
     '_reset_sim',
     '_set_action',
     '_step_callback',
@@ -80,7 +75,7 @@ _NOT_ASKED = (
 def _refusal(hook: str) -> str:
     return (
         f'{hook} would have no effect here; what may be overridden: _sample_goal, _get_obs, '
-        '_is_success, compute_terminated, compute_truncated, compute_reward'
+        '_is_success, compute_terminated, compute_truncated, compute_reward, _render_callback'
     )
 
 
@@ -132,6 +127,8 @@ class RobotEnv(FetchHandEnv, GoalEnv):
             **arguments,
         )
         physics = self.simulation.task
+        self._target_sites = _sites(physics.model, 'target')
+        self._finger_sites = _sites(physics.model, 'finger')
         start = physics.new_data(physics.start_state)
         self._state(
             n_substeps=physics.substeps,
@@ -172,11 +169,14 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Starts an episode; options are ignored, as the reference does."""
-        return super().reset(seed=seed)
+        started = super().reset(seed=seed)
+        self._show_goal()
+        return started
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
         """Advances one tick, with the reference's types: sparse rewards and successes float32."""
         observation, reward, terminated, truncated, info = super().step(action)
+        self._show_goal()
         if not self.overrides('_is_success'):
             info['is_success'] = np.float32(info['is_success'])
         if not self.overrides('compute_reward'):
@@ -193,16 +193,40 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         """Whether there is an object beside the robot."""
         return self.spec_of_task.has_object
 
+    def render(self) -> Image | None:
+        """Return a picture, as `FetchHandEnv.render`, after a call of `_render_callback`.
+
+        Gymnasium's renderer draws it, with its cameras and markers, once `mujoco_renderer` was read
+        or if `_render_callback` is overridden.
+        """
+        if self.render_mode is None:
+            return None
+        self._render_callback()
+        if self._mujoco_renderer is None and not self.overrides('_render_callback'):
+            return super().render()
+        picture = self.mujoco_renderer.render(self.render_mode)
+        is_depth = self.render_mode == 'depth_array'
+        drawn: Image | None = depth_in_metres(self.model, picture) if is_depth else picture
+        return drawn
+
+    @property
+    def data(self) -> Any:
+        """As `FetchHandEnv.data`, with the goal at its place."""
+        data = super().data
+        self._show_goal()
+        return data
+
     @property
     def mujoco_renderer(self) -> Any:
-        """Gymnasium's renderer of `model` and `data`, without markers of the goal."""
+        """Gymnasium's renderer of `model` and `data`."""
         if self._mujoco_renderer is None:
-            from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
-
-            self._mujoco_renderer = MujocoRenderer(
-                self.model, self.data, self._camera, width=self.width, height=self.height
-            )
+            size = self.width, self.height
+            self._mujoco_renderer = mujoco_renderer(self.model, self.data, self._camera, *size)
         return self._mujoco_renderer
+
+    @mujoco_renderer.setter
+    def mujoco_renderer(self, renderer: Any) -> None:
+        self._mujoco_renderer = renderer
 
     @property
     def _mujoco(self) -> Any:
@@ -210,9 +234,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
     @property
     def _utils(self) -> Any:
-        reference = import_module('gymnasium_robotics.utils.mujoco_utils')
-        working = {name: getattr(joint_access, name) for name in _JOINT_FUNCTIONS}
-        return SimpleNamespace(**vars(reference) | working)
+        return mujoco_utils()
 
     @property
     def _model_names(self) -> Any:
@@ -233,6 +255,26 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         """Goes on from the state; copies of arrays are writable until they are stated again."""
         self.__dict__.update(state)
         self._state(**{name: state[name] for name in state['_stated']})
+
+    def _render_callback(self) -> None:
+        """Move the goal in `model` and `data`, so that forward passes keep it there."""
+        if self._physics.is_shared:
+            self._show_goal()
+            self._keep_goal()
+
+    def _show_goal(self) -> None:
+        if self._physics.shares_data and self.simulation.is_started[0]:
+            self._draw_goal(self._physics.data)
+
+    def _draw_goal(self, data: Any) -> None:
+        """Move the target sites; the physics does not depend on them."""
+        data.site_xpos[self._target_sites] = self.goal.reshape(-1, 3)
+
+    def _keep_goal(self) -> None:
+        model = self.simulation.model
+        sites = [*self._target_sites, *self._finger_sites]
+        bodies = model.body_pos[model.site_bodyid[sites]]
+        self._physics.move_sites(sites, self.data.site_xpos[sites] - bodies)
 
     def _get_achieved_goal(self) -> Array:
         return self._get_obs()['achieved_goal']
@@ -292,11 +334,16 @@ class HandReachEnv(RobotEnv):
         super().__init__(task, **arguments)
         physics = self.simulation.task
         assert isinstance(physics, HandReachTask)
+        self._fingertip_sites = fingertip_sites(physics.model)
         self._state(
             initial_goal=physics.start_fingertips.flatten(),
             palm_xpos=physics.palm.copy(),
             relative_control=False,
         )
+
+    def _draw_goal(self, data: Any) -> None:
+        super()._draw_goal(data)
+        data.site_xpos[self._finger_sites] = data.site_xpos[self._fingertip_sites]
 
 
 class ManipulateEnv(RobotEnv):
@@ -334,6 +381,7 @@ class ManipulateEnv(RobotEnv):
         physics = self.simulation.task
         assert isinstance(physics, HandManipulateTask)
         position, rotation = _goal_kind(task)
+        self._target_geom = physics.model.geom('target').id
         self._state(
             target_position=position,
             target_rotation=rotation,
@@ -351,6 +399,24 @@ class ManipulateEnv(RobotEnv):
             success = np.asarray(self._is_success(achieved_goal, goal), dtype=np.float32)
             return (success - np.float32(1.0))[()]
         return super().compute_reward(achieved_goal, goal, info)
+
+    def _draw_goal(self, data: Any) -> None:
+        """Move the target body, on which only pictures depend."""
+        pose = self._shown_goal()
+        geom = self._target_geom
+        data.geom_xpos[geom] = pose[:3]
+        mujoco.mju_quat2Mat(data.geom_xmat[geom], pose[3:])
+
+    def _keep_goal(self) -> None:
+        mujoco_utils().set_joint_qpos(self.model, self.data, 'target:joint', self._shown_goal())
+        mujoco_utils().set_joint_qvel(self.model, self.data, 'target:joint', np.zeros(6))
+
+    def _shown_goal(self) -> Array:
+        """Return the goal; beside the hand, as in `manipulate.py`, if its position is ignored."""
+        goal = self.goal.copy()
+        if not self.spec_of_task.position_counts:
+            goal[0] += 0.15
+        return goal
 
     def _goal_distance(self, goal_a: ArrayLike, goal_b: ArrayLike) -> tuple[Any, Any]:
         distance, rotation = self.simulation.metric.distances(goal_a, goal_b)
@@ -372,6 +438,15 @@ def make_env(task: str, **arguments: Any) -> RobotEnv:
 
 # `gymnasium.make` looks here for what it can make lists of.
 make_env.metadata = RobotEnv.metadata  # type: ignore[attr-defined]
+
+
+def _sites(model: mujoco.MjModel, prefix: str) -> list[int]:
+    """Return the sites `<prefix>0`, `<prefix>1`, ... of a model."""
+    names = itertools.takewhile(
+        lambda name: mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE.value, name) >= 0,
+        (f'{prefix}{number}' for number in itertools.count()),
+    )
+    return [model.site(name).id for name in names]
 
 
 def _goal_kind(task: str) -> tuple[str, str]:

@@ -17,7 +17,6 @@ from gymnasium.envs.registration import (
 )
 from gymnasium.vector import VectorEnv
 
-from fetch_hand_sim.gym_envs.goal_env import import_goal_env
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS, task_spec
 
 NAMESPACE = 'fetch_hand_sim'
@@ -201,6 +200,8 @@ def register_gymnasium_robotics(override: bool = False) -> None:
             registered then.
     """
     if override:
+        from fetch_hand_sim.gym_envs.reference import import_goal_env
+
         import_goal_env()
     ids = reference_ids()
     foreign = [name for name in ids if _is_foreign(name)]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array
 
 
 class SharedPhysics:
@@ -42,6 +43,23 @@ class SharedPhysics:
             self._data = mujoco.MjData(self._simulation.model)
             self.receive()
         return self._data
+
+    @property
+    def is_shared(self) -> bool:
+        """True if the model or the data was read before."""
+        return self._shares_model or self.shares_data
+
+    @property
+    def shares_data(self) -> bool:
+        """True if the data was read before."""
+        return self._data is not None
+
+    def move_sites(self, sites: list[int], positions: Array) -> None:
+        """Move sites (n,) of the model to (n, 3) in m that only pictures show."""
+        site_pos = self._simulation.model.site_pos
+        site_pos[sites] = positions
+        if self._unchanged is not None:
+            self._unchanged['MjModel.site_pos'] = site_pos.copy()
 
     def send(self) -> None:
         """Takes over what was written; to be called before anything is computed."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import pickle
 import subprocess
@@ -14,8 +15,8 @@ import numpy as np
 import pytest
 
 import fetch_hand_sim
-from fetch_hand_sim.gym_envs.goal_env import import_goal_env
 from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv, ManipulateEnv
+from fetch_hand_sim.gym_envs.reference import import_goal_env
 from fetch_hand_sim.gym_envs.registration import reference_ids
 from msgs_spec.tasks import TASKS
 from support import SUPPORT
@@ -37,7 +38,6 @@ LEFT_OUT = {
     '_ezpickle_kwargs',
     '_initialize_simulation',
     '_mujoco_step',
-    '_render_callback',
     '_reset_sim',
     '_set_action',
     '_step_callback',
@@ -350,3 +350,87 @@ def test_what_is_written_into_the_model_counts(make):
         moved.append(env.data.joint('object0:joint').qvel[0])
     assert moved[0] == moved[2]
     assert abs(moved[0] - moved[1]) > 0.1
+
+
+def test_commands_follow_the_ranges_written_into_the_model(make):
+    env = make('HandReach-v3')
+    env.reset(seed=0)
+    env.model.actuator_ctrlrange[:] *= 0.5
+    halved = env.model.actuator_ctrlrange.copy()
+    env.step(np.ones(20, np.float32))
+    assert env.data.ctrl == pytest.approx(halved[:, 1], abs=1e-12)
+    assert env.data.ctrl[3] == pytest.approx(0.7855)
+    twin = pickle.loads(pickle.dumps(env))
+    for each in (env, twin):
+        each.step(-np.ones(20, np.float32))
+        assert each.data.ctrl == pytest.approx(halved[:, 0], abs=1e-12)
+
+
+def shown_goal(env) -> np.ndarray:
+    """Where a user's own renderer of model and data draws the goal."""
+    if env.spec_of_task.name.startswith('HandManipulate'):
+        return env.data.geom('target').xpos
+    names = [f'target{i}' for i in range(env.goal.size // 3)]
+    return np.concatenate([env.data.site(name).xpos for name in names])
+
+
+@pytest.mark.parametrize('name', ['FetchPush-v4', 'HandReach-v3', 'HandManipulateEggRotate-v1'])
+def test_model_and_data_show_the_goal_without_a_change_of_trajectories(name, make):
+    env, plain = make(name, render_mode='rgb_array'), make(name)
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    beside = np.zeros(env.goal.size)
+    if name.startswith('HandManipulate'):
+        # As in the reference, where the position of the goal does not count.
+        beside = np.array([0.15, 0.0, 0.0])
+    for _ in range(3):
+        assert shown_goal(env) == pytest.approx(env.goal[: beside.size] + beside, abs=1e-12)
+        action = env.action_space.sample()
+        ours, expected = env.step(action)[0], plain.step(action)[0]
+        assert all(ours[key].tobytes() == expected[key].tobytes() for key in ours)
+        env._render_callback()
+    # The goal stays at its place in a forward pass, too.
+    shown = shown_goal(env).copy()
+    mujoco.mj_forward(env.model, env.data)
+    assert shown_goal(env) == pytest.approx(shown, abs=1e-12)
+
+
+def test_render_uses_the_settings_of_mujoco_renderer(make):
+    env = make('FetchReach-v4', render_mode='rgb_array')
+    env.reset(seed=0)
+    free = env.render()
+    env.mujoco_renderer.default_cam_config = {'distance': 1.0}
+    near = env.render()
+    env.mujoco_renderer._get_viewer('rgb_array').cam.distance = 5.0
+    far = env.render()
+    env.mujoco_renderer.camera_id = 0
+    pictures = [free, near, far, env.render()]
+    env.close()
+    assert [picture.shape for picture in pictures] == [(480, 480, 3)] * 4
+    for first, second in itertools.combinations(pictures, 2):
+        assert np.abs(first.astype(float) - second).mean() > 5.0
+
+
+def test_a_picture_calls_the_render_callback(make):
+    class Marked(FetchEnv):
+        def _render_callback(self) -> None:
+            super()._render_callback()
+            viewer = self.mujoco_renderer._get_viewer(self.render_mode)
+            viewer.add_marker(pos=self.goal, size=np.full(3, 0.5), rgba=np.array([1, 0, 0, 1]))
+            self.calls = getattr(self, 'calls', 0) + 1
+
+    env = Marked('FetchReach', render_mode='rgb_array')
+    env.reset(seed=0)
+    marked = env.render()
+    assert env.calls == 1
+    red = (marked[..., 0] > 100) & (marked[..., 1:] < 50).all(axis=-1)
+    assert red.mean() > 0.05
+
+
+def test_depth_is_in_metres_with_either_renderer(make):
+    env = make('FetchReach-v4', render_mode='depth_array')
+    env.reset(seed=0)
+    first = env.render()
+    assert env.mujoco_renderer is env.mujoco_renderer
+    robot = first < 5.0
+    assert np.median(np.abs(env.render() - first)[robot]) < 0.1

@@ -129,11 +129,13 @@ def test_nothing_else_differs_from_the_published_model(task):
     published = published_model(task, tuned)
     for name in ('nq', 'nv', 'nu', 'nbody', 'ngeom', 'neq', 'ntendon', 'nmocap'):
         assert getattr(tuned, name) == getattr(published, name), name
-    for name in ('body_mass', 'body_inertia', 'dof_damping', 'geom_size', 'actuator_gainprm'):
+    names = ('body_mass', 'body_inertia', 'dof_damping', 'actuator_gainprm', 'actuator_ctrlrange')
+    for name in (*names, 'geom_size', 'geom_margin', 'geom_gap', 'geom_friction'):
         assert getattr(tuned, name).tobytes() == getattr(published, name).tobytes(), name
 
 
-# Not margins and gaps: MuJoCo keeps those of bodies too, which the published model looks at first.
+# Not larger geoms, margins and gaps: the published model compares bodies first, with the bounding
+# volumes and margins of the compiler, and misses contacts (docs/gymnasium_robotics.md).
 CHANGES = {
     'friction': 0.01,
     'solref': [0.05, 0.7],
@@ -141,6 +143,8 @@ CHANGES = {
     'condim': 1,
     'solmix': 3.0,
     'priority': 1,
+    'size': 0.004,
+    'gap': 0.0003,
 }
 
 
