@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -292,8 +293,8 @@ def read_disturbances(given: str | Mapping[str, Any] | Disturbances | None) -> D
         return PRESETS[name].scaled(_scale(scale) if star else 1.0)
     if given.startswith('{'):
         return Disturbances.from_dict(_parsed(given))
-    path = Path(given).expanduser()
-    if not path.is_file():
+    path = Path(os.path.expanduser(given))
+    if not os.path.isfile(path):
         allowed = ', '.join(['none', *PRESETS])
         raise ValueError(
             f'disturbances {given[:80]!r} is neither a file nor a preset; allowed: {allowed}, '

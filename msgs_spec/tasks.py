@@ -287,7 +287,11 @@ def substeps_per_tick(control_hz: float) -> int:
             valid rates.
     """
     if not isinstance(control_hz, Real):
-        raise ValueError(f'control_hz {control_hz!r} given; allowed: 12.5 ... 500')
+        raise ValueError(f'control_hz {control_hz!r:.60} given; allowed: 12.5 ... 500')
+    try:
+        control_hz = float(control_hz)
+    except OverflowError:
+        control_hz = float('inf')
     smallest, largest = 1, 40
     period = 1.0 / (control_hz * PHYSICS_TIMESTEP) if control_hz > 0 else float('inf')
     substeps = round(period) if period < 1e9 else 10**9

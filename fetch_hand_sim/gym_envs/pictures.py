@@ -59,12 +59,14 @@ class Pictures:
             require_whole(name, side)
             if not 1 <= side <= LARGEST_SIDE:
                 raise ValueError(f'{name} must be 1 ... {LARGEST_SIDE} pixels, not {side}')
+        if not isinstance(camera, Mapping | None):
+            raise ValueError(f'default_camera_config {camera!r:.60}; allowed: a mapping or None')
         known = [name for name in dir(mujoco.MjvCamera) if not name.startswith('_')]
         for name in camera or {}:
             if name not in known:
                 allowed = ', '.join(known)
                 raise ValueError(
-                    f'default_camera_config: {name!r} is not known; allowed: {allowed}'
+                    f'default_camera_config: {name!r:.60} is not known; allowed: {allowed}'
                 )
         set_attributes(mujoco.MjvCamera(), camera or {}, simulation.model)
         self._simulation = simulation
@@ -159,4 +161,4 @@ def check_render_mode(mode: str | None, known: Sequence[str] = RENDER_MODES) -> 
     """
     if mode not in (None, *known):
         allowed = ', '.join(('None', *known))
-        raise ValueError(f'render_mode {mode!r} is not known; allowed: {allowed}')
+        raise ValueError(f'render_mode {mode!r:.60} is not known; allowed: {allowed}')

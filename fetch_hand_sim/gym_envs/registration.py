@@ -65,6 +65,9 @@ def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
         gymnasium.error.NameNotFound: If there is no such task or id.
     """
     name = _id_of(name)
+    mode = arguments.get('render_mode')
+    if not isinstance(mode, str | None):
+        raise ValueError(f'render_mode {mode!r:.60}; allowed: a name or None')
     return gymnasium.make(name, **_with_length(name, arguments))
 
 
@@ -136,8 +139,9 @@ def make_vec(
         gymnasium.error.NameNotFound: If there is no such task or id.
     """
     name = _id_of(name)
-    if callable(wrappers):
-        raise ValueError(f'wrappers {wrappers!r}; allowed: a list of them')
+    wrappers = [] if wrappers is None else wrappers
+    if not isinstance(wrappers, list | tuple) or not all(map(callable, wrappers)):
+        raise ValueError(f'wrappers {wrappers!r:.60}; allowed: a list of them')
     batch = VectorizeMode.VECTOR_ENTRY_POINT
     mode = arguments.pop('vectorization_mode', None)
     if mode not in (None, batch, batch.value):
@@ -145,7 +149,7 @@ def make_vec(
             f'vectorization_mode {mode!r} is for gymnasium.make_vec with the id; this makes '
             f'batches; allowed: None, {batch.value!r}'
         )
-    chosen = [_wrapper_of_batches(wrapper) for wrapper in wrappers or ()]
+    chosen = [_wrapper_of_batches(wrapper) for wrapper in wrappers]
     env = gymnasium.make_vec(
         name,
         num_envs=num_envs,

@@ -41,7 +41,7 @@ def numbers(values: ArrayLike, what: str, shape: str) -> NDArray[Any]:
     except ValueError:
         array = np.array(None)
     if array.dtype == object:
-        raise ValueError(f'{what}: {shape} numbers, not {values!r:.80}')
+        raise ValueError(f'{what}: {shape} numbers, not {values!r:.60}')
     return array
 
 

@@ -88,7 +88,8 @@ class GoalMetric:
         Raises:
             ValueError: If the goals are not of the task's size or differ in shape.
         """
-        achieved, desired = self._checked(achieved_goal), self._checked(desired_goal)
+        achieved = self._checked('achieved_goal', achieved_goal)
+        desired = self._checked('desired_goal', desired_goal)
         if achieved.shape != desired.shape:
             raise ValueError(
                 f'achieved_goal {achieved.shape} and desired_goal {desired.shape} differ in shape'
@@ -150,13 +151,18 @@ class GoalMetric:
             return -(~(distance <= self.spec.distance_threshold)).astype(np.float64)
         return self._success(distance, rotation).astype(np.float64) - 1.0
 
-    def _checked(self, goal: ArrayLike) -> Array:
-        values = np.ascontiguousarray(goal, dtype=np.float64)
+    def _checked(self, name: str, goal: ArrayLike) -> Array:
         size = self.spec.goal.size
+        try:
+            values = np.ascontiguousarray(goal, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f'{name} {goal!r:.60}; allowed: numbers (..., {size}) for {self.spec.name}'
+            ) from None
         if values.ndim == 0 or values.shape[-1] != size:
             raise ValueError(
-                f'a goal of {self.spec.name} has {size} values on its last axis, not shape '
-                f'{values.shape}'
+                f'{name} of {self.spec.name} has {size} values on its last axis, not shape '
+                f'{np.shape(goal)}'
             )
         return values
 
@@ -171,4 +177,4 @@ class GoalMetric:
 
 def _require_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
-        raise ValueError(f'{name} {value!r} is not known; allowed: {", ".join(allowed)}')
+        raise ValueError(f'{name} {value!r:.60} is not known; allowed: {", ".join(allowed)}')

@@ -31,6 +31,7 @@ from fetch_hand_sim.simulation.arguments import (
     finite_numbers,
     generators,
     nearest_quaternions,
+    numbers,
     require_whole,
     selected_simulations,
 )
@@ -119,8 +120,10 @@ class Simulation:
     ) -> None:
         require_whole('num_envs', num_envs, lowest=1)
         require_whole('num_threads', num_threads, lowest=0)
+        if not isinstance(keeps_data, bool):
+            raise ValueError(f'keeps_data {keeps_data!r:.60}; allowed: True or False')
         if timing not in TIMINGS:
-            raise ValueError(f'timing {timing!r} is unknown; allowed: {", ".join(TIMINGS)}')
+            raise ValueError(f'timing {timing!r:.60} is unknown; allowed: {", ".join(TIMINGS)}')
         self._arguments: dict[str, Any] = {
             'num_envs': num_envs,
             'num_threads': num_threads,
@@ -162,10 +165,14 @@ class Simulation:
 
     @goals.setter
     def goals(self, goals: ArrayLike) -> None:
-        wanted = np.asarray(goals, dtype=np.float64)
-        if wanted.shape != (shape := (self.num_envs, self.spec.goal.size)):
-            raise ValueError(f'goals of {self.spec.name} have shape {shape}, not {wanted.shape}')
-        self._goals = wanted
+        shape = (self.num_envs, self.spec.goal.size)
+        wanted = numbers(goals, f'goals of {self.spec.name}', f'{shape}')
+        if wanted.shape != shape or wanted.dtype.kind not in 'iuf':
+            raise ValueError(
+                f'goals of {self.spec.name} have shape {shape}, not {wanted.shape} of type '
+                f'{wanted.dtype}'
+            )
+        self._goals = wanted.astype(np.float64, copy=False)
 
     @property
     def task(self) -> Task:
@@ -201,11 +208,11 @@ class Simulation:
 
         Goals, random generators and divergence counters are not included, nor in `write_data`.
         """
-        self._task.read_data(self._index(index), data)
+        self._task.read_data(self._index(index), self._fitting(data))
 
     def write_data(self, index: int, data: Any) -> None:
         """Continue simulation `index` from a `mujoco.MjData`."""
-        self._task.write_data(self._index(index), data)
+        self._task.write_data(self._index(index), self._fitting(data))
 
     def apply_model_changes(self) -> None:
         """Step with `model` as it is now; the simulation keeps its own copy.
@@ -223,7 +230,7 @@ class Simulation:
 
     def generator(self, index: int) -> np.random.Generator:
         """Return the random generator of simulation `index`, live; it draws starts and goals."""
-        generator = self._generators[index]
+        generator = self._generators[self._index(index)]
         if generator is None:
             generator = self._generators[index] = seeding.np_random(None)[0]
         return generator
@@ -355,9 +362,9 @@ class Simulation:
         """
         if not isinstance(body, str):
             raise ValueError(f'body {body!r:.60} is not a name; allowed: a movable body')
-        values = np.asarray(wrench, dtype=np.float64)
-        if values.shape != (6,) or not np.isfinite(values).all():
-            raise ValueError(f'wrench {values.tolist()!s:.60}; allowed: six finite numbers')
+        values = numbers(wrench, 'wrench', 'six')
+        if values.shape != (6,) or values.dtype.kind not in 'iuf' or not np.isfinite(values).all():
+            raise ValueError(f'wrench {wrench!r:.60}; allowed: six finite numbers')
         number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY.value, body)
         if number < 1 or not self.model.body_weldid[number]:
             raise ValueError(f'no body {body[:40]!r} that can move')
@@ -389,6 +396,7 @@ class Simulation:
 
     def variation(self, index: int) -> dict[str, float]:
         """Return what the running episode of a simulation drew from its disturbances."""
+        index = self._index(index)
         if self._disturber is None:
             return {}
         return {name: float(values[index]) for name, values in self._disturber.variations.items()}
@@ -548,6 +556,16 @@ class Simulation:
     def _finite(self, name: str, values: ArrayLike) -> NDArray[np.floating]:
         shape = (self.num_envs, self.spec.robot.action_size)
         return finite_numbers(name, values, shape, owner=self.spec.name)
+
+    def _fitting(self, data: Any) -> Any:
+        """Return `data` if it belongs to a model of this size; raise `ValueError` otherwise."""
+        shape = (self.model.nq,)
+        if not isinstance(data, mujoco.MjData) or data.qpos.shape != shape:
+            raise ValueError(
+                f'data {type(data).__name__}; allowed: a mujoco.MjData of the model of '
+                f'{self.spec.name}, with qpos of shape {shape}'
+            )
+        return data
 
     def _index(self, index: int) -> int:
         """Return `index` if a simulation has it; raise `ValueError` otherwise."""

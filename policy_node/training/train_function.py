@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -97,20 +98,24 @@ def train(
     """
     if on_cycle is not None and not callable(on_cycle):
         raise ValueError(f'on_cycle {on_cycle!r}; allowed: None or a function')
+    if output is not None and not (isinstance(output, str | os.PathLike) and str(output)):
+        raise ValueError(f'output {output!r:.60}; allowed: the path of a folder, or None')
+    if not isinstance(resume, bool):
+        raise ValueError(f'resume {resume!r:.60}; allowed: True or False')
     fields = typed_fields(fields)
     if resume:
         if output is None:
             raise ValueError('resume=True needs output, the folder of the run to go on with')
-        folder = Path(output).expanduser()
+        folder = Path(os.path.expanduser(output))
         config = resumed_config(folder, task, recipe, fields)
     else:
-        config = recipe_config(task, recipe or 'best', **fields)
-        folder = Path(output or default_folder(config)).expanduser()
+        config = recipe_config(task, 'best' if recipe is None else recipe, **fields)
+        folder = Path(default_folder(config) if output is None else os.path.expanduser(output))
         if (folder / STATE_FILE).is_file():
             raise ValueError(
                 f'{folder} holds a run: resume=True goes on with it, or choose another'
             )
-    given: dict[str, Any] = {'recipe': recipe} if recipe else {}
+    given: dict[str, Any] = {} if recipe is None else {'recipe': recipe}
     given |= {'resume': True} if resume else {}
     command = _command(task, folder, given | fields)
     with _PROGRAM:

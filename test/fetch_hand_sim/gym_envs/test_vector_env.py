@@ -492,6 +492,9 @@ def test_wrappers_go_around_the_batch():
     assert env.step(np.full((2, 4), 0.5))[4]['episode']['l'].tolist() == [2, 2]
     with pytest.raises(ValueError, match='TimeLimit wraps single environments only'):
         fetch_hand_sim.make_vec(name, 2, wrappers=[gymnasium.wrappers.TimeLimit])
+    for bad in (5, 'a', ['a'], gymnasium.wrappers.FlattenObservation):
+        with pytest.raises(ValueError, match='wrappers .*; allowed: a list of them'):
+            fetch_hand_sim.make_vec(name, 2, wrappers=bad)
 
 
 def test_functions_of_a_wrapper_of_single_environments_are_asked_of_each():

@@ -229,6 +229,9 @@ BAD_SIMULATIONS = {
     'low rate': ({'control_hz': 1}, 'nearest: 12.5'),
     'negative rate': ({'control_hz': -25}, 'nearest: 12.5'),
     'no rate': ({'control_hz': float('nan')}, 'control_hz nan'),
+    'huge rate': ({'control_hz': 10**400}, 'control_hz inf'),
+    'huge number': ({'num_envs': 2**31}, 'num_envs must be 1 ... 2147483647'),
+    'data': ({'keeps_data': ''}, "keeps_data ''; allowed: True or False"),
 }
 
 
@@ -315,6 +318,37 @@ def test_a_push_is_of_a_simulation_that_there_is(index):
     simulation.reset(seed=0)
     with pytest.raises(ValueError, match='index must be'):
         simulation.perturb('object0', [1, 0, 0, 0, 0, 0], index)
+
+
+BAD_CALLS = {
+    'body': (lambda one: one.perturb(None, np.zeros(6)), 'body None'),
+    'wrench': (lambda one: one.perturb('object0', 'abcdef'), "wrench 'abcdef'; allowed: six"),
+    'ragged wrench': (lambda one: one.perturb('object0', [[1], [1, 2]]), 'wrench: six numbers'),
+    'index': (lambda one: one.data(None), 'index must be a whole number, not None'),
+    'written': (lambda one: one.write_data(-1, one.data(0)), 'index must be 0 ... 1, not -1'),
+    'generator': (lambda one: one.generator(2), 'index must be 0 ... 1, not 2'),
+    'variation': (lambda one: one.variation('a'), "index must be a whole number, not 'a'"),
+    'data': (lambda one: one.write_data(0, None), 'data NoneType; allowed: a mujoco.MjData'),
+    'model': (
+        lambda one: one.read_data(0, Simulation('HandReach', num_threads=1).data(0)),
+        'data MjData; allowed: .* of FetchPush, with qpos of shape',
+    ),
+    'text': (lambda one: one.compute_reward('', np.zeros(3)), "achieved_goal ''; allowed: numbers"),
+    'mapping': (lambda one: one.compute_success(np.zeros(3), {}), 'desired_goal {}; allowed'),
+    'one number': (lambda one: one.compute_reward(5, np.zeros(3)), 'achieved_goal of FetchPush'),
+    'goals': (lambda one: setattr(one, 'goals', 'x'), 'goals of FetchPush have shape'),
+}
+
+
+@pytest.mark.parametrize('bad', BAD_CALLS)
+def test_a_bad_argument_is_named(bad):
+    call, message = BAD_CALLS[bad]
+    simulation = Simulation('FetchPush', num_envs=2, num_threads=1)
+    simulation.reset(seed=0)
+    before = state_of(simulation)
+    with pytest.raises(ValueError, match=message):
+        call(simulation)
+    assert state_of(simulation) == before
 
 
 def test_a_shallow_copy_shares_no_generator():
