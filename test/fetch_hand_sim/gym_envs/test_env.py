@@ -356,7 +356,7 @@ def test_importing_the_package_registers_without_mujoco():
             r'type 1 with trackbodyid 9999; allowed: 0 \.',
         ),
         ({'distance_threshold': 'a'}, r'must be 0 ... 1e\+06, not a'),
-        ({'control_hz': '25'}, "control_hz '25' is no number"),
+        ({'control_hz': '25'}, "control_hz '25' given"),
         ({'default_camera_config': 5}, 'default_camera_config 5; allowed: a mapping or None'),
         ({'disturbances': 'x' * 1000}, 'is neither a file nor a preset'),
         ({'default_camera_config': {'zoom': 2}}, "'zoom' is not known; allowed: azimuth,"),
