@@ -493,7 +493,7 @@ def test_wrappers_go_around_the_batch():
     with pytest.raises(ValueError, match='TimeLimit wraps single environments only'):
         fetch_hand_sim.make_vec(name, 2, wrappers=[gymnasium.wrappers.TimeLimit])
     for bad in (5, 'a', ['a'], gymnasium.wrappers.FlattenObservation):
-        with pytest.raises(ValueError, match='wrappers .*; allowed: a list of them'):
+        with pytest.raises(ValueError, match=r'wrappers .*; allowed: a list of them'):
             fetch_hand_sim.make_vec(name, 2, wrappers=bad)
 
 
