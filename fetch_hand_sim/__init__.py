@@ -1,8 +1,8 @@
-"""The robots: thirteen tasks on MuJoCo, from one batched simulation, and the ROS node around it."""
+"""The robots: thirteen tasks on MuJoCo in one batched simulation, and its ROS node."""
 
 from node_runtime.signals import guard_loading
 
-# Before anything that takes long to import.
+# First, because the imports below take long.
 guard_loading()
 
 from fetch_hand_sim.mujoco_import import import_mujoco  # noqa: E402

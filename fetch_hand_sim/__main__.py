@@ -26,8 +26,7 @@ class Command:
     """One word of the command line.
 
     Attributes:
-        help: One line for `--help`.
-        module: Module whose `main` is the command; it is imported when the command runs.
+        module: Its `main` is the command; it is imported when the command runs.
         extras: Extras of this package that the module imports.
         is_node: Whether the command takes ROS parameters instead of options.
         commands: Subcommands by name.

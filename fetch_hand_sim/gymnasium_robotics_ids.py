@@ -1,6 +1,6 @@
-"""Registers the ids of Gymnasium-Robotics when it is imported, in worker processes too.
+"""Register the ids of Gymnasium-Robotics on import, also in worker processes.
 
-Gymnasium imports what stands before the colon:
+Gymnasium imports the module before the colon:
 `gymnasium.make('fetch_hand_sim.gymnasium_robotics_ids:FetchReach-v4')`.
 """
 

@@ -1,7 +1,7 @@
-"""MuJoCo without the OpenGL that `MUJOCO_GL` asks for, where that is not there.
+"""Import MuJoCo even if the OpenGL backend in `MUJOCO_GL` is missing.
 
-`import mujoco` fails then, also in what draws nothing. Who does draw is told what to install by
-`simulation.opengl`.
+`import mujoco` fails then, even in programs that never render. Programs that render get an error
+from `simulation.opengl` that names the packages to install.
 """
 
 import os
@@ -10,17 +10,17 @@ from importlib import import_module
 
 
 def import_mujoco() -> None:
-    """Imports MuJoCo if `MUJOCO_GL` may keep it from being imported later; leaves it as it is."""
+    """Import MuJoCo now if `MUJOCO_GL` could make its import fail; the variable stays as it is."""
     asked = os.environ.get('MUJOCO_GL', '')
     if not asked or 'mujoco' in sys.modules:
         return
     try:
         import_module('mujoco')
     except ImportError:
-        # Something else is missing; whoever needs MuJoCo hears of it.
+        # Another module is missing; the first use of MuJoCo reports it.
         return
     except Exception:
-        # AttributeError of PyOpenGL where a library is missing, RuntimeError of another name.
+        # PyOpenGL raises AttributeError for a missing library, MuJoCo RuntimeError for a bad name.
         _import_without_opengl(asked)
 
 

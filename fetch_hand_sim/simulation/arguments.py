@@ -1,4 +1,4 @@
-"""What arguments may be: refused by name before a library trips over them."""
+"""Checks of arguments: errors name the argument before a library fails on it."""
 
 from __future__ import annotations
 
@@ -19,11 +19,7 @@ Seeds = int | Sequence[Seed] | None
 def require_whole(
     name: str, value: object, lowest: int | None = None, highest: int = 2**31 - 1
 ) -> None:
-    """Require a whole number within limits.
-
-    Raises:
-        ValueError: If the value is not an integer (booleans are not), or out of range.
-    """
+    """Raise ValueError unless `value` is an integer (not a boolean) within the limits."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ValueError(f'{name} must be a whole number, not {value!r:.60}')
     if lowest is not None and not lowest <= value <= highest:
@@ -31,11 +27,7 @@ def require_whole(
 
 
 def numbers(values: ArrayLike, what: str, shape: str) -> NDArray[Any]:
-    """Return values as an array of any shape.
-
-    Raises:
-        ValueError: If they are not numbers, or rows have different lengths.
-    """
+    """Return an array of any shape; raise ValueError for rows of different lengths or objects."""
     try:
         array = np.asarray(values)
     except ValueError:
@@ -48,22 +40,21 @@ def numbers(values: ArrayLike, what: str, shape: str) -> NDArray[Any]:
 def finite_numbers(
     name: str, values: ArrayLike, shape: tuple[int, ...], owner: str
 ) -> NDArray[np.floating]:
-    """Numbers for each simulation, float32 or float64.
+    """Return finite numbers, one row for each simulation, as float32 or float64.
 
     Args:
-        name: What they are, for messages.
-        values: The numbers.
-        shape: What they must have, (N, size).
-        owner: Whose they are, for messages.
+        name: Meaning of the numbers, for errors.
+        shape: The required shape, (N, size).
+        owner: Task or space of the numbers, for errors.
 
     Raises:
-        ValueError: If the shape is another, or something is no finite number.
+        ValueError: If the shape is wrong or a value is not a finite number.
     """
     array = numbers(values, f'{name} of {owner}', f'{shape}')
     if array.shape != shape:
         raise ValueError(f'{name} of {owner} have shape {shape}, not {array.shape}')
     if array.dtype.kind not in 'iuf':
-        raise ValueError(f'{name} are numbers, not of type {array.dtype}')
+        raise ValueError(f'{name} must be numbers, not of type {array.dtype}')
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.float64)
     if not np.isfinite(array).all():
@@ -73,11 +64,7 @@ def finite_numbers(
 
 
 def finite_goal(goal: ArrayLike, spec: TaskSpec) -> Array:
-    """A goal (goal size,) of a task.
-
-    Raises:
-        ValueError: If it has another shape, or something is no finite number.
-    """
+    """Return a goal (goal size,) of a task; raise ValueError for a wrong shape or no number."""
     array = np.asarray(goal, dtype=np.float64)
     if array.shape != (spec.goal.size,) or not np.isfinite(array).all():
         raise ValueError(f'a goal of {spec.name} is {spec.goal.size} finite numbers, not {goal!r}')
@@ -85,21 +72,17 @@ def finite_goal(goal: ArrayLike, spec: TaskSpec) -> Array:
 
 
 def finite_goals(goals: ArrayLike, count: int, spec: TaskSpec) -> Array:
-    """Goals of so many simulations, (count, goal size), a fresh array.
-
-    Raises:
-        ValueError: If they have another shape, or something is no finite number.
-    """
+    """Return a new array of goals (count, goal size); raise ValueError as `finite_numbers`."""
     array = finite_numbers('goals', goals, (count, spec.goal.size), owner=spec.name)
     return np.array(array, dtype=np.float64)
 
 
 def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
-    """Poses with unit quaternions, of q and -q the one that is nearer to the object's.
+    """Return poses with unit quaternions in the hemisphere of the object's quaternion.
 
     Args:
         goals: (n, 7), position in m and quaternion wxyz.
-        achieved_goals: (n, 7) where the objects are.
+        achieved_goals: (n, 7), poses of the objects.
 
     Raises:
         ValueError: If a quaternion is zero.
@@ -113,10 +96,10 @@ def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
 
 
 def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
-    """The simulations of indices or of a boolean mask (N,), in the order in which they are named.
+    """Return the indices given as such, in their order, or as a boolean mask (N,).
 
     Raises:
-        ValueError: If there is no such simulation, or one is named twice.
+        ValueError: If an index is out of range or given twice.
     """
     selected = np.asarray(ids)
     if selected.dtype == bool and selected.shape == (num_envs,):
@@ -135,14 +118,14 @@ def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
 
 
 def generators(seed: Seeds, selected: NDArray[np.intp]) -> list[np.random.Generator | None]:
-    """The random generators that simulations go on with; None for those that keep their own.
+    """Return a new random generator for each selected simulation; None keeps the old one.
 
     Args:
-        seed: As `Simulation.reset` has it.
-        selected: Which simulations.
+        seed: As in `Simulation.reset`.
+        selected: Indices of the simulations.
 
     Raises:
-        ValueError: If a seed is negative, or there are more or fewer than simulations.
+        ValueError: If a seed is negative, or the number of seeds is wrong.
         TypeError: If a seed is not an integer.
     """
     if seed is None:
@@ -150,9 +133,9 @@ def generators(seed: Seeds, selected: NDArray[np.intp]) -> list[np.random.Genera
     if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
         return [_generator(int(seed) + int(i)) for i in selected]
     if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str | bytes):
-        raise TypeError(f'a seed is an integer, a sequence of integers or None, not {seed!r}')
+        raise TypeError(f'seed {seed!r:.60}; allowed: an integer, a sequence of integers or None')
     if len(seed) != selected.size:
-        raise ValueError(f'{selected.size} simulations start again but {len(seed)} seeds came')
+        raise ValueError(f'{len(seed)} seeds for {selected.size} simulations')
     return [None if value is None else _generator(value) for value in seed]
 
 
@@ -160,7 +143,7 @@ def _generator(seed: Any) -> np.random.Generator:
     if isinstance(seed, np.random.Generator):
         return seed
     if not isinstance(seed, int | np.integer) or isinstance(seed, bool):
-        raise TypeError(f'a seed is an integer, not {seed!r}')
+        raise TypeError(f'seed {seed!r:.60}; allowed: an integer')
     if seed < 0:
-        raise ValueError(f'a seed must not be negative, but {seed} is')
+        raise ValueError(f'seed {seed}; allowed: 0 or more')
     return seeding.np_random(int(seed))[0]

@@ -345,7 +345,7 @@ class Disturber:
         """Continue from what `state` returned."""
         for name in _STATE:
             setattr(self, name, state[name])
-        for name in state.get('varied', ()):
+        for name in state['varied']:
             self._physics.allow(name)
         self._physics.restore(self._all)
         self._physics.apply(self._all, self.variations)

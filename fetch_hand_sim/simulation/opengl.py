@@ -1,7 +1,7 @@
-"""Which OpenGL draws pictures where no display answers: EGL, else OSMesa.
+"""Choose the OpenGL backend: `MUJOCO_GL`, a display (GLFW), EGL, or OSMesa.
 
-MuJoCo takes GLFW unless `MUJOCO_GL` said otherwise before it was imported. The choice is made here
-when the first picture is wanted instead, so that the order of imports does not matter.
+MuJoCo itself reads `MUJOCO_GL` when it is imported and defaults to GLFW. This module chooses at the
+first picture, so the order of imports does not matter.
 """
 
 from __future__ import annotations
@@ -23,36 +23,32 @@ _EGL, _OSMESA = 'libEGL.so.1', 'libOSMesa.so.8'
 _PLATFORM_DEVICE = 0x313F
 _MOST_DEVICES = 64
 _BACKENDS = ('egl', 'osmesa', 'glfw')
-# What MuJoCo takes GLFW for, which needs a display.
+# Values of `MUJOCO_GL` that mean GLFW, which needs a display.
 _WINDOWS = ('glfw', 'glx', 'enable', 'enabled', 'on', 'true', '1')
 ADVICE = 'rendering needs OpenGL: apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6'
 
 
 def prepare_opengl() -> str:
-    """Readies this process to draw.
-
-    Returns:
-        The backend's name.
+    """Prepare this process for rendering; return the name of the backend.
 
     Raises:
-        RuntimeError: If there is none; the message is one line with the packages to install. Or if
-            this process was forked from one that draws: its OpenGL would wait for threads that
-            stayed behind.
+        RuntimeError: If no backend works; the message names the packages to install. Or if this
+            process was forked from one that renders: OpenGL would wait for its missing threads.
     """
     backend = _backend()
     if _process_that_draws() != os.getpid():
         raise RuntimeError(
-            'this process was forked from one that draws pictures, and OpenGL does not come along: '
-            "start it by 'spawn' or 'forkserver', or before the first picture"
+            'this process was forked from one that renders, where OpenGL does not work; use the '
+            "start method 'spawn' or 'forkserver', or fork before the first picture"
         )
     return backend
 
 
 @contextlib.contextmanager
 def context_of_its_own() -> Iterator[None]:
-    """Leaves the OpenGL context of this thread as it was, so that others draw in theirs.
+    """Restore the OpenGL context of this thread afterwards, so that other renderers keep theirs.
 
-    With EGL the one that is drawn in is free then, and any thread may take it.
+    With EGL the context used inside becomes free for other threads.
     """
     before = _current_of_egl()
     try:
@@ -63,13 +59,13 @@ def context_of_its_own() -> Iterator[None]:
             none = egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_CONTEXT
             egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, *none)
             if before is not None:
-                # Somebody may have destroyed it meanwhile.
+                # The previous context may have been destroyed.
                 with contextlib.suppress(Exception):
                     egl.EGL.eglMakeCurrent(*before)
 
 
 def _current_of_egl() -> tuple[Any, ...] | None:
-    """Display, surfaces and context of this thread, as EGL takes them; None if there is none."""
+    """Return display, surfaces and context of this thread for `eglMakeCurrent`, or None."""
     egl = sys.modules.get('mujoco.egl')
     if egl is None or egl.EGL_DISPLAY is None or not (context := egl.EGL.eglGetCurrentContext()):
         return None
@@ -79,24 +75,24 @@ def _current_of_egl() -> tuple[Any, ...] | None:
 
 @functools.cache
 def _process_that_draws() -> int:
-    """The process that asked first, in all that are forked from it."""
+    """Return the id of the process that rendered first; forked processes inherit the value."""
     return os.getpid()
 
 
 @functools.cache
 def _backend() -> str:
-    """Chooses the backend for this process; what `MUJOCO_GL` says goes first, then a display.
+    """Choose the backend for this process: `MUJOCO_GL`, then a display, then EGL, then OSMesa.
 
-    GLFW is not tried without a display: MuJoCo fails then, and ends the process at a second try.
+    GLFW is not tried without a display, because MuJoCo's second attempt ends the process.
 
     Raises:
-        RuntimeError: If there is none.
+        RuntimeError: If no backend works.
     """
     asked = os.environ.get('MUJOCO_GL', '').strip().lower()
     if asked in _WINDOWS and not _has_display():
-        raise RuntimeError(f'{ADVICE} (MUJOCO_GL={asked} needs a display, and none answers)')
+        raise RuntimeError(f'{ADVICE} (MUJOCO_GL={asked} needs a display, but none is available)')
     if asked:
-        # Again: MuJoCo has looked at it when it was imported, which may have been before.
+        # MuJoCo may have been imported before the variable was set.
         _use(asked)
         return asked
     if _has_display():
@@ -107,16 +103,16 @@ def _backend() -> str:
     elif has_osmesa:
         backend = 'osmesa'
     else:
-        reason = ' (EGL is installed and finds no device)' if has_egl else ''
+        reason = ' (EGL is installed but finds no device)' if has_egl else ''
         raise RuntimeError(f'{ADVICE}{reason}')
     _use(backend)
     return backend
 
 
 def _has_device() -> bool:
-    """Whether EGL can draw on anything; its library alone, without drivers, cannot.
+    """Return whether EGL has a device; the library alone, without drivers, has none.
 
-    Asked of EGL itself, because PyOpenGL stays with EGL for good once MuJoCo has tried it.
+    Calls EGL directly, because PyOpenGL cannot leave EGL once MuJoCo has tried it.
     """
     egl = ctypes.CDLL(_EGL)
     egl.eglGetProcAddress.restype = ctypes.c_void_p
@@ -132,12 +128,12 @@ def _has_device() -> bool:
         return False
     open_display = ctypes.CFUNCTYPE(pointer, ctypes.c_uint, pointer, pointer)(display_of)
     displays = (open_display(_PLATFORM_DEVICE, each, None) for each in devices[: count.value])
-    # None is closed: MuJoCo opens the same one next.
+    # The display stays open, because MuJoCo opens the same one next.
     return any(display and egl.eglInitialize(pointer(display), None, None) for display in displays)
 
 
 def _has_display() -> bool:
-    """Whether a window could be opened; `DISPLAY` may be that of a session long gone."""
+    """Return whether a window can be opened; `DISPLAY` may belong to an ended session."""
     if sys.platform != 'linux':
         return True
     if not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')):
@@ -149,15 +145,11 @@ def _has_display() -> bool:
 
 
 def start_glfw() -> bool:
-    """Whether GLFW has a display, without its warning.
-
-    Raises:
-        ImportError: If it is not installed.
-    """
+    """Return whether GLFW has a display, without its warning; raise ImportError without GLFW."""
     import glfw
 
     with warnings.catch_warnings():
-        # It would say again, without the advice, what whoever asks says.
+        # The error of the caller is more helpful.
         warnings.simplefilter('ignore')
         return bool(glfw.init())
 
@@ -166,13 +158,13 @@ def _use(backend: str) -> None:
     if backend not in _BACKENDS:
         if not hasattr(gl_context, 'GLContext'):
             raise RuntimeError(
-                f'rendering needs OpenGL: MUJOCO_GL={backend} has none; allowed: egl, osmesa, glfw'
+                f'rendering needs OpenGL: MUJOCO_GL={backend}; allowed: egl, osmesa, glfw'
             )
         return
     try:
         gl_context.GLContext = import_module(f'mujoco.{backend}').GLContext
     except Exception as error:
-        # PyOpenGL raises AttributeError, among others, where a library is missing.
+        # PyOpenGL raises AttributeError, among others, if a library is missing.
         raise RuntimeError(f'{ADVICE} ({error})') from error
 
 

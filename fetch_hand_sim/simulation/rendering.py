@@ -1,4 +1,4 @@
-"""Pictures of a scene, through `mujoco.Renderer`."""
+"""Render pictures of a scene with `mujoco.Renderer`."""
 
 from __future__ import annotations
 
@@ -23,22 +23,21 @@ LARGEST_SIDE = LARGEST_PICTURE_SIDE
 
 
 class SceneRenderer:
-    """Draws frames of a scene without a display.
+    """Renders frames of a scene without a display.
 
-    Opens an OpenGL context. With EGL any thread may draw and close, one at a time; with others only
-    that which opened it.
+    With EGL any thread may render and close, one at a time. With other backends only the thread
+    that created the renderer may.
 
     Args:
-        scene: What to draw.
-        width: Pixels.
-        height: Pixels.
-        camera: A camera of the model by name, or attributes of `mujoco.MjvCamera` that differ
-            from the scene's own view; None for that view.
+        width: Pixels, 1 ... `LARGEST_SIDE`.
+        height: Likewise.
+        camera: Name of a camera of the model, or attributes of `mujoco.MjvCamera` that change the
+            scene's view; None for that view.
 
     Raises:
-        ValueError: If the model has no such camera or the size is not allowed.
-        TypeError: If a side is no whole number.
-        RuntimeError: If there is no OpenGL.
+        ValueError: If the camera is unknown or the size is not allowed.
+        TypeError: If a side is not an integer.
+        RuntimeError: If OpenGL is missing.
     """
 
     def __init__(
@@ -48,7 +47,7 @@ class SceneRenderer:
         height: int = HEIGHT,
         camera: str | Mapping[str, Any] | None = None,
     ) -> None:
-        # Not every number is a whole one, and OpenGL would be blamed for it.
+        # OpenGL's errors would be misleading.
         width, height = operator.index(width), operator.index(height)
         for side in (width, height):
             if not 1 <= side <= LARGEST_SIDE:
@@ -67,14 +66,13 @@ class SceneRenderer:
             raise RuntimeError(f'{ADVICE} ({error})') from error
 
     def render(self, frame: Frame, trail: Sequence[Array] = ()) -> Picture:
-        """Returns the picture of a frame, (height, width, 3).
+        """Return the picture of a frame, (height, width, 3).
 
         Args:
-            frame: The tick.
-            trail: Where the object or gripper was before.
+            trail: Earlier positions of the object or gripper, (3,) each.
 
         Raises:
-            RuntimeError: If the OpenGL context is of another thread.
+            RuntimeError: If the OpenGL context belongs to another thread.
         """
         self._update(frame)
         scene = self._renderer.scene
@@ -85,12 +83,10 @@ class SceneRenderer:
             return np.asarray(self._renderer.render())
 
     def render_depth(self, frame: Frame) -> NDArray[np.float32]:
-        """Returns the distance of what is seen from the camera plane, (height, width), metres.
-
-        Markers are left out: they are no part of the world.
+        """Return distances from the camera plane, (height, width), m, without markers.
 
         Raises:
-            RuntimeError: If the OpenGL context is of another thread.
+            RuntimeError: If the OpenGL context belongs to another thread.
         """
         self._update(frame)
         self._renderer.enable_depth_rendering()
@@ -101,17 +97,13 @@ class SceneRenderer:
             self._renderer.disable_depth_rendering()
 
     def close(self) -> None:
-        """Frees the OpenGL context.
-
-        Raises:
-            RuntimeError: If it is of another thread.
-        """
+        """Free the OpenGL context; raise RuntimeError if it belongs to another thread."""
         with self._in_its_thread():
             self._renderer.close()
 
     @contextlib.contextmanager
     def _in_its_thread(self) -> Iterator[None]:
-        """Says in one line what OpenGL says at length to a thread that did not open the context."""
+        """Replace OpenGL's errors in other threads by one line."""
         try:
             with context_of_its_own():
                 yield
@@ -119,12 +111,12 @@ class SceneRenderer:
             if threading.get_ident() == self._thread:
                 raise
             raise RuntimeError(
-                'OpenGL draws in one thread only: render and close in the thread of the first '
-                f'picture, or make the environment where it is drawn ({type(error).__name__})'
+                'OpenGL works in one thread only: render and close in the thread that created the '
+                f'renderer ({type(error).__name__})'
             ) from error
 
     def _update(self, frame: Frame) -> None:
-        # Again: a forked process may have come by a renderer of its parent's.
+        # A forked process may have inherited this renderer.
         prepare_opengl()
         self._scene.show(frame)
         mujoco.mj_forward(self._scene.model, self._scene.data)
@@ -132,7 +124,7 @@ class SceneRenderer:
 
 
 def make_options() -> mujoco.MjvOption:
-    """Returns what of a model is drawn: no helper lines, and of the sites those that tell ends."""
+    """Return drawing options: no helper lines, only sites of the group `SHOWN_SITES`."""
     options = mujoco.MjvOption()
     options.flags[mujoco.mjtVisFlag.mjVIS_RANGEFINDER.value] = 0
     options.sitegroup[:] = 0
@@ -141,10 +133,10 @@ def make_options() -> mujoco.MjvOption:
 
 
 def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.MjvCamera:
-    """Returns a camera of the model by name, or the scene's own view with other attributes.
+    """Return a camera of the model by name, or the scene's view with changed attributes.
 
     Raises:
-        ValueError: If there is none; the message lists those there are.
+        ValueError: If the camera is unknown (the message lists all), or an attribute is invalid.
     """
     camera = mujoco.MjvCamera()
     if name is None or isinstance(name, Mapping):
@@ -162,16 +154,11 @@ def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.Mj
 def set_attributes(
     camera: mujoco.MjvCamera, attributes: Mapping[str, Any], model: mujoco.MjModel
 ) -> None:
-    """Sets attributes of a camera that it has.
-
-    Args:
-        camera: The camera.
-        attributes: New values by name.
-        model: What it looks at.
+    """Set attributes of a camera of a model.
 
     Raises:
-        ValueError: If a value is of another type or length, is not finite, or names a type, body or
-            camera that is not there.
+        ValueError: If a value has a wrong type or length, is not finite, or refers to an unknown
+            camera type, body or camera.
     """
     for name, value in attributes.items():
         try:
@@ -188,7 +175,7 @@ def set_attributes(
 
 
 def _check_camera(camera: mujoco.MjvCamera, model: mujoco.MjModel) -> None:
-    """Refuses what would draw nothing, or end the process inside MuJoCo at the first picture."""
+    """Raise ValueError for values with which MuJoCo renders nothing or ends the process."""
     for name in ('azimuth', 'distance', 'elevation', 'lookat'):
         if not np.isfinite(getattr(camera, name)).all():
             raise ValueError(f'default_camera_config: {name} {getattr(camera, name)} is not finite')
@@ -211,7 +198,7 @@ def _check_camera(camera: mujoco.MjvCamera, model: mujoco.MjModel) -> None:
 
 
 def simulation_frame(simulation: Simulation, index: int = 0) -> Frame:
-    """Returns how one copy of a simulation looks now."""
+    """Return the present frame of one copy of a simulation."""
     readings, observation = simulation.readings(), simulation.observe()
     achieved, desired = observation['achieved_goal'][index], observation['desired_goal'][index]
     spec = simulation.spec

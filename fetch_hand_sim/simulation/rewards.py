@@ -7,7 +7,7 @@ in a fixed order, so a batch gives the same bits as one call per row.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -19,7 +19,7 @@ from msgs_spec.tasks import REWARD_TYPES, SUCCESS_RULES, GoalKind, RewardType, S
 
 
 def _norm(difference: Array) -> Array:
-    """Euclidean norm over the last axis, summed in a fixed order whatever the memory layout."""
+    """Return Euclidean norms over the last axis, summed in an order independent of the layout."""
     total = np.zeros(difference.shape[:-1])
     for index in range(difference.shape[-1]):
         part = difference[..., index]
@@ -27,12 +27,12 @@ def _norm(difference: Array) -> Array:
     return np.asarray(np.sqrt(total))
 
 
-# Without slots: what a subclass keeps beside the fields is then part of copies and pickles.
+# Without slots, so that copies and pickles keep further attributes of subclasses.
 @dataclass(frozen=True)
 class GoalMetric:
-    """How far a goal is, when it counts as reached, and what that is worth.
+    """Distance between goals, success rule and reward of a task.
 
-    A subclass may have more fields, or attributes: `with_changes` keeps them.
+    A subclass may have more fields or attributes; `with_changes` keeps them.
 
     Attributes:
         spec: The task.
@@ -51,15 +51,12 @@ class GoalMetric:
         _require_choice('reward_type', self.reward_type, REWARD_TYPES)
 
     def with_changes(self, **changes: Any) -> Self:
-        """This metric with other values of some fields; all else that it has stays.
+        """Return a copy with other values of some fields.
 
-        Not `dataclasses.replace`, which asks `__init__` and loses what a subclass did not name.
-
-        Args:
-            changes: By name of the field. `__post_init__` is called after them.
+        `dataclasses.replace` would call `__init__` and lose further attributes of subclasses.
 
         Raises:
-            ValueError: If a success rule or reward is not known.
+            ValueError: If a success rule or reward type is unknown.
         """
         changed = copy.copy(self)
         for name, value in changes.items():
@@ -67,26 +64,18 @@ class GoalMetric:
         changed.__post_init__()
         return changed
 
-    def __setstate__(self, state: Any) -> None:
-        """Goes on from what `copy` and `pickle` kept; up to 1.0 that was a list of the fields."""
-        if isinstance(state, list):
-            state = dict(zip((field.name for field in fields(GoalMetric)), state, strict=True))
-        parts = state if isinstance(state, tuple) else (state,)
-        for name, value in (item for part in parts for item in (part or {}).items()):
-            object.__setattr__(self, name, value)
-
     @property
     def has_own_reward(self) -> bool:
-        """Whether a subclass brought another reward than the sparse and the dense one."""
+        """True if a subclass replaces the sparse and the dense reward."""
         return type(self).reward is not GoalMetric.reward
 
     def distances(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> tuple[Array, Array]:
-        """Distance in metres and rotation in radians between goals (..., goal size).
+        """Return distance, m, and rotation, rad, (...) each, between goals (..., goal size).
 
         A part that does not count for the task is zero.
 
         Raises:
-            ValueError: If the goals are not of the task's size or differ in shape.
+            ValueError: If the goals have a wrong size or different shapes.
         """
         achieved = self._checked('achieved_goal', achieved_goal)
         desired = self._checked('desired_goal', desired_goal)
@@ -106,19 +95,15 @@ class GoalMetric:
         return _norm(achieved - desired), nothing
 
     def success(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> NDArray[np.bool_]:
-        """Whether goals (..., goal size) are reached: a boolean array (...)."""
+        """Return whether goals (..., goal size) are reached, a boolean array (...)."""
         return self._success(*self.distances(achieved_goal, desired_goal))
 
     def reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Array:
-        """Reward of goals (..., goal size): an array (...).
+        """Return the reward (...) of goals (..., goal size).
 
         Sparse: 0 where the goal is reached, -1 elsewhere. Dense: minus the distance in metres; for
-        poses minus (10 x metres + radians), as in Gymnasium-Robotics `manipulate.py`.
-
-        Args:
-            achieved_goal: Achieved goals.
-            desired_goal: Desired goals.
-            info: Unused; part of Gymnasium's signature.
+        poses minus (10 x metres + radians), as in Gymnasium-Robotics `manipulate.py`. `info` is
+        ignored; it is part of Gymnasium's signature.
         """
         del info
         return self._reward(*self.distances(achieved_goal, desired_goal))
@@ -126,10 +111,9 @@ class GoalMetric:
     def evaluate(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Reward and success of goals (..., goal size), from one measurement of the distance.
+        """Return reward and success of goals (..., goal size), computing distances once.
 
-        A subclass with another `reward` or `success` is asked for both: steps and goals that are
-        exchanged afterwards are worth the same.
+        Methods of subclasses are called, so steps and hindsight goals get the same rewards.
         """
         if self.has_own_reward or type(self).success is not GoalMetric.success:
             reward = self.reward(achieved_goal, desired_goal)
@@ -147,7 +131,7 @@ class GoalMetric:
         if self.reward_type == 'dense':
             return -(10.0 * distance + rotation) if self.spec.goal is GoalKind.POSE else -distance
         if self.spec.rotation_threshold is None:
-            # Exactly on the threshold is no success and yet worth 0, as in the reference.
+            # A goal exactly on the threshold is no success but has reward 0, as in the reference.
             return -(~(distance <= self.spec.distance_threshold)).astype(np.float64)
         return self._success(distance, rotation).astype(np.float64) - 1.0
 

@@ -1,7 +1,7 @@
-"""What people look at: a task's model dressed for pictures, its goal as a ghost, markers, cameras.
+"""Scenes for pictures: the model of a task with floor and light, its goal as a ghost, markers.
 
-Pages and films share it. It follows what is known of a robot at a tick, live or from a file, and
-computes no physics.
+Pages and films share them. A scene shows the frame of one tick, live or from a file, and computes
+no physics.
 """
 
 from __future__ import annotations
@@ -23,20 +23,19 @@ from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
 
 Color = tuple[float, float, float, float]
 
-# How much of the way of an object or gripper is drawn.
+# Length of the drawn trail of the object or gripper.
 TRAIL_TICKS = 40
 REACHED: Color = (0.15, 0.75, 0.25, 0.65)
 MISSED: Color = (0.9, 0.2, 0.15, 0.65)
 _ACHIEVED: Color = (0.15, 0.4, 0.9, 0.8)
 _LINK: Color = (0.35, 0.35, 0.4, 0.5)
 _TRAIL: Color = (0.15, 0.4, 0.9, 0.35)
-# Opacity of what surrounds a goal: the ball of its threshold, or the shell of a ghost.
+# Opacity around a goal: the ball of its threshold, or the shell of a ghost.
 _HALO_OPACITY = 0.16
 _SHELL_SCALE = 1.08
-# Drawn where a pose has no object to show it, metres.
+# Axis that shows the rotation of a pose without an object, m.
 _POINTER = np.array([0.1, 0.0, 0.0])
-# Where the position of a pose does not count, its ghost stands beside the hand, metres
-# (Gymnasium-Robotics draws it there too).
+# If only the rotation counts, the ghost is drawn beside the hand, m, as in Gymnasium-Robotics.
 GHOST_OFFSET = np.array([0.15, 0.0, 0.0])
 # Name of the body that shows a goal.
 GHOST = 'target'
@@ -53,7 +52,7 @@ class View:
     elevation: float
 
     def apply(self, camera: mujoco.MjvCamera) -> None:
-        """Sets a camera to it."""
+        """Set a camera to this view."""
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE.value
         camera.fixedcamid = camera.trackbodyid = -1
         camera.lookat[:] = self.lookat
@@ -68,14 +67,14 @@ _MANIPULATE_VIEW = View((1.05, 0.89, 0.18), 0.47, 62.0, -38.0)
 
 
 def default_view(spec: TaskSpec) -> View:
-    """The camera from which a task is seen best."""
+    """Return the usual camera of a task."""
     if spec.robot.has_gripper_command:
         return _SLIDE_VIEW if spec.looks_like == 'FetchSlide' else _FETCH_VIEW
     return _REACH_VIEW if spec.goal is GoalKind.FINGERTIPS else _MANIPULATE_VIEW
 
 
 def model_view(model: mujoco.MjModel) -> View:
-    """The camera from which MuJoCo sees a model first: `<statistic>` and `<visual><global>`."""
+    """Return MuJoCo's default camera: `<statistic>` and `<visual><global>` of the model."""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
     x, y, z = camera.lookat.tolist()
@@ -84,16 +83,15 @@ def model_view(model: mujoco.MjModel) -> View:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What is known of a robot at one tick; goals and poses in the world frame.
+    """State of a robot at one tick; goals and poses in the world frame.
 
     Attributes:
         joint_position: (joints,) in the order of `joint_states`, rad or m.
         desired_goal: (goal size,), m and quaternion wxyz.
         achieved_goal: Likewise.
-        object_pose: (7,) m and quaternion wxyz; None where there is no object.
-        is_success: Whether the goal is reached.
-        qpos: (nq,) where all joints of the model are, those of a door too; None where only the
-            above is known, as in a log: other joints then stay where they are.
+        object_pose: (7,) m and quaternion wxyz; None for tasks without an object.
+        qpos: (nq,) positions of all joints of the model. None, as in a log, leaves the joints that
+            are not in `joint_position` where they are.
     """
 
     joint_position: Array
@@ -110,7 +108,7 @@ class Marker:
 
     Attributes:
         shape: `mujoco.mjtGeom`.
-        size: (3,) as MuJoCo has it for the shape, m.
+        size: (3,) MuJoCo's sizes of the shape, m.
         position: (3,) m.
         quaternion: (4,) wxyz.
         color: Red, green, blue, opacity.
@@ -123,7 +121,7 @@ class Marker:
     quaternion: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
 
     def draw(self, geom: mujoco.MjvGeom) -> None:
-        """Writes the shape into a geom of a scene."""
+        """Write the shape into a geom of a MuJoCo scene."""
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, self.quaternion)
         color = np.array(self.color, dtype=np.float32)
@@ -131,15 +129,15 @@ class Marker:
 
 
 class Scene:
-    """A task's robot, object and ghost, posed as frames say.
+    """Robot, object and ghost of a task in the poses of frames.
 
     Attributes:
-        spec: The task, whose thresholds markers show; it may be replaced by one with others.
-        model: The compiled `mujoco.MjModel`, for looking at only.
-        data: Its `mujoco.MjData`, posed as the last frame.
+        spec: The task, whose thresholds the markers show; it may be replaced.
+        model: The compiled `mujoco.MjModel`, for pictures only.
+        data: Its `mujoco.MjData` in the pose of the last frame.
 
     Raises:
-        ValueError: If there is no such task.
+        ValueError: If the task is unknown.
     """
 
     def __init__(self, task: str) -> None:
@@ -157,14 +155,14 @@ class Scene:
 
     @property
     def has_ghost(self) -> bool:
-        """Whether the goal is shown as a ghost of the object, which the model then has."""
+        """True if the model contains a ghost of the object that shows the goal."""
         joint = mujoco.mj_name2id(
             self.model, mujoco.mjtObj.mjOBJ_JOINT.value, _free_joint_of(GHOST)
         )
         return self.spec.goal is GoalKind.POSE and self.spec.has_object and joint >= 0
 
     def show(self, frame: Frame) -> None:
-        """Poses robot, object and ghost, and whatever else is known to move."""
+        """Pose robot, object and ghost, and all other joints if the frame contains them."""
         if frame.qpos is not None and frame.qpos.shape == self.data.qpos.shape:
             self.data.qpos[:] = frame.qpos
         self.data.qpos[self._joints] = frame.joint_position
@@ -174,11 +172,10 @@ class Scene:
             self.data.qpos[self._ghost] = ghost_pose(self.spec, frame.desired_goal)
 
     def markers(self, frame: Frame, trail: Sequence[Array] = ()) -> list[Marker]:
-        """What is drawn beside the model: goal, achieved goal, the way the object took.
+        """Return the markers of goal, achieved goal and trail.
 
         Args:
-            frame: The tick.
-            trail: Positions (3,) of the object or gripper before, the oldest first.
+            trail: Earlier positions (3,) of the object or gripper, the oldest first.
         """
         color = REACHED if frame.is_success else MISSED
         if self.has_ghost:
@@ -191,7 +188,7 @@ class Scene:
         return [*shapes, *_line(trail, width)]
 
     def object_markers(self, frame: Frame) -> list[Marker]:
-        """The object, for those who draw neither it nor the model."""
+        """Return the object as markers, for viewers without the model."""
         if self._object is None or frame.object_pose is None:
             return []
         body = self.model.body(self.spec.object_name)
@@ -199,7 +196,7 @@ class Scene:
         return [self._geom_marker(geom, frame.object_pose) for geom in range(first, first + count)]
 
     def table_markers(self) -> list[Marker]:
-        """What a task's object lies on and no robot moves: the table of a Fetch."""
+        """Return the fixed geoms except robot and floor: the table of the Fetch tasks."""
         return self._table
 
     @cached_property
@@ -210,14 +207,14 @@ class Scene:
         for geom in range(model.ngeom):
             body = int(model.geom_bodyid[geom])
             is_robot = model.body(body).name.startswith(JOINT_PREFIX)
-            # The floor is the world's own.
+            # The floor belongs to body 0, the world.
             if body and not is_robot and int(model.body_weldid[body]) == 0:
                 pose = np.concatenate([data.xpos[body], data.xquat[body]])
                 markers.append(self._geom_marker(geom, pose))
         return markers
 
     def _geom_marker(self, geom: int, pose: Array) -> Marker:
-        """A geom of the body that has this pose (7,)."""
+        """Return the marker of a geom whose body has the pose (7,)."""
         model = self.model
         position, quaternion = np.zeros(3), np.zeros(4)
         mujoco.mju_mulPose(
@@ -228,7 +225,7 @@ class Scene:
         return Marker(shape, size, position, (red, green, blue, opacity), quaternion)
 
     def _shell(self, frame: Frame, color: Color) -> list[Marker]:
-        """A tinted skin around the ghost."""
+        """Return a tinted shell around the ghost."""
         geom = self.model.geom(GHOST)
         pose = ghost_pose(self.spec, frame.desired_goal)
         tint = (*color[:3], 2.0 * _HALO_OPACITY)
@@ -247,7 +244,7 @@ def _free_joint_of(body: str) -> str:
 
 
 def ghost_pose(spec: TaskSpec, goal: Array) -> Array:
-    """Where the ghost of a pose goal (7,) is drawn, (7,)."""
+    """Return the pose (7,) in which the ghost of a pose goal (7,) is drawn."""
     pose = np.array(goal)
     if not spec.position_counts:
         pose[:3] += GHOST_OFFSET
@@ -255,14 +252,14 @@ def ghost_pose(spec: TaskSpec, goal: Array) -> Array:
 
 
 def tracked_position(frame: Frame) -> Array:
-    """The point (3,) whose way is worth drawing: the object, or the gripper."""
+    """Return the position (3,) of the object, or of the gripper in tasks without an object."""
     if frame.object_pose is not None:
         return frame.object_pose[:3].copy()
     return frame.achieved_goal[:3].copy()
 
 
 def trail_of(frames: Sequence[Frame], index: int) -> list[Array]:
-    """The way (n, 3) of that point up to a frame, as much of it as is drawn."""
+    """Return the last `TRAIL_TICKS` tracked positions up to a frame, (3,) each."""
     return [tracked_position(frame) for frame in frames[max(0, index - TRAIL_TICKS) : index + 1]]
 
 
@@ -277,7 +274,7 @@ def _point_markers(spec: TaskSpec, frame: Frame, color: Color) -> list[Marker]:
     if not spec.has_object:
         shapes.append(_sphere(achieved, 0.012, _ACHIEVED))
     if spec.goal is GoalKind.POSE:
-        # How both are turned: their x axes.
+        # The x axes show both rotations.
         for pose, tint in ((frame.desired_goal, color), (frame.achieved_goal, _ACHIEVED)):
             axis = np.zeros(3)
             mujoco.mju_rotVecQuat(axis, _POINTER, pose[3:])
@@ -295,7 +292,7 @@ def _fingertip_markers(frame: Frame, color: Color) -> list[Marker]:
 
 
 def _line(points: Iterable[Array], width: float, color: Color = _TRAIL) -> list[Marker]:
-    """Capsules from point to point."""
+    """Return capsules from point to point."""
     return [
         _capsule(start, end, width, color)
         for start, end in pairwise(points)
@@ -314,7 +311,7 @@ def _capsule(start: Array, end: Array, width: float, color: Color) -> Marker:
 
 
 def _dress(mjcf: mujoco.MjSpec) -> None:
-    """Gives the published model a floor, a sky and a shadow; hides its own goal markers."""
+    """Add floor, sky and shadow to the published model; hide its own goal markers."""
     for texture in mjcf.textures:
         if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             texture.rgb1, texture.rgb2 = [0.93, 0.95, 0.97], [0.66, 0.73, 0.8]
@@ -335,12 +332,12 @@ def _dress(mjcf: mujoco.MjSpec) -> None:
             geom.material = 'view:floor'
             geom.rgba = [1.0, 1.0, 1.0, 1.0]
     for body in mjcf.bodies:
-        # What leads the robot; another one is somebody's obstacle.
+        # Hide the robot's mocap body; other mocap bodies may be obstacles.
         if body.mocap and body.name.startswith(JOINT_PREFIX):
             for geom in body.geoms:
                 geom.group = 5
     for site in mjcf.sites:
-        # The ends of the pen tell them apart; all else marks what nobody looks for.
+        # Only the sites at the ends of the pen are shown: they show its direction.
         is_end = site.name.endswith((':top', ':bottom'))
         site.group = SHOWN_SITES if is_end else 5
     for light in mjcf.lights:
@@ -353,5 +350,5 @@ def _dress(mjcf: mujoco.MjSpec) -> None:
     mjcf.visual.headlight.specular = [0.1, 0.1, 0.1]
     mjcf.visual.map.shadowclip = 1.5
     mjcf.visual.quality.offsamples = 4
-    # The page fetches the model: its textures are most of it.
+    # Small textures, because the page downloads the model.
     mjcf.visual.quality.shadowsize = 2048

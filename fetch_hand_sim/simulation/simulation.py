@@ -1,11 +1,8 @@
 """`Simulation`: any number of copies of one task, stepped together.
 
-The ROS node and `gymnasium.make` use one copy, the trainer 64 and more. A `Simulation` counts no
-steps and ends no episodes; its user does. A step passes three places, in this order:
-
-- `_start` begins episodes: state, physics and goals of the copies that are reset.
-- `_apply` is the action path: commands as they reach MuJoCo.
-- `_sensed` is the sensing path: the observation of the true state.
+The ROS node and `gymnasium.make` use one copy, the trainer 64 and more. A `Simulation` does not
+count steps and never ends an episode; its user does. `_start` begins episodes, `_advance` applies
+commands and steps, `observe` measures.
 """
 
 from __future__ import annotations
@@ -206,7 +203,7 @@ class Simulation:
     def read_data(self, index: int, data: Any) -> None:
         """Write simulation `index` into a `mujoco.MjData`; derived fields need `keeps_data`.
 
-        Goals, random generators and divergence counters are not included, nor in `write_data`.
+        Goals, random generators and divergence counters are not included, as in `write_data`.
         """
         self._task.read_data(self._index(index), self._fitting(data))
 
@@ -448,7 +445,7 @@ class Simulation:
         """Compile the model again and restore the state, bit for bit."""
         Simulation.__init__(self, **state['arguments'])
         if state['model'] is not None:
-            self._task.take_model(state['model'], state.get('pairs'))
+            self._task.take_model(state['model'], state['pairs'])
             self._model_may_change = True
         self.metric = state['metric']
         self._task.set_physics_state(state['physics'])
@@ -458,9 +455,9 @@ class Simulation:
         self.goals[:] = state['goals']
         self._generators = state['generators']
         self.divergences = state['divergences']
-        # The push itself is part of the physics. Pickles of version 1.0 lack both flags.
-        self._is_pushed = state.get('is_pushed', False)
-        self._is_started[:] = state.get('is_started', True)
+        # The push itself is part of the physics.
+        self._is_pushed = state['is_pushed']
+        self._is_started[:] = state['is_started']
 
     def _given_variation(self, variation: Mapping[str, Any] | None) -> dict[str, float]:
         if variation is None:

@@ -1,7 +1,8 @@
-"""A task's robot as URDF, generated from its compiled model.
+"""The robot of a task as URDF, generated from its compiled model.
 
-Links are MuJoCo's bodies with their frames; joints have the names and the zero of `joint_states`.
-A body with several joints, or a joint beside the body's origin, takes links without mass between.
+Links are MuJoCo's bodies with their frames; joints have the names and zero positions of
+`joint_states`. A body with several joints, or a joint away from its origin, gets massless links in
+between.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ _GEOM = mujoco.mjtGeom
 # Geom groups that MuJoCo draws by default.
 _DRAWN_GROUPS = (0, 1, 2)
 ROOT = 'world'
-# URDF demands limits of what MuJoCo leaves unlimited: m or rad, N or N m, and per second.
+# URDF requires limits that MuJoCo does not have: m or rad, N or N m, and per second.
 _FAR, _STRONG, _FAST = 1000.0, 1000.0, 100.0
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a frame is in another one: position (3,) m and quaternion (4,) wxyz."""
+    """Pose of a frame in another one: position (3,) m and quaternion (4,) wxyz."""
 
     position: Array
     quaternion: Array
 
     def __matmul__(self, other: Pose) -> Pose:
-        """The pose of a frame that is at `other` in this one."""
+        """Return the pose of a frame that has the pose `other` in this one."""
         rotated = quaternion_to_matrix(self.quaternion) @ other.position
         turned = quaternion_multiply(self.quaternion, other.quaternion)
         return Pose(self.position + rotated, turned / np.linalg.norm(turned))
@@ -54,14 +55,12 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class UrdfJoint:
-    """What connects two links.
+    """Connection of two links.
 
     Attributes:
-        name: That of `joint_states`, or of the child link for fixed ones.
-        kind: Its type in URDF.
-        parent: Link it hangs on.
-        child: Link it moves.
-        origin: Of the joint in the parent, at position 0.
+        name: As in `joint_states`; fixed joints have the name of the child link and `/fixed`.
+        kind: Joint type of URDF.
+        origin: Pose of the child in the parent at position 0.
         axis: (3,) in the child.
         lower: Limit, rad or m.
         upper: Limit, rad or m.
@@ -77,11 +76,7 @@ class UrdfJoint:
     upper: float = 0.0
 
     def pose(self, position: float = 0.0) -> Pose:
-        """Returns the pose of the child link in the parent.
-
-        Args:
-            position: rad or m; fixed joints have none.
-        """
+        """Return the pose of the child in the parent at a position, rad or m."""
         if self.kind == 'fixed':
             return self.origin
         if self.kind == 'prismatic':
@@ -91,13 +86,13 @@ class UrdfJoint:
 
 
 class RobotDescription:
-    """The robot of a task, link by link.
+    """Links and joints of the robot of a task.
 
     Attributes:
-        joints: From the root outwards: parents come before their children.
+        joints: Ordered from the root: parents come before their children.
 
     Raises:
-        ValueError: If there is no such task.
+        ValueError: If the task is unknown.
     """
 
     def __init__(self, task: str) -> None:
@@ -109,22 +104,18 @@ class RobotDescription:
         self.joints = [joint for body in self._bodies for joint in self._joints_of(body)]
 
     def poses(self, positions: Mapping[str, float]) -> dict[str, Pose]:
-        """Forward kinematics: where every link is in the root.
-
-        Args:
-            positions: By name of the joint, rad or m.
-        """
+        """Return the pose of each link in the root, for joint positions by name, rad or m."""
         found = {ROOT: Pose(np.zeros(3), IDENTITY)}
         for joint in self.joints:
             found[joint.child] = found[joint.parent] @ joint.pose(positions.get(joint.name, 0.0))
         return found
 
     def to_xml(self, frame_prefix: str = '', joint_prefix: str = JOINT_PREFIX) -> str:
-        """Returns the URDF.
+        """Return the URDF.
 
         Args:
-            frame_prefix: Before the names of all links but the root, such as `left/`.
-            joint_prefix: What the names of the robot's joints begin with in `joint_states`.
+            frame_prefix: Prefix of all links except the root, such as `left/`.
+            joint_prefix: Prefix of the joint names in `joint_states`.
         """
         robot = ElementTree.Element('robot', name=self._spec.robot.name)
         ElementTree.SubElement(robot, 'link', name=ROOT)
@@ -139,14 +130,14 @@ class RobotDescription:
         return ElementTree.tostring(robot, encoding='unicode')
 
     def _belongs(self, body: int) -> bool:
-        """Whether a body is a part of the robot: mocap bodies and cameras of the room are not."""
+        """Return whether a body is part of the robot; mocap bodies and room cameras are not."""
         model = self._model
         name = model.body(body).name
         is_mocap = int(model.body_mocapid[body]) >= 0
         return name.startswith(JOINT_PREFIX) and not is_mocap and 'external_camera' not in name
 
     def _joints_of(self, body: int) -> Iterator[UrdfJoint]:
-        """The chain of joints from a body's parent to the body."""
+        """Yield the chain of joints from a body's parent to the body."""
         model = self._model
         name = model.body(body).name
         parent_body = int(model.body_parentid[body])
@@ -155,7 +146,7 @@ class RobotDescription:
         first = int(model.body_jntadr[body])
         moving = range(first, first + int(model.body_jntnum[body])) if first >= 0 else range(0)
         for index in moving:
-            # Only a hinge turns about its anchor; what slides may as well start from the origin.
+            # The anchor only matters for hinges.
             is_hinge = int(model.jnt_type[index]) == mujoco.mjtJoint.mjJNT_HINGE.value
             anchor = model.jnt_pos[index] if is_hinge else np.zeros(3)
             start = origin @ Pose(anchor, IDENTITY)
@@ -180,7 +171,7 @@ class RobotDescription:
             kind = 'continuous'
         limits = float(lower), float(upper)
         moving = UrdfJoint(joint.name, kind, parent, child, start, axis, *limits)
-        # The model as it is compiled stands at `zero`, not at 0.
+        # The compiled pose belongs to the position `zero`.
         return replace(moving, origin=moving.pose(-zero))
 
     def _fill_link(self, link: ElementTree.Element, body: int) -> None:
@@ -214,14 +205,14 @@ class RobotDescription:
 
 
 def numbers(values: ArrayLike) -> str:
-    """Returns numbers as URDF writes them."""
+    """Return numbers as text for URDF."""
     return ' '.join(f'{value:.12g}' for value in np.asarray(values, dtype=np.float64))
 
 
 def add_shapes(
     link: ElementTree.Element, mjcf: mujoco.MjSpec, model: mujoco.MjModel, body: int
 ) -> None:
-    """Adds `visual` and `collision` elements for the geoms of a body."""
+    """Add `visual` and `collision` elements for the geoms of a body."""
     first = int(model.body_geomadr[body])
     for geom in range(first, first + int(model.body_geomnum[body])):
         touches = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
@@ -238,7 +229,7 @@ def add_shapes(
 def _shapes(
     mjcf: mujoco.MjSpec, model: mujoco.MjModel, geom: int
 ) -> Iterator[tuple[ElementTree.Element, Array, Array]]:
-    """The shapes of a geom with their poses in the body; URDF knows no capsule."""
+    """Yield shapes of a geom and their poses in the body; a capsule becomes three shapes."""
     position, quaternion = model.geom_pos[geom].copy(), model.geom_quat[geom].copy()
     size = model.geom_size[geom]
     kind = int(model.geom_type[geom])
@@ -264,7 +255,7 @@ def _sphere(radius: float) -> ElementTree.Element:
 def _mesh(
     mjcf: mujoco.MjSpec, model: mujoco.MjModel, mesh: int, position: Array, quaternion: Array
 ) -> tuple[ElementTree.Element, Array, Array]:
-    """The file of a mesh, posed: MuJoCo has moved its points to the centre and axes of inertia."""
+    """Return the file of a mesh with its pose; MuJoCo has moved the mesh to its inertia frame."""
     source: Any = mjcf.mesh(model.mesh(mesh).name)
     path = (Path(mjcf.modelfiledir) / mjcf.meshdir / source.file).resolve()
     back = np.array([1.0, -1.0, -1.0, -1.0]) * model.mesh_quat[mesh]
@@ -280,14 +271,14 @@ def _add_color(element: ElementTree.Element, model: mujoco.MjModel, geom: int) -
 
 
 def add_origin(element: ElementTree.Element, position: ArrayLike, quaternion: ArrayLike) -> None:
-    """Adds an `origin` with URDF's roll, pitch and yaw."""
+    """Add an `origin` with URDF's roll, pitch and yaw."""
     ElementTree.SubElement(
         element, 'origin', xyz=numbers(position), rpy=numbers(roll_pitch_yaw(quaternion))
     )
 
 
 def roll_pitch_yaw(quaternion: ArrayLike) -> Array:
-    """URDF's angles (3,), radians, of a unit quaternion wxyz: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return URDF's angles (3,), rad, of a quaternion wxyz: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     m = quaternion_to_matrix(quaternion)
     cosine = np.hypot(m[0, 0], m[1, 0])
     if cosine > 1e-9:

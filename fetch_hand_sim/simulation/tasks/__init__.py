@@ -1,4 +1,4 @@
-"""The thirteen tasks, from data (`msgs_spec.tasks`) to running batches."""
+"""Batches of simulations for the tasks of `msgs_spec.tasks`."""
 
 from __future__ import annotations
 

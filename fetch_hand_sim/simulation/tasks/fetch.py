@@ -1,9 +1,9 @@
 """The four Fetch tasks: a mocap-driven gripper, with or without an object.
 
-Facts follow Gymnasium-Robotics 1.4.2 `fetch_env.py` to the bit, accidents included: positions are
-those of the last substep unless the gripper is blocked (then a forward pass refreshes them),
-velocities come from that Jacobian and the newest qvel, and the mocap body is re-anchored to the
-lagged gripper pose at each action.
+Equal to `fetch_env.py` of Gymnasium-Robotics 1.4.2 bit for bit, including its quirks. Positions are
+those of the last substep, unless the gripper is blocked: then a forward pass refreshes them.
+Velocities combine the Jacobian of these positions with the newest qvel. Each action anchors the
+mocap body at the lagged gripper pose.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation.model_tuning import (
+from fetch_hand_sim.simulation.models import (
     FETCH_NEVER_TOUCHING,
     exclude_body_pairs,
+    load_spec,
     skip_unread_stages,
 )
-from fetch_hand_sim.simulation.models import load_spec
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.task import (
     BatchConfig,
@@ -35,35 +35,34 @@ from msgs_spec.robots import GRIPPER_STEP
 from msgs_spec.rotations import quaternion_multiply
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule, TaskSpec
 
-# The gripper is held in this (unnormalised) orientation: fetch_env.py adds it to the mocap
-# quaternion.
+# Unnormalised orientation of the gripper, which `fetch_env.py` adds to the mocap quaternion.
 _GRIPPER_ROTATION = np.array([1.0, 0.0, 1.0, 0.0])
-# Where the gripper starts, relative to where the compiled model has it, metres.
+# Start of the gripper relative to its place in the compiled model, m.
 _GRIPPER_START = np.array([-0.498, 0.005, -0.431])
 _SETTLING_SUBSTEPS = 200
-# Time constant of the weld between mocap body and gripper (`fetch/shared.xml`), seconds.
+# Time constant of the weld between mocap body and gripper (`fetch/shared.xml`), s.
 _TIME_CONSTANT = 0.02
-# No object starts closer to the gripper than this, metres.
+# Smallest distance between gripper and object at the start, m.
 _OBJECT_CLEARANCE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class FetchConfig:
-    """Numbers in which the Fetch tasks differ; metres.
+    """Differences between the Fetch tasks; lengths in m.
 
     Attributes:
         asset: MJCF file.
         start: Initial positions of robot0:slide0, slide1, slide2.
-        object_start: Initial object qpos, or None.
+        object_start: Initial qpos of the object, or None.
         block_gripper: Whether the fingers are locked shut.
-        gripper_extra_height: Added to the gripper's starting height.
+        gripper_extra_height: Added to the start height of the gripper.
         object_range: Half width of the square in which the object starts.
-        target_range: Half width of the cube in which goals lie.
+        target_range: Half width of the cube that contains the goals.
         target_offset: Added to goals.
         target_in_the_air: Whether half of the goals are above the table.
 
     Raises:
-        ValueError: If an object can start nowhere.
+        ValueError: If `object_range` leaves no place for the object.
     """
 
     asset: str
@@ -77,11 +76,11 @@ class FetchConfig:
     target_in_the_air: bool = False
 
     def __post_init__(self) -> None:
-        # The corners of the square are farthest.
+        # The corners of the square have the largest distance.
         if self.object_start is not None and self.object_range <= _OBJECT_CLEARANCE / np.sqrt(2.0):
             raise ValueError(
-                f'object_range {self.object_range:g} m leaves no place that is {_OBJECT_CLEARANCE}'
-                ' m away from the gripper, where objects start'
+                f'object_range {self.object_range:g} m leaves no place {_OBJECT_CLEARANCE} m away '
+                'from the gripper'
             )
 
 
@@ -127,20 +126,16 @@ FETCH_CONFIGS = {
 class FetchTask(Task):
     """FetchReach, FetchPush, FetchSlide, FetchPickAndPlace.
 
-    The robot settles once; that state is the start of every episode.
+    The robot settles once; every episode starts from that state.
 
     Args:
-        spec: The task.
-        batch: How many simulations, and how they are stepped.
-        config: In what it differs; None for those of the thirteen.
+        config: Differences to the other Fetch tasks; needed for third-party tasks only.
 
     Attributes:
-        config: In what they differ.
-        gripper_start: (3,) where the gripper is at a reset, m, world.
-        object_height: Where the object's centre is then, m; only with an object.
-        gripper_rotation: (N, 4) how the gripper is turned now, wxyz, live and read-only.
-        lead_scale: What steps of the gripper, metres or radians, are multiplied by so that it is as
-            fast at this rate as at 25 Hz; 1 there.
+        gripper_start: (3,) position of the gripper at a reset, m, world.
+        object_height: Height of the object's centre at a reset, m; only with an object.
+        gripper_rotation: (N, 4) present rotation of the gripper, wxyz, live and read-only.
+        lead_scale: Factor of gripper steps that keeps the speed at rates other than 25 Hz.
     """
 
     def __init__(
@@ -174,7 +169,7 @@ class FetchTask(Task):
         self.batch.state[:] = self.start_state
 
     def _settle(self, model: mujoco.MjModel, spec: TaskSpec) -> None:
-        """Drives the gripper to its start and records the state after a reset."""
+        """Drive the gripper to its start and store the state after a reset."""
         config = self.config
         data = mujoco.MjData(model)
         for joint, value in zip(spec.robot.joints[:3], config.start, strict=True):
@@ -201,7 +196,7 @@ class FetchTask(Task):
         return self.config.asset
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
-        """Restores the settled state, places the objects, samples goals."""
+        """Restore the settled state, place the objects and draw goals."""
         self.batch.state[ids] = self.start_state
         if self.spec.has_object:
             places = [self._sample_object_place(generator) for generator in generators]
@@ -219,7 +214,7 @@ class FetchTask(Task):
         return place
 
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draws a point around the gripper's start, on the table or, for some tasks, above it."""
+        """Draw a point around the gripper's start, on the table or, for some tasks, above it."""
         config = self.config
         reach = config.target_range
         goal = self.gripper_start + generator.uniform(-reach, reach, size=3)
@@ -231,9 +226,9 @@ class FetchTask(Task):
         return np.asarray(goal)
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
-        """Moves the mocap target by 0.05 m per unit (at 25 Hz) and sets the finger actuators.
+        """Move the mocap target by 0.05 m per unit (at 25 Hz) and set the finger actuators.
 
-        The offset is scaled in the floating type of the command, as the reference does.
+        The offset is scaled in the floating type of the command, as in the reference.
         """
         offset = commands[:, :3] * commands.dtype.type(GRIPPER_STEP * self.lead_scale)
         if self.model.nu:
@@ -242,16 +237,16 @@ class FetchTask(Task):
         self.move_gripper(offset, self.gripper_rotation + _GRIPPER_ROTATION)
 
     def move_gripper(self, offset: NDArray[np.floating], rotation: Array) -> None:
-        """Sets where the gripper is drawn to: (N, 3) m from where it is, (N, 4) quaternion wxyz."""
+        """Set the mocap target: offset from the gripper (N, 3), m, and quaternion (N, 4) wxyz."""
         self._mocap_pos[:, 0] = self._gripper_xpos + offset
         self._mocap_quat[:, 0] = rotation
 
     def resting_commands(self) -> Array:
-        """Returns zeros: the gripper stays where it is, the fingers too."""
+        """Return zeros: gripper and fingers stay where they are."""
         return np.zeros((self.batch.nsim, self.spec.robot.action_size))
 
     def _finger_controls(self, fingers: NDArray[np.floating] | float) -> Array:
-        """Position actuators take targets relative to the present finger positions."""
+        """Return actuator targets, which are relative to the present finger positions."""
         model = self.model
         controls = np.broadcast_to(fingers, self._ctrl.shape).astype(np.float64)
         relative = np.flatnonzero(model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE)
@@ -260,21 +255,21 @@ class FetchTask(Task):
         return controls
 
     def step(self) -> None:
-        """Advances one tick; a blocked gripper is shut again, with a forward pass.
+        """Advance one tick; a blocked gripper is then shut, with a forward pass.
 
-        Of the pass only positions are ever read, but where the data are kept for others; these
-        models have no actuators, so no efforts.
+        The pass only computes positions unless `MjData` is kept. Models with a blocked gripper have
+        no actuators and therefore no efforts.
         """
         try:
             super().step()
         finally:
-            # The others go on where MuJoCo gave one up.
+            # Also after a divergence, because the other simulations continue.
             if self.config.block_gripper:
                 self._qpos[:, self._fingers] = 0.0
                 self.batch.forward(stage=self._last_stage)
 
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
-        """Returns the distance to a point."""
+        """Return the distance to a point."""
         return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)
 
 
@@ -295,7 +290,7 @@ class _SiteReader:
         self._qvel = task.batch.bind('qvel')
 
     def pose(self) -> Array:
-        """World position and orientation wxyz, (N, 7)."""
+        """Return world position and orientation wxyz, (N, 7)."""
         quaternion = self._body_quaternion
         if not self._site_aligned:
             site = np.broadcast_to(self._site_quaternion, quaternion.shape)
@@ -303,10 +298,9 @@ class _SiteReader:
         return np.concatenate([self._position, quaternion], axis=1)
 
     def twist(self) -> Array:
-        """Linear and angular world velocity, (N, 6): `mj_jacSite` times qvel.
+        """Return linear and angular world velocity, (N, 6): `mj_jacSite` times qvel.
 
-        The sum runs over degrees of freedom in a fixed order, so that one simulation and sixty-four
-        give the same bits.
+        The sum has a fixed order, so batches of any size give the same bits.
         """
         spatial = (self._cdof[:, self._dofs] * self._qvel[:, self._dofs, None]).sum(axis=1)
         angular, linear = spatial[:, :3], spatial[:, 3:]
@@ -315,14 +309,14 @@ class _SiteReader:
 
 
 def _cross(first: Array, second: Array) -> Array:
-    """`np.cross` of (N, 3) arrays with the same bits, in a fraction of its time."""
+    """Return `np.cross` of (N, 3) arrays with the same bits, but faster."""
     product = first[:, [1, 2, 0]] * second[:, [2, 0, 1]]
     product -= first[:, [2, 0, 1]] * second[:, [1, 2, 0]]
     return product
 
 
 def _chain_dofs(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
-    """Degrees of freedom that move a body, ascending."""
+    """Return the degrees of freedom that move a body, ascending."""
     dofs: list[int] = []
     while body:
         first, count = int(model.body_dofadr[body]), int(model.body_dofnum[body])
@@ -332,15 +326,16 @@ def _chain_dofs(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
 
 
 def lead_scale(control_hz: float) -> float:
-    """What leads are multiplied by at an action frequency in Hz; exactly 1 at 25 Hz."""
+    """Return the factor of gripper steps at an action frequency, Hz; exactly 1 at 25 Hz."""
     return _steady_speed(DEFAULT_CONTROL_HZ) / _steady_speed(control_hz)
 
 
 def _steady_speed(control_hz: float) -> float:
-    """Mean speed per metre of lead, 1/s, where every command leads as much as the one before.
+    """Return the mean speed of the gripper per metre of step, 1/s, for constant commands.
 
-    With x = w T, a spring let go at a distance of 1 with a speed of w u is at
-    (1 - (u - 1) x) exp(-x) after T; u is the speed at which it begins as fast as it ends.
+    The weld is a critically damped spring of frequency w. With x = w T, released at distance 1 with
+    speed w u, its distance after T is (1 - (u - 1) x) exp(-x). In the steady state, u is the same
+    at the beginning and at the end of a period.
     """
     x = 1.0 / (control_hz * _TIME_CONSTANT)
     decay = math.exp(-x)

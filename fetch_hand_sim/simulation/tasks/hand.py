@@ -1,4 +1,4 @@
-"""What all hand tasks share: twenty position actuators, twenty-four joints, five fingertips."""
+"""Base class of the hand tasks: 20 position actuators, 24 joints, 5 fingertips."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation.model_tuning import list_geom_pairs, skip_unread_stages
-from fetch_hand_sim.simulation.models import load_spec
+from fetch_hand_sim.simulation.models import list_geom_pairs, load_spec, skip_unread_stages
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task, weakly
 from msgs_spec.arrays import Array
 from msgs_spec.robots import FINGERTIPS, command_from_action
@@ -17,7 +16,7 @@ from msgs_spec.tasks import TaskSpec
 
 
 def load_hand_model(asset: str) -> mujoco.MjModel:
-    """Compiles a hand model, tuned to step fast along the same trajectories."""
+    """Compile a hand model, tuned to step faster along the same trajectories."""
     mjcf = load_spec(asset)
     list_geom_pairs(mjcf)
     model = mjcf.compile()
@@ -26,7 +25,7 @@ def load_hand_model(asset: str) -> mujoco.MjModel:
 
 
 def fingertip_sites(model: mujoco.MjModel) -> NDArray[np.intp]:
-    """Site indices of the fingertips in the order of goals."""
+    """Return the site indices of the fingertips in the order of goals."""
     return np.array([model.site(f'robot0:S_{name}').id for name in FINGERTIPS], dtype=np.intp)
 
 
@@ -34,7 +33,6 @@ class HandTask(Task):
     """Base of the hand tasks."""
 
     def __init__(self, spec: TaskSpec, model: mujoco.MjModel, batch: BatchConfig) -> None:
-        """Binds controls and fingertip positions."""
         super().__init__(spec, model, batch)
         self._ctrl: Array = self.batch.bind('ctrl')
         self._scaled_robot = spec.robot
@@ -56,19 +54,19 @@ class HandTask(Task):
             self._scaled_robot = replace(self.spec.robot, command=command)
 
     def commands_from_actions(self, actions: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return joint angles (N, 20), radians, of actions in [-1, 1]."""
+        """Return joint angles (N, 20), rad, of actions in [-1, 1]."""
         return command_from_action(self._scaled_robot, actions)
 
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
-        """Sets the position actuators to absolute joint angles, radians."""
+        """Set the position actuators to absolute joint angles, rad."""
         self._ctrl[:] = commands
 
     def resting_commands(self) -> Array:
-        """Returns the joint angles that the actuators hold now."""
+        """Return the present targets of the actuators, rad."""
         return self._ctrl.copy()
 
     def _fingertip_poses(self) -> Array:
-        """Fingertip positions, metres, and orientations wxyz, (N, 35); sites turn as bodies do."""
+        """Return fingertip positions, m, and orientations wxyz (those of the bodies), (N, 35)."""
         positions = self._site_xpos[:, self._fingertip_sites]
         quaternions = self._xquat[:, self._fingertip_bodies]
         return np.concatenate([positions, quaternions], axis=2).reshape(self.batch.nsim, -1)

@@ -1,8 +1,8 @@
 """The eight manipulation tasks: turn a block, an egg or a pen in the hand.
 
-Facts follow Gymnasium-Robotics 1.4.2 `manipulate.py` in a fresh instance. One thing is put right:
-the reference does not restore controls and warm start between episodes, so its n-th episode of a
-seed differs from the first; here every reset starts from the fresh state.
+Equal to a new instance of `manipulate.py` of Gymnasium-Robotics 1.4.2, with one correction. The
+reference does not restore controls and warm start between episodes, so later episodes with a seed
+differ from the first. Here every reset starts from the initial state.
 """
 
 from __future__ import annotations
@@ -49,25 +49,25 @@ from msgs_spec.tasks import (
 
 _OBJECT_JOINT = 'object:joint'
 _OBJECT_SITE = 'object:center'
-# An object whose centre is lower than this after settling has fallen off the palm, metres.
+# An object with a lower centre after settling has fallen off the palm, m.
 PALM_HEIGHT = 0.04
 _SETTLING_TICKS = 10
-# Of the thirteen hardly one fails.
+# Attempts to place the object; the thirteen tasks rarely need a second one.
 _MOST_TRIES = 1000
 _POSITION_SCATTER = 0.005
-# Box around the object in which `Full` goals lie, metres.
+# Box around the object that contains the goals of the `Full` tasks, m.
 TARGET_RANGE = np.array([(-0.04, 0.04), (-0.06, 0.02), (0.0, 0.06)])
 _Z_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
 class ManipulateConfig:
-    """In what the manipulation tasks differ.
+    """Differences between the manipulation tasks.
 
     Attributes:
         asset: MJCF file.
-        target_rotation: Which rotations goals have: about z, about z on any face, or any.
-        randomizes_rotation: Whether the object starts turned.
+        target_rotation: Rotations of goals: about z, about z on any face, or any.
+        randomizes_rotation: Whether the object starts with a random rotation.
     """
 
     asset: str
@@ -93,19 +93,15 @@ class HandManipulateTask(HandTask):
     """HandManipulateBlock*, HandManipulateEgg*, HandManipulatePen*.
 
     Args:
-        spec: The task.
-        batch: How many simulations, and how they are stepped.
-        config: In what it differs; None for those of the thirteen.
+        config: Differences to the other manipulation tasks; needed for third-party tasks only.
 
     Attributes:
-        config: In what they differ.
         parallel_quaternions: (24, 4) wxyz, the rotations that map a cube to itself.
     """
 
     def __init__(
         self, spec: TaskSpec, batch: BatchConfig, config: ManipulateConfig | None = None
     ) -> None:
-        """Keeps the fresh state, from which every episode starts."""
         self.config = config or MANIPULATE_CONFIGS[spec.name]
         model = load_hand_model(self.config.asset)
         data = mujoco.MjData(model)
@@ -133,13 +129,13 @@ class HandManipulateTask(HandTask):
         return self.config.asset
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
-        """Drops the object on the palm until it stays there, then samples goals.
+        """Drop the object on the palm until it stays there, then draw goals.
 
-        A try that fails, also one that MuJoCo gave up, is followed by another from the same
-        controls and warm start, as in the reference.
+        A failed or diverged attempt is repeated with the same controls and warm start, as in the
+        reference.
 
         Raises:
-            RuntimeError: If it never stays, which a model or object of one's own may bring about.
+            RuntimeError: If the object never stays, for example in a changed model.
         """
         self.batch.state[ids] = self.start_state
         generator_of = dict(zip(ids.tolist(), generators, strict=True))
@@ -156,7 +152,7 @@ class HandManipulateTask(HandTask):
         raise RuntimeError(f'{self.spec.name}: the object fell off the palm {_MOST_TRIES} times')
 
     def _settle(self, ids: Ids) -> NDArray[np.bool_]:
-        """Lets objects come to rest; which simulations MuJoCo gave up meanwhile, (N,)."""
+        """Let objects come to rest; return which simulations diverged, (N,)."""
         watch, failed = DivergenceWatch(self.batch), np.zeros(self.batch.nsim, dtype=np.bool_)
         for advance in (partial(self.batch.step, nstep=self._settling), self.batch.forward):
             try:
@@ -172,7 +168,7 @@ class HandManipulateTask(HandTask):
         self.batch.forward(ids)
 
     def _sample_start(self, generator: np.random.Generator) -> Array:
-        """Draws the object's starting pose, (7,)."""
+        """Draw the start pose of the object, (7,)."""
         start = self._start_qpos[joint_qpos_slice(self.model, _OBJECT_JOINT)]
         position, quaternion = start[:3].copy(), start[3:]
         if self.config.randomizes_rotation:
@@ -182,7 +178,7 @@ class HandManipulateTask(HandTask):
         return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
 
     def _sample_rotation(self, generator: np.random.Generator) -> Array:
-        """Draws a rotation of the task's kind: quaternion wxyz, (4,)."""
+        """Draw a rotation of the task's kind, a quaternion wxyz (4,)."""
         angle = generator.uniform(-np.pi, np.pi)
         if self.config.target_rotation == 'xyz':
             axis = generator.uniform(-1.0, 1.0, size=3)
@@ -194,7 +190,7 @@ class HandManipulateTask(HandTask):
         return quaternion_multiply(about_z, faces[generator.integers(len(faces))])
 
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draws a pose: where the object is now, moved for some tasks, and turned."""
+        """Draw a pose: the present one, shifted for some tasks, and rotated."""
         position = self._object_qpos[index, :3].copy()
         if self.spec.position_counts:
             position += generator.uniform(TARGET_RANGE[:, 0], TARGET_RANGE[:, 1])
@@ -202,22 +198,22 @@ class HandManipulateTask(HandTask):
         return np.concatenate([position, quaternion / np.linalg.norm(quaternion)])
 
     def _object_twist(self) -> Array:
-        """The object's velocity in world axes, (N, 6); MuJoCo holds it in the object's own."""
+        """Return the object's velocity in world axes, (N, 6); qvel has angular object axes."""
         rotation = quaternion_to_matrix(self._object_qpos[:, 3:])
         angular = np.einsum('nij,nj->ni', rotation, self._object_qvel[:, 3:])
         return np.concatenate([self._object_qvel[:, :3], angular], axis=1)
 
     def _object_joint(self) -> Array:
-        """The free joint as MuJoCo holds it, (N, 13)."""
+        """Return qpos and qvel of the free joint, (N, 13)."""
         return np.concatenate([self._object_qpos, self._object_qvel], axis=1)
 
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
-        """Returns the distance between poses."""
+        """Return the distance between poses."""
         return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)
 
 
 def _parallel_rotations() -> Array:
-    """The 24 rotations that map a cube to itself, Euler xyz, (24, 3), in the reference's order."""
+    """Return the 24 rotations of a cube to itself, Euler xyz (24, 3), in the reference's order."""
     quarter = np.pi / 2
     found: list[Array] = []
     for euler in itertools.product([0.0, quarter, -quarter, np.pi], repeat=3):

@@ -18,14 +18,14 @@ from msgs_spec.robots import FINGERTIPS
 from msgs_spec.tasks import RewardType, SuccessRule, TaskSpec
 
 REACH_ASSET = 'hand/reach.xml'
-# Where fingers meet, relative to the palm, and how far that place scatters, metres.
+# Meeting point of the fingers relative to the palm, and its standard deviation, m.
 _MEETING_OFFSET = np.array([0.0, -0.09, 0.05])
 _MEETING_SCATTER = 0.005
-# How far each fingertip stays from the meeting place, so that goals do not overlap, metres.
+# Distance of each fingertip to the meeting point, so that goals do not overlap, m.
 _MEETING_GAP = 0.005
 _PROBABILITY_OF_INITIAL_POSE = 0.1
 
-# Initial joint positions, radians (`DEFAULT_INITIAL_QPOS` of the reference).
+# Initial joint positions, rad (`DEFAULT_INITIAL_QPOS` of the reference).
 _INITIAL_QPOS = {
     'robot0:WRJ1': -0.16514339750464327,
     'robot0:WRJ0': -0.31973286565062153,
@@ -58,14 +58,13 @@ class HandReachTask(HandTask):
     """HandReach.
 
     Attributes:
-        start_fingertips: (5, 3) where the fingertips are at a reset, m, world.
-        palm: (3,) where the palm is, m, world.
+        start_fingertips: (5, 3) positions of the fingertips at a reset, m, world.
+        palm: (3,) position of the palm, m, world.
     """
 
     ASSET = REACH_ASSET
 
     def __init__(self, spec: TaskSpec, batch: BatchConfig) -> None:
-        """Keeps the initial pose, its fingertips and the palm, from which goals are made."""
         model = load_hand_model(self.ASSET)
         data = mujoco.MjData(model)
         for joint, value in _INITIAL_QPOS.items():
@@ -78,13 +77,13 @@ class HandReachTask(HandTask):
         self.batch.state[:] = self.start_state
 
     def reset(self, ids: Ids, generators: Generators) -> Array:
-        """Restores the initial pose and samples goals."""
+        """Restore the initial pose and draw goals."""
         self.batch.state[ids] = self.start_state
         self.batch.forward(ids)
         return self.sample_goals(ids, generators)
 
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draws where thumb and one finger meet, or now and then the initial pose."""
+        """Draw a meeting point of thumb and one finger, or in one of ten cases the initial pose."""
         fingers, thumb = list(FINGERTIPS[:-1]), len(FINGERTIPS) - 1
         finger = fingers.index(str(generator.choice(fingers)))
         meeting = self.palm + _MEETING_OFFSET
@@ -99,5 +98,5 @@ class HandReachTask(HandTask):
         return goal.flatten()
 
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
-        """Returns the distance between fingertips."""
+        """Return the distance between fingertips."""
         return GoalMetric(self.spec, success_rule=success_rule, reward_type=reward_type)

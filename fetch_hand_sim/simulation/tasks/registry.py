@@ -1,4 +1,4 @@
-"""From the name of a task to its running batch."""
+"""Find the class and the model of a task by name."""
 
 from __future__ import annotations
 
@@ -28,37 +28,30 @@ def make_task(
     keeps_data: bool = False,
     timing: Timing = 'seconds',
 ) -> Task:
-    """Compiles a task's model and starts its simulations.
-
-    Args:
-        name: One of `msgs_spec.tasks.TASKS`.
-        num_envs: Number of simulations.
-        num_threads: Threads that step them; 0 for all processors.
-        control_hz: Actions per simulated second.
-        keeps_data: Whether each simulation keeps an `MjData` of its own.
-        timing: What stays at another rate than 25 Hz.
+    """Compile the model of a task and start its simulations; arguments as in `BatchConfig`.
 
     Raises:
-        ValueError: If the task is unknown, the rate is not a whole number of substeps, or the
-            package of a task that is none of the thirteen has no simulation of it, or one of
-            another model than it names, or of one that steps by another time, or one without a
-            sensor, joint or object that its specification names.
+        ValueError: If the task is unknown or the rate is not allowed. For third-party tasks also if
+            the simulation is missing, or its model differs from its `ASSET`, has another time step
+            than `PHYSICS_TIMESTEP`, or lacks a joint of the specification.
     """
     spec = task_spec(name, control_hz=control_hz if timing == 'seconds' else DEFAULT_CONTROL_HZ)
     batch = BatchConfig(num_envs, num_threads, substeps_per_tick(control_hz), keeps_data, timing)
     task: Task = _family(spec)(spec, batch)
     if str(task.asset) != (named := task_asset(name)):
-        raise ValueError(f'{name} simulates {task.asset}; its ASSET, which is drawn, is {named}')
+        raise ValueError(
+            f'{name} simulates {task.asset}, but its ASSET, which pictures show, is {named}'
+        )
     if (timestep := float(task.model.opt.timestep)) != PHYSICS_TIMESTEP:
         raise ValueError(
-            f'{name}: {task.asset} steps by {timestep:g} s; rates, stamps and logs take '
+            f'{name}: {task.asset} has a time step of {timestep:g} s; allowed: '
             f'{PHYSICS_TIMESTEP:g} s (<option timestep="{PHYSICS_TIMESTEP:g}"/>)'
         )
     return task
 
 
 def _family(spec: TaskSpec) -> Any:
-    """The class that simulates a task."""
+    """Return the class that simulates a task."""
     if spec.name in FETCH_CONFIGS:
         return FetchTask
     if spec.name == 'HandReach':
@@ -69,10 +62,10 @@ def _family(spec: TaskSpec) -> Any:
 
 
 def task_asset(name: str) -> str:
-    """Returns the MJCF asset of a task, for example `fetch/reach.xml`.
+    """Return the MJCF asset of a task, for example `fetch/reach.xml`.
 
     Raises:
-        ValueError: If the task is unknown, or its package names none.
+        ValueError: If the task is unknown, or its class has no `ASSET`.
     """
     spec = task_spec(name)
     if spec.name in FETCH_CONFIGS:

@@ -1,4 +1,4 @@
-"""What every task does on a batch of simulations: reset, command, step, observe."""
+"""Base class of the tasks: reset, command, step and observe a batch of simulations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.engine import keep_in_forks, prepare_engine
-from fetch_hand_sim.simulation.model_tuning import ListedPairs
+from fetch_hand_sim.simulation.models import ListedPairs
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array
 from msgs_spec.observations import Readings, achieved_goal, observation, observed_topics
@@ -30,15 +30,14 @@ Generators = Sequence[np.random.Generator]
 
 @dataclass(frozen=True, slots=True)
 class BatchConfig:
-    """How many simulations of a task, and how they are stepped.
+    """Size of a batch of simulations, and how it is stepped.
 
     Attributes:
         num_envs: Number of simulations N.
         num_threads: Threads that step them; 0 for all processors that the process may use.
         substeps: Physics steps per action.
-        keeps_data: Whether each simulation keeps an `MjData` of its own, so that all that MuJoCo
-            computes can be read, at the cost of its memory.
-        timing: What stays at another rate than 25 Hz.
+        keeps_data: Whether each simulation keeps its own `MjData` with all derived values.
+        timing: Quantities that other rates than 25 Hz keep, see `msgs_spec.tasks.Timing`.
     """
 
     num_envs: int = 1
@@ -49,25 +48,18 @@ class BatchConfig:
 
     @property
     def threads(self) -> int:
-        """Threads of the pool: never more than simulations."""
-        return min(self.num_threads or _processors(), self.num_envs)
-
-
-def _processors() -> int:
-    """How many processors this process may use."""
-    if hasattr(os, 'sched_getaffinity'):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        """Number of threads of the pool, at most one per simulation."""
+        return min(self.num_threads or len(os.sched_getaffinity(0)), self.num_envs)
 
 
 @dataclass(frozen=True, slots=True)
 class PhysicsState:
-    """All that the next tick and the next observation depend on.
+    """State from which a batch continues to the same bits.
 
     Attributes:
         rows: (N, state size), `mjSTATE_INTEGRATION` of each simulation.
-        outputs: What MuJoCo derived in its last pass and the task reads, by the name in `MjData`,
-            each (N, ...): after a step it is one substep older than the rows.
+        outputs: Derived fields of `MjData` that the task reads, by name, (N, ...) each. After a
+            step they are one substep older than the rows.
     """
 
     rows: Array
@@ -75,26 +67,18 @@ class PhysicsState:
 
 
 class Task(ABC):
-    """One task on a batch of simulations.
-
-    Subclasses fill in the physics of a family. All arrays have the simulation as leading axis.
-
-    Args:
-        spec: The task.
-        model: Its compiled model.
-        batch: How many simulations, and how they are stepped.
+    """One task on a batch of simulations; all arrays have the simulation as leading axis.
 
     Attributes:
         spec: The task as data.
         model: The compiled `mujoco.MjModel`; the batch steps with a copy.
         batch: The simulations.
-        pairs: Whose contacts follow what is written into geoms.
+        pairs: Listed contact pairs, which follow changes of their geoms.
         substeps: Physics steps per action.
         tick_duration: Simulated seconds per action.
-        draws_goals: Whether `reset` draws goals; else they are zero until somebody sets them.
-        start_state: (state size,) `mjSTATE_INTEGRATION` in which episodes start, before anything
-            is drawn.
-        ASSET: The MJCF asset, of a class whose tasks all have the same.
+        draws_goals: Whether `reset` draws goals; otherwise they are zero until the user sets them.
+        start_state: (state size,) `mjSTATE_INTEGRATION` before start and goal are drawn.
+        ASSET: MJCF asset, for classes whose tasks share one.
     """
 
     ASSET: ClassVar[str]
@@ -122,7 +106,7 @@ class Task(ABC):
         joints = [_scalar_joint(spec, model, name) for name in spec.robot.joints]
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._joint_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
-        # What reads the vectors (N, topic.size) of a topic; families add theirs.
+        # Functions that return the vectors (N, topic.size) of a topic; subclasses add more.
         self._sensors: dict[str, Callable[[], Array]] = {'joint_states': weakly(self._joint_states)}
         self._observed = observed_topics(spec)
 
@@ -133,22 +117,19 @@ class Task(ABC):
 
     @abstractmethod
     def reset(self, ids: Ids, generators: Generators) -> Array:
-        """Starts simulations `ids` again and samples their goals.
+        """Begin episodes of simulations `ids`; return their goals (n, goal size).
 
         Args:
             ids: Sorted simulation indices, (n,).
-            generators: One generator per index; draws in the order of the reference.
-
-        Returns:
-            The desired goals, (n, goal size).
+            generators: One generator per index; draws have the order of the reference.
         """
 
     @abstractmethod
     def sample_goal(self, index: int, generator: np.random.Generator) -> Array:
-        """Draws a goal (goal size,) for simulation `index` as it is now."""
+        """Draw a goal (goal size,) for the present state of simulation `index`."""
 
     def sample_goals(self, ids: Ids, generators: Generators) -> Array:
-        """Draws goals (n, goal size), one simulation after the other."""
+        """Draw goals (n, goal size), one simulation after the other."""
         if not self.draws_goals:
             return np.zeros((ids.size, self.spec.goal.size))
         pairs = zip(ids.tolist(), generators, strict=True)
@@ -160,45 +141,37 @@ class Task(ABC):
 
     @abstractmethod
     def apply_commands(self, commands: NDArray[np.floating]) -> None:
-        """Writes commands (N, action size), in command units and within limits, to the physics."""
+        """Write commands (N, action size), in command units and within limits, to the physics."""
 
     @abstractmethod
     def resting_commands(self) -> Array:
-        """Returns the commands (N, action size) that change nothing about what the robots hold."""
+        """Return the commands (N, action size) that keep the robots as they are."""
 
     @abstractmethod
     def goal_metric(self, success_rule: SuccessRule, reward_type: RewardType) -> GoalMetric:
-        """Returns the distances, success rule and reward of the task."""
+        """Return the metric of the task: distances, success and reward."""
 
     def step(self) -> None:
-        """Advances all simulations by one tick under the commands applied last."""
+        """Advance all simulations by one tick with the commands applied last."""
         self.batch.step(nstep=self.substeps)
 
     def follow_model(self) -> None:
-        """Steps with the model as it is, its time step included; contacts follow their geoms."""
+        """Step with the present `model` and time step; listed contacts follow their geoms."""
         self.pairs.follow(self.model)
         self.batch.set_models(self.model)
         self.tick_duration = self.substeps * float(self.model.opt.timestep)
 
-    def take_model(self, model: mujoco.MjModel, pairs: ListedPairs | None) -> None:
-        """Steps with a model that was changed before.
-
-        Args:
-            model: The model.
-            pairs: Its `pairs`; None where nobody knows: all of it is as it is meant, then.
-        """
+    def take_model(self, model: mujoco.MjModel, pairs: ListedPairs) -> None:
+        """Step with a changed model and its `pairs`."""
         self.batch.set_models(model)
         self.batch.get_model(0, self.model)
-        if pairs is None:
-            self.pairs.note(self.model)
-        else:
-            self.pairs = pairs
+        self.pairs = pairs
         self.follow_model()
 
     def output(self, name: str) -> Array:
-        """Binds a derived field of `MjData`, (N, ...), live and read-only: `xpos`, `cdof`, ...
+        """Return a derived field of `MjData`, (N, ...), live and read-only: `xpos`, `cdof`, ...
 
-        Sensors of the model are off until somebody binds `sensordata`.
+        Sensors of the model are off until `sensordata` is requested.
         """
         if name == 'sensordata':
             self.model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_SENSOR.value
@@ -207,15 +180,15 @@ class Task(ABC):
         return self._outputs[name]
 
     def add_sensor(self, name: str, function: Callable[[], Array]) -> None:
-        """Says what a topic reads, in place of what said it before.
+        """Set the function that measures a topic.
 
         Args:
-            name: Of the topic, one of `msgs_spec.topics.sensor_topics`.
-            function: Returns its vectors (N, topic.size) as they are now, a fresh array. A method
-                of the task does not keep the task alive.
+            name: One of `msgs_spec.topics.sensor_topics`.
+            function: Returns the present vectors (N, topic.size) in a new array. A method of the
+                task does not keep the task alive.
 
         Raises:
-            ValueError: If the task has no such topic; the message lists those it has.
+            ValueError: If the task has no such topic; the message lists all.
         """
         allowed = [topic.name for topic in sensor_topics(self.spec)]
         if name not in allowed:
@@ -227,68 +200,64 @@ class Task(ABC):
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of the topics that something says."""
+        """Names of the measured topics."""
         return tuple(self._sensors)
 
     def physics_state(self) -> PhysicsState:
-        """Returns a copy of the state and of what was derived from it."""
+        """Return a copy of the state and of the derived fields that the task reads."""
         outputs = {name: values.copy() for name, values in self._outputs.items()}
         return PhysicsState(self.batch.state.copy(), outputs)
 
     def set_physics_state(self, state: PhysicsState) -> None:
-        """Goes on from a state as `physics_state` gave it, to the same bits."""
+        """Continue from a result of `physics_state`, to the same bits."""
         self.batch.state[:] = state.rows
-        # Fills the data that simulations keep; its warm start is not theirs.
+        # Fills the `MjData` that simulations keep, but changes the warm start.
         self.batch.forward()
         self.batch.state[:] = state.rows
         for name in self._outputs:
             self._write_output(name, slice(None), state.outputs[name])
 
     def new_data(self, state: Array) -> mujoco.MjData:
-        """Returns an `MjData` in a state (state size,), nothing derived from it yet."""
+        """Return an `MjData` in a state (state size,), without derived values."""
         data = mujoco.MjData(self.model)
         mujoco.mj_setState(self.model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
         return data
 
     def read_data(self, index: int, data: mujoco.MjData) -> None:
-        """Writes simulation `index` into `data`; what is derived needs `keeps_data`."""
+        """Write simulation `index` into `data`; derived values need `keeps_data`."""
         self.batch.get_data(index, data)
-        # Of a copy that has not stepped yet, what it keeps is newer than what the task reads.
+        # The `MjData` of a copy that has not stepped yet is newer than the task's outputs.
         for name, values in self._outputs.items():
             getattr(data, name)[:] = values[index]
 
     def write_data(self, index: int, data: mujoco.MjData) -> None:
-        """Lets simulation `index` go on from `data`, as if it had stepped that itself."""
+        """Continue simulation `index` from `data`, as if it had computed `data` itself."""
         self.batch.state[index] = integration_state(self.model, data)
         for name in self._outputs:
             self._write_output(name, index, getattr(data, name))
 
     def _write_output(self, name: str, where: int | slice, values: Array) -> None:
-        # Read-only since the next call overwrites it; until then it is what the task reads.
+        # Outputs are read-only for users, because the next step overwrites them.
         output = self._outputs[name]
         output.flags.writeable = True
         output[where] = values
         output.flags.writeable = False
 
     def readings(self, names: Iterable[str] = ()) -> Readings:
-        """Returns what the sensors say, fresh arrays.
-
-        Args:
-            names: Topics to read; none for all that the task has.
-        """
+        """Return the present sensor readings of some topics, by default of all, in new arrays."""
         return {name: self._sensors[name]() for name in names or self._sensors}
 
     def observe(self) -> tuple[Array, Array]:
-        """Returns the observations (N, observation size) and achieved goals (N, goal size)."""
+        """Return the observations (N, observation size) and achieved goals (N, goal size)."""
         return self.observe_from(self.readings(self._observed))
 
     def observe_from(self, readings: Readings) -> tuple[Array, Array]:
-        """Returns the same from what the sensors said."""
+        """Return observations and achieved goals that follow from readings."""
         goal = achieved_goal(self.spec, readings)
         return observation(self.spec, readings, self.tick_duration), goal
 
     def _joint_states(self) -> Array:
-        """Positions, velocities and efforts of the robot's scalar joints, (N, 3 * joints)."""
+        """Return positions, velocities and efforts of the robot's joints, (N, 3 * joints)."""
         return np.concatenate(
             [
                 self._qpos[:, self._joint_qpos],
@@ -300,11 +269,7 @@ class Task(ABC):
 
 
 def _scalar_joint(spec: TaskSpec, model: mujoco.MjModel, name: str) -> Any:
-    """A joint of the robot in its model, which slides or turns about one axis.
-
-    Raises:
-        ValueError: If there is none of this name; the message lists those there are.
-    """
+    """Return a hinge or slide joint of the model; raise ValueError, which lists all, otherwise."""
     kinds = (mujoco.mjtJoint.mjJNT_SLIDE.value, mujoco.mjtJoint.mjJNT_HINGE.value)
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT.value, name)
     if number < 0 or model.jnt_type[number] not in kinds:
@@ -317,9 +282,10 @@ def _scalar_joint(spec: TaskSpec, model: mujoco.MjModel, name: str) -> Any:
 
 
 def weakly(sensor: Callable[[], Array]) -> Callable[[], Array]:
-    """A method that does not keep its object alive, for an object that keeps the method.
+    """Return a method in a form that does not keep its object alive.
 
-    A task would else wait for the garbage collector, which does not see how large a batch is.
+    A task that holds its own methods would only be freed by the garbage collector, which
+    underestimates the memory of a batch.
     """
     method = WeakMethod(sensor)
 
@@ -332,7 +298,7 @@ def weakly(sensor: Callable[[], Array]) -> Callable[[], Array]:
 
 
 def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-    """Returns everything that decides a simulation's future, as `Batch.state` holds it."""
+    """Return `mjSTATE_INTEGRATION` of `data`, a row of `Batch.state`."""
     spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
     state = np.empty(mujoco.mj_stateSize(model, spec))
     mujoco.mj_getState(model, data, state, spec)
@@ -340,12 +306,12 @@ def integration_state(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
 
 
 def joint_qpos_slice(model: mujoco.MjModel, name: str) -> slice:
-    """Where a free joint's seven coordinates lie in qpos."""
+    """Return the seven places of a free joint in qpos."""
     address = int(model.joint(name).qposadr[0])
     return slice(address, address + 7)
 
 
 def joint_qvel_slice(model: mujoco.MjModel, name: str) -> slice:
-    """Where a free joint's six velocities lie in qvel."""
+    """Return the six places of a free joint in qvel."""
     address = int(model.joint(name).dofadr[0])
     return slice(address, address + 6)

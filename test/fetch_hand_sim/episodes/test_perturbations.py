@@ -70,16 +70,6 @@ def test_a_copy_of_a_pushed_simulation_is_pushed_during_one_tick_too(simulation)
     assert not twin.data(0).xfrc_applied.any()
 
 
-def test_copies_made_by_1_0_can_be_loaded(simulation):
-    state = simulation.__getstate__()
-    del state['is_pushed']
-    twin = Simulation.__new__(Simulation)
-    twin.__setstate__(state)
-    np.testing.assert_array_equal(
-        twin.observe()['observation'], simulation.observe()['observation']
-    )
-
-
 @pytest.mark.parametrize('task', ['FetchReach', 'HandReach', 'HandManipulatePenFull'])
 def test_every_robot_can_be_pushed(task):
     body = 'robot0:palm' if task.startswith('Hand') else 'robot0:gripper_link'

@@ -211,7 +211,7 @@ def test_bad_resets_move_nothing(arguments, error, message):
         (5, r'an action of FetchPush has shape \(4,\), not \(\)'),
         (np.zeros((1, 4)), r'has shape \(4,\), not \(1, 4\)'),
         (np.full(4, np.nan), 'actions must be finite'),
-        (['up'] * 4, 'actions are numbers'),
+        (['up'] * 4, 'actions must be numbers'),
     ],
 )
 def test_bad_actions_move_nothing(action, message):
@@ -462,7 +462,7 @@ def test_a_thread_is_told_that_another_holds_the_context(monkeypatch):
         pytest.skip(str(error))
     with ThreadPoolExecutor(1) as another:
         for call in (env.render, env.close):
-            with pytest.raises(RuntimeError, match='render and close in the thread of the first'):
+            with pytest.raises(RuntimeError, match='OpenGL works in one thread only'):
                 another.submit(call).result()
     assert (env.render() == before).all()
     env.close()
@@ -527,7 +527,7 @@ def test_an_opengl_that_is_not_there_keeps_nothing_but_pictures(asked, monkeypat
     found, *reason = result.stdout.splitlines()
     assert found == asked
     if asked == 'nonsense':
-        assert 'MUJOCO_GL=nonsense has none; allowed: egl, osmesa, glfw' in reason[0]
+        assert 'MUJOCO_GL=nonsense; allowed: egl' in reason[0]
     elif reason:
         assert reason[0].startswith('rendering needs OpenGL: apt install')
 

@@ -11,8 +11,7 @@ import pytest
 from mujoco.batch import Batch
 
 from fetch_hand_sim.simulation import Simulation
-from fetch_hand_sim.simulation.model_tuning import FETCH_NEVER_TOUCHING
-from fetch_hand_sim.simulation.models import load_model
+from fetch_hand_sim.simulation.models import FETCH_NEVER_TOUCHING, load_model
 from fetch_hand_sim.simulation.tasks.registry import task_asset
 
 # One of each model.

@@ -220,10 +220,3 @@ def test_settings_of_an_environment_keep_the_parameter():
     env.reward_type = 'dense'
     assert env.simulation.metric.scale == copy.deepcopy(env).simulation.metric.scale == 0.5
     assert env.distance_threshold == 0.2
-
-
-def test_what_copies_made_by_1_0_say_of_a_metric_is_understood():
-    spec = TASKS['FetchPush']
-    old = GoalMetric.__new__(GoalMetric)
-    old.__setstate__([spec, 'paper', 'dense'])
-    assert old == GoalMetric(spec, 'paper', 'dense')
