@@ -95,6 +95,7 @@ class Disturber:
         self._applied = np.zeros((count, size))
         self._lost = np.zeros(count, np.int64)
         self._true: dict[str, Array] = {}
+        self._is_true_current = False
         self._held: dict[str, Array] = {}
         self._physics = VariedPhysics(task, disturbances.physics)
         self._pushed_body = _pushed_body(task)
@@ -270,6 +271,16 @@ class Disturber:
         """Return what the disturbed sensors measured last, fresh arrays."""
         return {name: values.copy() for name, values in self._held.items()}
 
+    def true_readings(self) -> Readings:
+        """Return what undisturbed sensors measure now, fresh arrays."""
+        if not self._is_true_current:
+            return self._task.readings()
+        return {name: past[0].copy() for name, past in self._true.items()}
+
+    def note_written_state(self) -> None:
+        """Read the true sensors again, because the user has changed the state."""
+        self._is_true_current = False
+
     def _sense(self, ids: Ids, is_first: bool) -> None:
         true = self._task.readings()
         for name, values in true.items():
@@ -282,6 +293,7 @@ class Disturber:
             else:
                 past[1:] = past[:-1].copy()
                 past[0] = values
+        self._is_true_current = True
         self._sense_joints(ids, true)
         self._sense_object(ids, true, is_first)
         for name in true.keys() - {*_JOINT_TOPICS, *_OBJECT_TOPICS}:
@@ -345,6 +357,7 @@ class Disturber:
         """Continue from what `state` returned."""
         for name in _STATE:
             setattr(self, name, state[name])
+        self._is_true_current = False
         for name in state['varied']:
             self._physics.allow(name)
         self._physics.restore(self._all)

@@ -38,7 +38,7 @@ from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import Disturbances, read_disturbances
-from msgs_spec.observations import Readings
+from msgs_spec.observations import Readings, achieved_goal
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,
     TIMINGS,
@@ -210,6 +210,8 @@ class Simulation:
     def write_data(self, index: int, data: Any) -> None:
         """Continue simulation `index` from a `mujoco.MjData`."""
         self._task.write_data(self._index(index), self._fitting(data))
+        if self._disturber is not None:
+            self._disturber.note_written_state()
 
     def apply_model_changes(self) -> None:
         """Step with `model` as it is now; the simulation keeps its own copy.
@@ -404,14 +406,15 @@ class Simulation:
 
     def true_readings(self) -> Readings:
         """Return what undisturbed sensors would measure, as `readings`."""
-        return self._task.readings()
+        disturber = self._disturber
+        return self._task.readings() if disturber is None else disturber.true_readings()
 
     def observe(self) -> Observation:
         """Return the observation now, fresh arrays."""
         if self._disturber is None:
             return self._sensed(*self._task.observe())
         sensed, _ = self._task.observe_from(self._disturber.readings())
-        return self._sensed(sensed, self._task.observe()[1])
+        return self._sensed(sensed, achieved_goal(self.spec, self._disturber.true_readings()))
 
     def observe_from(self, readings: Readings) -> Observation:
         """Return the observation that follows from the result of `readings`."""

@@ -152,3 +152,27 @@ def test_episodes_draw_variations_within_their_range() -> None:
     simulation.reset(seed=0)
     drawn = [simulation.variation(index)['action_latency'] for index in range(100)]
     assert set(drawn) == {0.0, 1.0, 2.0}
+
+
+def test_sensors_are_read_once_a_step_and_again_after_the_state_was_written() -> None:
+    simulation = Simulation('FetchPush', 1, keeps_data=True, disturbances='hardware')
+    simulation.reset(seed=0)
+    count = 0
+    read = simulation.task.readings
+
+    def counted(*names):
+        nonlocal count
+        count += 1
+        return read(*names)
+
+    simulation.task.readings = counted  # type: ignore[method-assign]
+    result = simulation.step(np.zeros((1, 4), np.float32))
+    truth = simulation.true_readings()
+    assert count == 1
+    assert (truth['object_pose'][:, :3] == result.observation['achieved_goal']).all()
+    data = simulation.data(0)
+    data.joint('object0:joint').qpos[0] += 0.1
+    mujoco.mj_forward(simulation.model, data)
+    simulation.write_data(0, data)
+    moved = simulation.observe()['achieved_goal'] - result.observation['achieved_goal']
+    assert moved[0, 0] == pytest.approx(0.1)
