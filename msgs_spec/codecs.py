@@ -8,6 +8,7 @@ message. `decode` reads it, also from messages of rclpy, whose fields have the s
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -21,6 +22,7 @@ from msgs_spec.schemas import deserialize, message_class, serialize
 from msgs_spec.topics import TopicSpec
 
 _NANOSECONDS = 10**9
+_ANSWER_LABEL = re.compile(r'answers ([0-9]{19})')
 
 
 def message_stamp(message: Any) -> int:
@@ -96,6 +98,19 @@ def build_status(
 def decode_status(message: Any) -> dict[str, str]:
     """Return the key/value pairs of a DiagnosticArray; the last of equal keys counts."""
     return {pair.key: pair.value for status in message.status for pair in status.values}
+
+
+def answer_label(stamp: int) -> str:
+    """Return the label in the layout of a command that answers an observation of this stamp."""
+    return f'answers {stamp:019d}'
+
+
+def answered_stamp(message: Any) -> int | None:
+    """Return the stamp, nanoseconds, of the observation that a command answers, if it names one."""
+    for dimension in message.layout.dim[1:2]:
+        if found := _ANSWER_LABEL.fullmatch(dimension.label):
+            return int(found[1])
+    return None
 
 
 def check_frame(topic: TopicSpec, frame: str) -> None:
@@ -395,6 +410,42 @@ class TopicCodec:
         if self._template.count(pattern) != 1 or offset % _FLOAT.size:
             raise RuntimeError(f'{self.topic.name}: cannot place {marker} in the template')
         return offset // _FLOAT.size
+
+
+class CommandCodec:
+    """Encodes commands that name the observation they answer.
+
+    The stamp of the observation is the label of a second dimension of size 1 in the layout.
+    Receivers that read only `data` need not know it.
+
+    Args:
+        topic: The topic `commands` of a task.
+    """
+
+    def __init__(self, topic: TopicSpec) -> None:
+        self._topic = topic
+        message = build_message(topic, 0, np.zeros(topic.size))
+        label = answer_label(0)
+        dimension = message_class('std_msgs/msg/MultiArrayDimension')
+        message.layout.dim.append(dimension(label=label, size=1, stride=1))
+        self._template = serialize(topic.type_name, message)
+        start = self._template.index(label.encode())
+        self._label = slice(start, start + len(label))
+
+    def encode(self, stamp: int, values: ArrayLike) -> bytes:
+        """Return the CDR bytes of a command.
+
+        Args:
+            stamp: Stamp of the observation, nanoseconds.
+            values: (topic.size,) in the order of the layout.
+        """
+        data = bytearray(self._template)
+        data[self._label] = answer_label(stamp).encode()
+        # The numbers are the last field.
+        data[-_FLOAT.size * self._topic.size :] = (
+            checked_size(self._topic, values).astype('<f8').tobytes()
+        )
+        return bytes(data)
 
 
 def _equal(messages: NDArray[np.uint8], expected: bytes) -> bool:

@@ -70,6 +70,8 @@ class ParameterSpec:
 
 LARGEST_SEED = 2**32 - 1
 
+# ms. A robot that waits longer is in lockstep.
+LONGEST_ANSWER_WAIT = 1000.0
 # N. Larger forces throw the robots apart.
 LARGEST_PERTURBATION = 100.0
 # Pixels.
@@ -153,6 +155,16 @@ SIM_NODE = (
         'Seconds without a command after which the robot holds; 0 never within an episode.',
         lower=0.0,
         upper=3600.0,
+        read_only=False,
+    ),
+    ParameterSpec(
+        'answer_wait',
+        'double',
+        0.0,
+        'Milliseconds that a tick in mode realtime waits at most for the command that answers the '
+        'last observation; 0 never waits.',
+        lower=0.0,
+        upper=LONGEST_ANSWER_WAIT,
         read_only=False,
     ),
     ParameterSpec(

@@ -148,6 +148,8 @@ class Tick:
         true_readings: Sensor readings without disturbances; None if there are none.
         has_diverged: Whether the simulation diverged in the last step, which ends the episode;
             state, goal and reward are those after MuJoCo's reset.
+        late_commands: Steps of the episode so far whose command did not answer the observation
+            before; None in lockstep, where steps wait for commands.
     """
 
     stamp_ns: int
@@ -160,6 +162,7 @@ class Tick:
     status: EpisodeStatus
     true_readings: Readings | None = None
     has_diverged: bool = False
+    late_commands: int | None = None
 
 
 def _vectors(tick: Tick) -> dict[str, ArrayLike | None]:

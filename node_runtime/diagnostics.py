@@ -25,6 +25,7 @@ PAUSED = 'paused'
 RATE = 'rate (Hz)'
 ASKED_RATE = 'rate asked (Hz)'
 MISSED_TICKS = 'missed ticks'
+LATE_COMMANDS = 'late commands'
 PERTURB_LIMIT = 'perturb limit (N)'
 COMMANDERS = 'commanders'
 # The latest stamp, whose seconds are an int32. Clocks of machines may be later.

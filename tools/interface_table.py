@@ -30,7 +30,9 @@ _VIEWING = (
 )
 _COMMANDS = (
     'The order of the values in `commands` and `applied_command`. A joint is named as here in '
-    '`joint_commands`, after the prefix.'
+    '`joint_commands`, after the prefix. `policy_node` names the observation that a command '
+    'answers: its layout has a second dimension of size 1 with the label `answers <stamp in 19 '
+    'digits, ns>`.'
 )
 _FAMILIES: dict[str, Callable[[TaskSpec], bool]] = {
     'all': lambda task: True,

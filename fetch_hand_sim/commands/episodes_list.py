@@ -38,8 +38,18 @@ from node_runtime.command_line import (
 )
 
 _NAME = 'fetch_hand_sim episodes list'
-_COLUMNS = ('episode', 'task', 'seed', 'steps', 'return', 'success', 'seconds', 'KiB', 'ended')
-_NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB'})
+_NUMBERS = ('seed', 'steps', 'late', 'return', 'seconds', 'KiB')
+_COLUMNS = (
+    'episode',
+    'task',
+    'seed',
+    'steps',
+    'late',
+    'return',
+    'success',
+    *_NUMBERS[-2:],
+    'ended',
+)
 # Wide enough for every column. A narrow terminal wraps lines, which keeps names whole.
 _WIDEST = 400
 _LONGEST_CELL = 60
@@ -83,6 +93,7 @@ def _cells(episode: EpisodeSummary) -> list[str]:
         f'{episode.duration_s:.2f}',
         f'{episode.size_bytes / 1024:.0f}',
         'complete' if outcome.is_complete else f'interrupted: {outcome.reason or "?"}',
+        '-' if outcome.late_commands is None else str(outcome.late_commands),
     ]
 
 
@@ -156,6 +167,7 @@ def _as_json(episode: EpisodeSummary) -> dict[str, Any]:
         'task': metadata.get('task'),
         'seed': integer_or_none(metadata, 'seed'),
         'steps': outcome.steps,
+        'late_commands': outcome.late_commands,
         'return': outcome.episode_return,
         'success': outcome.is_success,
         'seconds': episode.duration_s,

@@ -113,6 +113,8 @@ class EpisodeOutcome:
         episode_return: Sum of rewards.
         is_success: Whether the goal was reached at the end.
         received_not_logged: Number of received messages beyond the allowance, by topic.
+        late_commands: Steps whose command did not answer the observation before; None in lockstep,
+            in generated episodes and in files of version 1.
     """
 
     is_complete: bool = True
@@ -121,6 +123,7 @@ class EpisodeOutcome:
     episode_return: float | None = None
     is_success: bool | None = None
     received_not_logged: Mapping[str, int] = field(default_factory=dict)
+    late_commands: int | None = None
 
     @classmethod
     def parse(cls, result: Strings) -> EpisodeOutcome:
@@ -133,6 +136,7 @@ class EpisodeOutcome:
             episode_return=_number_or_none(result.get('return', ''), float),
             is_success=_flag(result.get('success', '')),
             received_not_logged=_counts(result.get('received_not_logged', '')),
+            late_commands=_number_or_none(result.get('late_commands', ''), int),
         )
 
     def to_strings(self) -> dict[str, str]:
@@ -141,6 +145,7 @@ class EpisodeOutcome:
             'steps': None if self.steps is None else str(self.steps),
             'return': None if self.episode_return is None else repr(self.episode_return),
             'success': None if self.is_success is None else str(self.is_success).lower(),
+            'late_commands': None if self.late_commands is None else str(self.late_commands),
             'complete': str(self.is_complete).lower(),
             'reason': self.reason,
             'received_not_logged': (

@@ -41,7 +41,7 @@ _LONGEST = 80
 # Keys of the record `episode` that name software; another value is a change, not a difference.
 _SOFTWARE = ('interface_version', 'model_sha256', 'source_revision')
 # Keys of the record `episode_result` that do not follow from the simulation.
-_NOT_SIMULATED = {'reason', 'received_not_logged'}
+_NOT_SIMULATED = {'reason', 'received_not_logged', 'late_commands'}
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from fetch_hand_sim.episodes.recorder import (
 from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS, RobotEpisode, sense
 from fetch_hand_sim.simulation import Observation, Simulation
 from msgs_spec.arrays import Array
-from msgs_spec.codecs import TopicCodec
+from msgs_spec.codecs import CommandCodec
 from msgs_spec.robots import clip_command, command_from_action
 from msgs_spec.tick import Tick, TickEncoder
 from msgs_spec.topics import topic
@@ -71,7 +71,7 @@ class EpisodeGenerator:
         self._context = context
         self._encoder = TickEncoder(simulation.spec)
         self._commands = topic(simulation.spec, 'commands')
-        self._command_encoder = TopicCodec(self._commands)
+        self._command_encoder = CommandCodec(self._commands)
         self._period_ns = round(simulation.tick_duration * 1e9)
 
     def generate(self, episodes: int, first_seed: int = 0) -> Iterator[LoggedEpisode]:
@@ -136,7 +136,8 @@ class EpisodeGenerator:
         for robot, command in zip(robots, commands, strict=False):
             if not robot.episode.is_finished:
                 stamp_ns, messages, _ = robot.messages[-1]
-                robot.messages[-1] = (stamp_ns, messages, self._command_encoder.encode(0, command))
+                data = self._command_encoder.encode(stamp_ns, command)
+                robot.messages[-1] = (stamp_ns, messages, data)
 
     def _write(self, robot: _Robot) -> EpisodeWriter:
         status = robot.episode.status

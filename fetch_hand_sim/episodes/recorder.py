@@ -116,11 +116,13 @@ class LoggedEpisode:
         status: Status of the last tick.
         path: The bag directory.
         is_complete: Whether the episode ran to its end.
+        late_commands: See `Tick`.
     """
 
     status: EpisodeStatus
     path: Path
     is_complete: bool
+    late_commands: int | None = None
 
 
 class EpisodeRecorder:
@@ -160,7 +162,7 @@ class EpisodeRecorder:
         self._on_logged = on_logged
         self._on_slow = on_slow
         self._reported_s = self._report_after = 0.0
-        self._status: EpisodeStatus | None = None
+        self._last_tick: Tick | None = None
         # Used by the writing thread alone.
         self._episodes = EpisodeDirectory(directory, namespace=namespace)
         self._attachments = attachments
@@ -187,17 +189,17 @@ class EpisodeRecorder:
             self._end('reset before the end')
             if not self.has_failed:
                 self._put(partial(self._begin, tick.status, self._metadata(tick.status)))
-                self._status = tick.status
-        if self._status is None:
+                self._last_tick = tick
+        if self._last_tick is None:
             return
         self._put(partial(self._write_tick, tick.stamp_ns, messages))
-        self._status = tick.status
+        self._last_tick = tick
         if tick.status.phase == 'finished':
             self._end(DIVERGED if tick.has_diverged else None)
 
     def record_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> None:
         """Log a message received since the last tick; between episodes it belongs to no file."""
-        if self._status is not None:
+        if self._last_tick is not None:
             self._put(partial(self._write_received, topic, data, is_refused))
 
     def close(self, reason: str, gives_up: Callable[[], bool] = lambda: False) -> None:
@@ -226,9 +228,9 @@ class EpisodeRecorder:
 
     def _end(self, reason: str | None) -> None:
         """Complete the running episode, if any; with a reason, marked as cut short."""
-        status, self._status = self._status, None
-        if status is not None:
-            self._put(partial(self._finish, status, reason))
+        tick, self._last_tick = self._last_tick, None
+        if tick is not None:
+            self._put(partial(self._finish, tick, reason))
 
     def _put(self, task: Task) -> None:
         """Queue a task; a robot that is faster than its disk waits here."""
@@ -272,7 +274,7 @@ class EpisodeRecorder:
 
     def _fail(self, line: str) -> None:
         self.has_failed = True
-        self._status = None
+        self._last_tick = None
         if self._unreported.acquire(blocking=False):
             self._on_error(line)
 
@@ -334,11 +336,11 @@ class EpisodeRecorder:
         if self._writer is not None:
             self._writer.write_received(topic, data, is_refused=is_refused)
 
-    def _finish(self, status: EpisodeStatus, reason: str | None) -> None:
+    def _finish(self, tick: Tick, reason: str | None) -> None:
         if self._writer is not None:
             writer, self._writer = self._writer, None
-            writer.end(episode_result(status), reason)
-            self._unstored.put(partial(self._store, writer, status, reason is None))
+            writer.end(episode_result(tick.status, tick.late_commands), reason)
+            self._unstored.put(partial(self._store, writer, tick, reason is None))
 
     # The storing thread
 
@@ -347,20 +349,21 @@ class EpisodeRecorder:
         while (store := self._unstored.get()) is not None:
             store()
 
-    def _store(self, writer: EpisodeWriter, status: EpisodeStatus, is_complete: bool) -> None:
+    def _store(self, writer: EpisodeWriter, tick: Tick, is_complete: bool) -> None:
         try:
             path = writer.store()
         except EpisodeLogError as error:
             self._fail(str(error))
         else:
             if path is not None:
-                self._on_logged(LoggedEpisode(status, path, is_complete))
+                self._on_logged(LoggedEpisode(tick.status, path, is_complete, tick.late_commands))
 
 
-def episode_result(status: EpisodeStatus) -> dict[str, str]:
+def episode_result(status: EpisodeStatus, late_commands: int | None = None) -> dict[str, str]:
     """Return the metadata record `episode_result` of an episode with this last status."""
     return EpisodeOutcome(
         steps=status.tick,
         episode_return=status.episode_return,
         is_success=status.is_success,
+        late_commands=late_commands,
     ).to_strings()

@@ -40,6 +40,8 @@ class CommandBuffer:
         last_far_out: The value far out of range and its limits.
         last_rejection: Why the last command was rejected; empty if it was valid.
         has_fresh_command: Whether a command came since the last `take` or `start_episode`.
+        answered_stamp: Stamp of the observation that the last command answers, nanoseconds; None
+            if it names none.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class CommandBuffer:
         self._command: Array | None = None
         self._received_at: float | None = None
         self.has_fresh_command = False
+        self.answered_stamp: int | None = None
 
     @property
     def has_command(self) -> bool:
@@ -81,8 +84,12 @@ class CommandBuffer:
         self._command = None
         self.has_fresh_command = False
 
-    def accept(self, values: ArrayLike) -> None:
+    def accept(self, values: ArrayLike, answered_stamp: int | None = None) -> None:
         """Store a whole command, in order.
+
+        Args:
+            values: (action size,).
+            answered_stamp: Stamp of the observation that it answers, nanoseconds, if known.
 
         Raises:
             ValueError: If its size is wrong or a value is not finite; the buffer is unchanged.
@@ -91,7 +98,7 @@ class CommandBuffer:
         size = self._robot.action_size
         if command.size != size:
             self._reject('wrong size', f'{command.size} values given; allowed: {size}')
-        self._store(command)
+        self._store(command, answered_stamp)
 
     def accept_named(self, names: Sequence[str], positions: ArrayLike) -> None:
         """Store joint positions by name, in any order; other joints keep their target.
@@ -145,7 +152,7 @@ class CommandBuffer:
         keeps = [part.name == 'gripper' for part in self._robot.command]
         return np.where(keeps, command, self._resting)
 
-    def _store(self, command: Array) -> None:
+    def _store(self, command: Array, answered_stamp: int | None = None) -> None:
         finite = np.isfinite(command)
         if not finite.all():
             index = int(np.argmin(finite))
@@ -156,6 +163,7 @@ class CommandBuffer:
             self._count_clipping(command)
         self._received_at = self._clock()
         self.has_fresh_command = True
+        self.answered_stamp = answered_stamp
         self.accepted += 1
         self.last_rejection = ''
 

@@ -15,6 +15,7 @@ from msgs_spec.topics import DIAGNOSTICS, REAL_TIME_FACTOR
 from node_runtime.diagnostics import (
     ASKED_RATE,
     COMMANDERS,
+    LATE_COMMANDS,
     MISSED_TICKS,
     MODE,
     PAUSED,
@@ -150,6 +151,12 @@ CONDITIONS = (
         lambda s: f'{s.count("missed")} ticks missed',
     ),
     Condition(
+        'commands late',
+        Level.WARN,
+        lambda s: s.count('late'),
+        lambda s: f'{s.count("late")} late commands: not the answer to the last observation',
+    ),
+    Condition(
         'too slow',
         Level.WARN,
         lambda s: s.shortfall and not s.count('missed'),
@@ -270,6 +277,7 @@ class Health:
             'ticks': robot.counters.ticks,
             'diverged': robot.runner.simulation.divergences,
             'missed': robot.schedule.missed_ticks,
+            'late': robot.counters.late_commands,
             'rejected': robot.buffer.rejected.total(),
             'far out': robot.buffer.far_out,
             'goals rejected': robot.counters.goals_rejected,
@@ -306,6 +314,7 @@ class Health:
             MISSED_TICKS: str(schedule.missed_ticks),
             **{f'tick time {name} (ms)': value for name, value in tick_time.items()},
             'command age (s)': '-' if age is None else f'{age:.3f}',
+            LATE_COMMANDS: str(counters.late_commands),
             'commands accepted': str(buffer.accepted),
             'commands clipped': str(buffer.clipped),
             'commands far out of range': str(buffer.far_out),

@@ -45,6 +45,7 @@ from node_runtime.ros import (
 from node_runtime.ros_parameters import declare_parameters, set_callback
 
 _WARN_PERIOD = 1.0
+_MILLISECOND = 1e-3
 # Seconds that a beat may take. No beat begins that close to a tick.
 _BEAT_TIME = 0.01
 # Maximum number of callbacks before a due tick, far more than in normal operation.
@@ -122,6 +123,7 @@ class SimNode(Node):
             simulation.tick_duration,
             values['real_time_factor'],
             time.monotonic(),
+            values['answer_wait'] * _MILLISECOND,
         )
         robot = Robot(
             runner,
@@ -203,6 +205,7 @@ class SimNode(Node):
             self._publish(self._robot.waiting_status())
             if self._settings['wait_for_commands']:
                 self._wait_for_commander(loop, stop)
+                self._robot.has_commander = True
             gc.collect()
             gc.freeze()
             self._robot.schedule.restart(time.monotonic())
@@ -310,11 +313,11 @@ class SimNode(Node):
         if self._recorder is not None:
             self._recorder.record(tick, messages)
         if tick.status.phase == 'finished':
-            self._report_episode(tick.status)
+            self._report_episode(tick)
 
-    def _report_episode(self, status: EpisodeStatus) -> None:
+    def _report_episode(self, tick: Tick) -> None:
         if self._recorder is None or self._recorder.has_failed:
-            self.get_logger().info(_episode_line(status))
+            self.get_logger().info(_episode_line(tick.status, tick.late_commands))
         if self._robot.runner.current.has_diverged:
             count = self._robot.runner.simulation.divergences
             self.get_logger().error(
@@ -339,7 +342,8 @@ class SimNode(Node):
 
     def _on_logged(self, episode: LoggedEpisode) -> None:
         end = '' if episode.is_complete else ', cut short'
-        self.get_logger().info(f'{_episode_line(episode.status)}{end}, {episode.path}')
+        line = _episode_line(episode.status, episode.late_commands)
+        self.get_logger().info(f'{line}{end}, {episode.path}')
 
     def _warn(self, topic: str, line: str) -> None:
         # The logger's own throttle would let one topic silence the others.
@@ -375,13 +379,16 @@ class SimNode(Node):
                     self._publish(self._robot.waiting_status())
             elif change.name == 'command_timeout':
                 self._robot.buffer.timeout = float(change.value)
+            elif change.name == 'answer_wait':
+                self._robot.schedule.answer_wait = float(change.value) * _MILLISECOND
             elif change.name == 'disturbances':
                 self._robot.runner.set_next_disturbances(read_disturbances(change.value))
                 self._open_ground_truth()
 
 
-def _episode_line(status: EpisodeStatus) -> str:
+def _episode_line(status: EpisodeStatus, late_commands: int | None) -> str:
+    late = f', {late_commands} late commands' if late_commands else ''
     return (
         f'episode {status.episode} seed {status.seed}: {status.tick} steps, return '
-        f'{status.episode_return:g}, {"success" if status.is_success else "failure"}'
+        f'{status.episode_return:g}, {"success" if status.is_success else "failure"}{late}'
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from fetch_hand_sim.sim_node.robot import Robot
-from msgs_spec.codecs import decode_status
+from msgs_spec.codecs import answered_stamp, decode_status
 from msgs_spec.schemas import deserialize, require_short, serialize
 from msgs_spec.topics import TopicSpec
 
@@ -44,7 +44,9 @@ class Receivers:
         self._on_commander = on_commander
         self._warn = warn
         self._handlers: dict[str, Callable[[TopicSpec, Any], None]] = {
-            'commands': lambda spec, message: robot.buffer.accept(message.data),
+            'commands': lambda spec, message: robot.buffer.accept(
+                message.data, answered_stamp(message)
+            ),
             'joint_commands': lambda spec, message: robot.buffer.accept_named(
                 message.name, message.position
             ),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fetch_hand_sim.episodes.inputs import accept_goal, accept_perturbation
@@ -41,6 +41,7 @@ class Counters:
         episodes: Episodes that ran to their end.
         successes: Episodes whose last tick was a success.
         given_up: Episodes ended by a reset.
+        late_commands: Steps in real time whose command did not answer the last tick.
         goals_set: Goals accepted from outside.
         tick_time: Wall time of a tick: command, physics, encoding, publishing, logging.
     """
@@ -49,6 +50,7 @@ class Counters:
     episodes: int = 0
     successes: int = 0
     given_up: int = 0
+    late_commands: int = 0
     goals_set: int = 0
     goals_rejected: int = 0
     last_goal_rejection: str = ''
@@ -68,6 +70,7 @@ class Robot:
     Attributes:
         counters: Counts since the start.
         perturb_limit: Largest force of a push, N; 0 rejects all.
+        has_commander: Whether the first episode waited for a policy, which answers its first tick.
         last_messages: Messages of the last tick, to be repeated for new subscribers.
     """
 
@@ -84,18 +87,20 @@ class Robot:
         self.schedule = schedule
         self.counters = Counters()
         self.perturb_limit = 0.0
+        self.has_commander = False
         self._emit = emit
         self._clock = clock
         self._encoder = TickEncoder(runner.spec)
         self.last_messages: Messages = []
         self._ticked_at = self._resumed_at = -math.inf
         self._reset_due: float | None = None
+        self._late_commands = 0
 
     def wait(self) -> float:
         """Return the seconds until the next tick is due; the first reset needs no command."""
         now = self._clock()
         has_command = self.buffer.has_fresh_command or not self.runner.has_started
-        wait = self.schedule.wait(now, has_command)
+        wait = self.schedule.wait(now, has_command, self.lacks_answer)
         return wait if self._reset_due is None else min(wait, max(0.0, self._reset_due - now))
 
     @property
@@ -125,16 +130,41 @@ class Robot:
         silence = max(_LONGEST_SILENCE, self.buffer.timeout, 2.0 * schedule.period)
         return min(self.buffer.age() or 0.0, now - self._resumed_at) > silence
 
+    @property
+    def lacks_answer(self) -> bool:
+        """True if a step now would apply a late command.
+
+        A command that names no observation answers the last tick before it. Only a robot in real
+        time that receives commands expects an answer.
+        """
+        if self.schedule.mode == 'lockstep' or self.schedule.is_paused:
+            return False
+        if self.runner.is_between_episodes:
+            return False
+        if self.buffer.has_fresh_command:
+            return self.buffer.answered_stamp not in (None, self.runner.stamp_ns)
+        if self.buffer.age() is None:
+            return self.has_commander and self.counters.ticks == 1
+        return not self.misses_commands
+
     def tick_when_due(self) -> None:
         """Run the tick that is due by `wait`."""
-        self.schedule.begin(self._clock())
+        now, age = self._clock(), self.buffer.age()
+        if self.lacks_answer:
+            self.schedule.postpone(now)
+        elif age is not None:
+            self.schedule.postpone(now - age)
+        self.schedule.begin(now)
         self.tick()
 
     def tick(self) -> None:
         """Apply the latest command, advance by one tick and emit it."""
-        began = self._clock()
+        began, is_late = self._clock(), self.lacks_answer
         tick = self.runner.advance(self.buffer.take())
         phase = tick.status.phase
+        if self.schedule.mode == 'realtime':
+            self._late_commands = is_late + (0 if phase == 'reset' else self._late_commands)
+            tick = replace(tick, late_commands=self._late_commands)
         messages = self._encoder.encode(tick, latched=phase != 'running')
         self._emit(tick, messages)
         self.last_messages = messages
@@ -145,6 +175,7 @@ class Robot:
             self.counters.episodes += 1
             self.counters.successes += tick.status.is_success
         self.counters.ticks += 1
+        self.counters.late_commands += is_late
         self.counters.tick_time.add(self._ticked_at - began)
 
     # Messages without a tick

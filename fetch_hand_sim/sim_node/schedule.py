@@ -21,12 +21,19 @@ class TickSchedule:
         is_paused: Whether ticks are suspended.
         changes: Number of pauses, resumptions and changes of the pace.
         missed_ticks: Deadlines that passed without a tick.
+        answer_wait: Seconds that a tick may wait for the command that answers the last tick.
     """
 
     def __init__(
-        self, mode: Mode, tick_duration: float, real_time_factor: float, now: float
+        self,
+        mode: Mode,
+        tick_duration: float,
+        real_time_factor: float,
+        now: float,
+        answer_wait: float = 0.0,
     ) -> None:
         self.mode = mode
+        self.answer_wait = answer_wait
         self.is_paused = False
         self.changes = 0
         self.missed_ticks = 0
@@ -51,17 +58,24 @@ class TickSchedule:
         is_paced = self.period and self.mode == 'realtime' and not self.is_paused
         return 1.0 / self.period if is_paced else None
 
-    def wait(self, now: float, has_command: bool) -> float:
+    def wait(self, now: float, has_command: bool, lacks_answer: bool = False) -> float:
         """Return the seconds until the next tick; infinity while paused or without a command.
 
         Args:
             now: The present time.
             has_command: Whether a command waits to be applied, or none is needed.
+            lacks_answer: Whether the tick may wait for an answer.
         """
         if self.is_paused or (self.mode == 'lockstep' and not has_command):
             return math.inf
-        is_paced = self.mode == 'realtime' and self._factor
-        return max(0.0, self._due - now) if is_paced else 0.0
+        if self.mode == 'lockstep':
+            return 0.0
+        due = self._due if self._factor else self._began
+        return max(0.0, due + (self.answer_wait if lacks_answer else 0.0) - now)
+
+    def postpone(self, until: float) -> None:
+        """Move the deadline, because the tick waited for an answer; at most by `answer_wait`."""
+        self._due = min(max(self._due, until), self._due + self.answer_wait)
 
     def begin(self, now: float) -> None:
         """Set the next deadline, because the due tick begins.

@@ -156,7 +156,6 @@ class Health:
             RATE: f'{rate:.2f}',
             **{f'inference {name} (ms)': value for name, value in inference.items()},
             'incomplete ticks dropped': str(responder.join.dropped),
-            'ticks overtaken': str(responder.overtaken),
             'unusable messages': str(responder.unusable),
             'failures of the policy': str(responder.failed),
             'observation age (s)': '-' if age is None else f'{age:.3f}',

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_spec.codecs import TopicCodec
+from msgs_spec.codecs import CommandCodec, TopicCodec
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.tasks import task_spec
 from msgs_spec.text import one_line
@@ -41,7 +41,6 @@ class Responder:
         topics: The topics it needs.
         join: Joins them by stamp.
         answered: Commands sent.
-        overtaken: Complete ticks without an answer because a newer one was complete.
         turned_back: Messages with an earlier stamp than the last one of their topic. A restarted
             publisher causes one; two publishers cause many.
         unusable: Invalid messages, and ticks without a valid observation.
@@ -64,7 +63,7 @@ class Responder:
         self._assembler = ObservationAssembler(spec, status.control_hz)
         self._send = send
         self._clock = clock
-        self._commands = TopicCodec(topic(spec, 'commands'))
+        self._commands = CommandCodec(topic(spec, 'commands'))
         self._sources = {
             source.name: TopicCodec(source, requires_frame=True)
             for source in self._assembler.topics
@@ -82,7 +81,6 @@ class Responder:
         self.join = StampJoin((source.name for source in self.topics), clock=clock)
         self._newest: dict[str, int] = {}
         self.answered = 0
-        self.overtaken = 0
         self.turned_back = 0
         self.unusable = 0
         self.failed = 0
@@ -106,7 +104,6 @@ class Responder:
         self._newest[name] = stamp
         vectors = self.join.add(name, stamp, vector)
         if vectors is not None:
-            self.overtaken += self.is_due
             self._due, self._due_stamp = vectors, stamp
 
     def note_phase(self, phase: Phase, stamp: int) -> None:
@@ -188,5 +185,5 @@ class Responder:
             self._ask_again_at = began + _ASK_AGAIN
             raise
         self.inference.add(self._clock() - began)
-        self._unsent = self._commands.encode(0, command)
+        self._unsent = self._commands.encode(self._due_stamp, command)
         self.send_unsent()

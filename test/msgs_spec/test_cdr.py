@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from msgs_spec.codecs import LayoutError, TopicCodec, build_message, decode, message_stamp
+from msgs_spec.codecs import (
+    CommandCodec,
+    LayoutError,
+    TopicCodec,
+    answered_stamp,
+    build_message,
+    decode,
+    message_stamp,
+)
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import TASKS
 from msgs_spec.topics import topic, topics
@@ -69,3 +77,25 @@ def test_invalid_bytes_are_rejected_in_one_line(name):
         with pytest.raises(ValueError) as error:
             codec.decode(data)
         assert '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize('task', ['FetchReach', 'HandReach'])
+@pytest.mark.parametrize('stamp', [0, 1_040_000_000, 2**62])
+def test_commands_name_the_observation_they_answer(task, stamp):
+    commands = topic(TASKS[task], 'commands')
+    values = np.linspace(-1.0, 1.0, commands.size)
+    data = CommandCodec(commands).encode(stamp, values)
+    message = deserialize(commands.type_name, data)
+    assert serialize(commands.type_name, message) == data
+    assert answered_stamp(message) == stamp
+    assert TopicCodec(commands).decode(data)[1].tolist() == values.tolist()
+    plain = deserialize(commands.type_name, TopicCodec(commands).encode(0, values))
+    assert answered_stamp(plain) is None
+
+
+@pytest.mark.parametrize('label', ['', 'answers', 'answers -5', f'answers {"9" * 20}', 'z'])
+def test_other_labels_name_no_observation(label):
+    commands = topic(TASKS['FetchReach'], 'commands')
+    message = deserialize(commands.type_name, CommandCodec(commands).encode(7, np.zeros(4)))
+    message.layout.dim[1].label = label
+    assert answered_stamp(message) is None

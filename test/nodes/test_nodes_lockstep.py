@@ -188,7 +188,7 @@ def test_resets_leave_a_policy_no_tick_behind(start_process: Start, tmp_path: Pa
     cut = [number for number, episode in episodes.items() if not episode.is_complete]
     assert len(cut) > 1
     for number in episodes.keys() - cut:
-        for name in ('/commands', '/reward'):
+        for name in ('/applied_command', '/reward'):
             messages = episodes[number].topics[name].messages
             assert [message.data for message in messages] == undisturbed[number][name], number
 

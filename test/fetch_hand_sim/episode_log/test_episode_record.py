@@ -53,6 +53,7 @@ def test_a_record_without_timing_kept_ticks():
         EpisodeOutcome(steps=50, episode_return=-0.1 - 0.2, is_success=True),
         EpisodeOutcome(is_complete=False, reason='SIGTERM', steps=0, episode_return=0.0),
         EpisodeOutcome(is_complete=False, reason='x', received_not_logged={'commands': 3}),
+        EpisodeOutcome(steps=50, late_commands=0),
     ],
 )
 def test_outcomes_survive(outcome):

@@ -30,13 +30,13 @@ def simulations():
 
 @pytest.fixture
 def make(simulations):
-    def make(mode='realtime', task='FetchReach', factor=1.0, episodes=0):
+    def make(mode='realtime', task='FetchReach', factor=1.0, episodes=0, answer_wait=0.0):
         clock, ticks = Clock(), []
         runner = EpisodeRunner(simulations[task], episodes=episodes)
         robot = Robot(
             runner,
             CommandBuffer(runner.spec.robot, 0.5, clock),
-            TickSchedule(mode, 0.04, factor, clock.now),
+            TickSchedule(mode, 0.04, factor, clock.now, answer_wait),
             lambda tick, messages: ticks.append((tick, messages)),
             clock,
         )

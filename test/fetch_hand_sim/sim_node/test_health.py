@@ -85,6 +85,7 @@ def test_other_clocks_matter_only_to_a_robot_that_publishes_one(make):
     ('problem', 'level', 'text'),
     [
         ('missed', Level.WARN, '3 ticks missed'),
+        ('late', Level.WARN, '2 late commands: not the answer to the last observation'),
         ('rejected', Level.WARN, '1 commands rejected; 3 values given; allowed: 4'),
         (
             'far out',
@@ -116,6 +117,11 @@ def test_a_report_contains_problems_of_the_robot(make, monkeypatch, problem, lev
     if problem == 'missed':
         case.clock.now += 0.17
         case.robot.tick_when_due()
+    elif problem == 'late':
+        case.robot.buffer.accept([0.0] * 4)
+        for _ in range(3):
+            case.clock.now += case.robot.wait()
+            case.robot.tick_when_due()
     elif problem == 'rejected':
         with pytest.raises(ValueError, match='3 values'):
             case.robot.buffer.accept([1.0] * 3)

@@ -232,3 +232,99 @@ def test_goals_that_are_refused_are_counted(make):
     case.robot.tick()
     assert case.ticks[-1][0].desired_goal.tolist() == [1.3, 0.7, 0.6]
     assert (case.robot.counters.goals_set, case.robot.counters.goals_rejected) == (1, 2)
+
+
+def run(case, delays):
+    """Answer each tick after a delay, s, or never (None); return the wall time of each step."""
+    case.robot.tick_when_due()
+    began = []
+    for delay in delays:
+        published = case.clock.now
+        while case.robot.wait() > 0.0:
+            answer = math.inf if delay is None else published + delay
+            left = answer - case.clock.now
+            if 0.0 < left <= case.robot.wait():
+                case.clock.now = answer
+                case.robot.buffer.accept([0.1] * 4)
+            else:
+                case.clock.now += case.robot.wait()
+        case.robot.tick_when_due()
+        began.append(round(case.clock.now - 100.0, 3))
+    return began
+
+
+def test_steps_without_a_new_command_are_counted_as_late(make):
+    case = make()
+    assert run(case, [0.01, None, 0.01, None, None]) == [0.04, 0.08, 0.12, 0.16, 0.2]
+    counts = [tick.late_commands for tick, _ in case.ticks]
+    assert counts == [0, 0, 1, 1, 2, 3]
+    assert case.robot.counters.late_commands == 3
+    case.robot.reset()
+    case.robot.tick_when_due()
+    assert case.ticks[-1][0].late_commands == 0, 'each episode has a count of its own'
+    assert case.robot.counters.late_commands == 3
+
+
+def test_no_command_is_late_before_the_first_and_after_the_last(make):
+    case = make()
+    run(case, [None] * 3)
+    assert case.robot.counters.late_commands == 0
+    run(case, [0.01, *[None] * 30])
+    # After a second of silence no policy commands.
+    assert 23 <= case.robot.counters.late_commands <= 25
+
+
+def test_lockstep_has_no_late_commands_and_does_not_count_them(make):
+    case = make('lockstep', answer_wait=1.0)
+    case.robot.tick_when_due()
+    case.robot.buffer.accept([0.1] * 4)
+    case.robot.tick_when_due()
+    case.robot.step()
+    assert [tick.late_commands for tick, _ in case.ticks] == [None] * 3
+    assert case.robot.counters.late_commands == 0
+
+
+def test_a_tick_waits_for_its_answer_and_the_deadlines_move_with_it(make):
+    case = make(answer_wait=0.02)
+    # In time, 15 ms late, in time, never, in time.
+    began = run(case, [0.01, 0.055, 0.01, None, 0.01])
+    assert began == [0.04, 0.095, 0.135, 0.195, 0.235]
+    assert case.robot.counters.late_commands == 1
+    assert case.robot.schedule.missed_ticks == 0
+
+
+def test_no_tick_waits_where_no_policy_commands(make):
+    case = make(answer_wait=0.02)
+    assert run(case, [None] * 3) == [0.04, 0.08, 0.12]
+    case = make(answer_wait=0.02)
+    case.robot.has_commander = True
+    assert run(case, [None] * 3) == [0.06, 0.1, 0.14], 'its first command is expected once'
+    assert case.robot.counters.late_commands == 1
+
+
+@pytest.mark.parametrize('answer_wait', [0.0, 0.1])
+def test_a_robot_as_fast_as_possible_waits_only_with_answer_wait(make, answer_wait):
+    case = make(factor=0.0, answer_wait=answer_wait)
+    case.robot.buffer.accept([0.1] * 4)
+    case.robot.tick_when_due()
+    assert case.robot.wait() == pytest.approx(answer_wait)
+    case.robot.buffer.accept([0.1] * 4)
+    assert case.robot.wait() == 0.0
+
+
+def test_a_command_that_answers_an_older_observation_is_late(make):
+    case = make(answer_wait=0.02)
+    case.robot.buffer.accept([0.1] * 4)
+    case.robot.tick_when_due()
+    older = case.robot.runner.stamp_ns
+    case.robot.buffer.accept([0.1] * 4, older)
+    assert case.robot.wait() == pytest.approx(0.04)
+    case.clock.now += 0.04
+    case.robot.tick_when_due()
+    assert case.robot.counters.late_commands == 0
+    case.robot.buffer.accept([0.2] * 4, older)
+    assert case.robot.wait() == pytest.approx(0.06)
+    case.clock.now += 0.06
+    case.robot.tick_when_due()
+    assert case.robot.counters.late_commands == 1
+    assert case.ticks[-1][0].applied_command.tolist() == [0.2] * 4

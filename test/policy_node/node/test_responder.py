@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.episodes.runner import FIRST_STAMP_NS, EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.codecs import TopicCodec, decode
+from msgs_spec.codecs import TopicCodec, answered_stamp, decode
 from msgs_spec.robots import command_from_action
 from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import task_spec
@@ -81,6 +81,10 @@ def test_each_tick_gets_one_command_whatever_the_order(case):
     assert len(wire.sent) == len(ticks) == responder.answered
     message = deserialize('std_msgs/msg/Float64MultiArray', wire.sent[0])
     assert decode(topic(REACH, 'commands'), message).tolist() == [0.0] * 4
+    stamps = [
+        answered_stamp(deserialize('std_msgs/msg/Float64MultiArray', data)) for data in wire.sent
+    ]
+    assert stamps == [FIRST_STAMP_NS + 40_000_000 * number for number in range(len(ticks))]
 
 
 def test_a_command_nobody_hears_is_kept_and_sent_once(case):
@@ -150,8 +154,8 @@ def test_hostile_bytes_are_refused_in_one_line_and_counted(case, hostile_count):
             refused += 1
             assert len(str(error)) < 1000
     assert responder.unusable == refused > hostile_count / 10
-    command = TopicCodec(topic(REACH, 'commands')).encode(0, np.zeros(4))
-    assert set(wire.sent) <= {command}
+    sent = {tuple(deserialize('std_msgs/msg/Float64MultiArray', data).data) for data in wire.sent}
+    assert sent <= {(0.0,) * 4}
     responder.forget()
     before = responder.answered
     feed(responder, ticks[-1])
@@ -261,7 +265,7 @@ def test_of_ticks_that_wait_the_newest_is_answered(case):
     responder.answer()
     assert not responder.is_due
     responder.answer()
-    assert (len(wire.sent), responder.overtaken) == (1, len(ticks) - 1)
+    assert len(wire.sent) == 1
 
 
 @pytest.mark.parametrize('stamp', [0, 10**18])

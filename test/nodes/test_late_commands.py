@@ -1,0 +1,140 @@
+"""Late commands and `answer_wait` on a real graph."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from std_msgs.msg import Float64MultiArray
+
+from fetch_hand_sim.commands.episodes_list import main as list_episodes
+from fetch_hand_sim.episode_log import Episode, read_summary
+from fetch_hand_sim.episodes.checker import EpisodeChecker
+from msgs_spec.codecs import CommandCodec, answered_stamp, message_stamp
+from msgs_spec.schemas import deserialize
+from msgs_spec.tasks import task_spec
+from msgs_spec.topics import topic
+from support.graph import (
+    POLICY_NODE,
+    SIM_NODE,
+    Client,
+    Start,
+    client,
+    end,
+    episodes_in,
+    finish,
+    payload,
+    ros_args,
+)
+
+REACH = task_spec('FetchReach')
+COMMANDS = topic(REACH, 'commands')
+
+
+def unanswered(episode: Episode) -> int:
+    """Return the steps before which the log has no command that answers the last tick."""
+    late = 0
+    states = episode.topics['/joint_states'].messages
+    for state, following in itertools.pairwise(states):
+        came = [
+            message
+            for message in episode.topics['/commands'].messages
+            if state.log_time_ns < message.log_time_ns < following.log_time_ns
+        ]
+        stamp = message_stamp(deserialize('sensor_msgs/msg/JointState', state.data))
+        answered = [answered_stamp(deserialize(COMMANDS.type_name, m.data)) for m in came]
+        late += answered[-1:] not in ([None], [stamp])
+    return late
+
+
+def answer_after(robot: Client, seconds: float, steps: int, *, is_stamped: bool = False) -> float:
+    """Answer one tick after the other; return the wall time of that many steps."""
+    codec = CommandCodec(COMMANDS)
+    states = robot.received['joint_states']
+    first = None
+    while len(states) < steps:
+        count = len(states)
+        robot.spin_until(lambda: len(states) > count, 'tick')  # noqa: B023
+        first = first or robot.received_at['joint_states'][-1]
+        robot.spin(seconds)
+        stamp = message_stamp(states[count])
+        stamped = codec.encode(stamp, [0.1, 0.0, 0.0, 0.0])
+        plain = Float64MultiArray(data=[0.1, 0.0, 0.0, 0.0])
+        robot.publish('commands', stamped if is_stamped else plain)
+    return robot.received_at['joint_states'][-1] - first
+
+
+@pytest.mark.parametrize(('is_stamped', 'fewest'), [(False, 5), (True, 45)])
+def test_late_commands_are_in_diagnostics_in_the_file_and_in_the_list(
+    start_process: Start, tmp_path: Path, capsys, is_stamped: bool, fewest: int
+) -> None:
+    """Every answer is late; without stamps, commands that came in time for the next tick count."""
+    arguments = ros_args(wait_for_commands=True, episodes=1, episode_dir=tmp_path, seed=3)
+    sim = start_process(*SIM_NODE, *arguments)
+    with client(REACH) as robot:
+        robot.subscribe('joint_states', '/diagnostics')
+        robot.connect('commands')
+        answer_after(robot, 0.055, 45, is_stamped=is_stamped)
+        robot.spin_until(lambda: int(robot.values()['late commands']) > 5, 'report')
+        text = 'late commands: not the answer to the last observation'
+        assert any(text in each.message for each in robot.reports())
+    code, output = finish(sim)
+    assert code == 0, output
+    (episode,) = episodes_in(tmp_path)
+    late = episode.outcome.late_commands
+    assert late is not None and fewest < late == unanswered(episode)
+    assert f'success, {late} late commands' in output or f'failure, {late} late' in output
+    assert f'late_commands: "{late}"' in (episode.path.parent / 'metadata.yaml').read_text()
+    assert EpisodeChecker().check(episode.path).difference is None
+    assert list_episodes([str(tmp_path)]) == 0
+    header, row, *_ = capsys.readouterr().out.splitlines()
+    assert header.endswith('late commands') and row.split()[-1] == str(late)
+    assert list_episodes([str(tmp_path), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)[0]['late_commands'] == late
+
+
+def test_a_slow_policy_slows_the_robot_that_waits_for_it(start_process: Start) -> None:
+    sim = start_process(*SIM_NODE, *ros_args(wait_for_commands=True))
+    with client(REACH) as robot:
+        robot.subscribe('joint_states', '/diagnostics')
+        robot.connect('commands')
+        wait = Parameter(name='answer_wait', value=ParameterValue(type=3, double_value=400.0))
+        assert robot.call(SetParameters, 'sim_node/set_parameters', parameters=[wait])
+        seconds = answer_after(robot, 0.08, 40)
+        stamps = robot.stamps('joint_states')
+        assert len(stamps) == 40
+        assert stamps == sorted(stamps)
+        # 39 steps of 80 ms or more instead of 40 ms.
+        assert seconds > 39 * 0.08
+        assert (message_stamp(robot.received['joint_states'][-1]) - stamps[0]) / 1e9 < 0.6 * seconds
+        robot.spin_until(lambda: 'late commands' in robot.values(), 'report')
+        assert int(robot.values()['late commands']) <= 2
+        assert robot.values()['missed ticks'] == '0'
+    end(sim)
+
+
+def test_with_answer_wait_real_time_equals_lockstep(start_process: Start, tmp_path: Path) -> None:
+    policy = start_process(*POLICY_NODE)
+    episodes = []
+    for number, parameters in enumerate(
+        ({'mode': 'lockstep'}, {'real_time_factor': 20.0, 'answer_wait': 1000.0})
+    ):
+        directory = tmp_path / str(number)
+        arguments = ros_args(
+            wait_for_commands=True, episodes=2, seed=5, episode_dir=directory, **parameters
+        )
+        code, output = finish(start_process(*SIM_NODE, *arguments))
+        assert code == 0, output
+        episodes.append([payload(each) for each in episodes_in(directory)])
+    end(policy)
+    assert episodes[0] == episodes[1]
+    late = [
+        read_summary(path).outcome.late_commands
+        for directory in sorted(tmp_path.iterdir())
+        for path in sorted(directory.iterdir())
+    ]
+    assert late == [None, None, 0, 0]
