@@ -38,18 +38,19 @@ from node_runtime.command_line import (
 )
 
 _NAME = 'fetch_hand_sim episodes list'
-_NUMBERS = ('seed', 'steps', 'late', 'return', 'seconds', 'KiB')
 _COLUMNS = (
     'episode',
     'task',
     'seed',
     'steps',
-    'late',
     'return',
     'success',
-    *_NUMBERS[-2:],
+    'seconds',
+    'KiB',
     'ended',
+    'late commands',
 )
+_NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB', 'late commands'})
 # Wide enough for every column. A narrow terminal wraps lines, which keeps names whole.
 _WIDEST = 400
 _LONGEST_CELL = 60
