@@ -70,7 +70,7 @@ class Robot:
     Attributes:
         counters: Counts since the start.
         perturb_limit: Largest force of a push, N; 0 rejects all.
-        has_commander: Whether the first episode waited for a policy, which answers its first tick.
+        has_commander: Whether the first episode waited for a policy, which answers from then on.
         last_messages: Messages of the last tick, to be repeated for new subscribers.
     """
 
@@ -144,7 +144,7 @@ class Robot:
         if self.buffer.has_fresh_command:
             return self.buffer.answered_stamp not in (None, self.runner.stamp_ns)
         if self.buffer.age() is None:
-            return self.has_commander and self.counters.ticks == 1
+            return self.has_commander
         return not self.misses_commands
 
     def tick_when_due(self) -> None:
