@@ -26,6 +26,7 @@ from policy_node.training.configuration.groups import (
     Held,
     Hierarchical,
     Horizon,
+    Imitation,
     OffPolicy,
     OneStep,
     Ppo,
@@ -161,7 +162,7 @@ class TrainConfig(Checked):
     goals: Goals = Goals()
     network: Network = Network()
     replay: Replay = Replay()
-    learner: Ddpg | Hierarchical | Ppo = field(default_factory=Ddpg)
+    learner: Ddpg | Hierarchical | Ppo | Imitation = field(default_factory=Ddpg)
     run: Limits = Limits()
     machine: Machine = Machine()
 
@@ -335,6 +336,10 @@ def _contradictions(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool,
     )
     yield 'outcome' in config.goals.goals and not ppo, 'goals outcome needs algorithm ppo'
     yield ppo and config.machine.overlap, 'algorithm ppo needs overlap=false'
+    yield (
+        isinstance(learner, Imitation) and not config.network.init_from,
+        'algorithm imitation needs init_from, the policy to imitate',
+    )
     unusual = unusual_networks(config)
     yield bool(config.network.init_from and unusual), f'init_from excludes {", ".join(unusual)}'
     if isinstance(learner, OffPolicy):

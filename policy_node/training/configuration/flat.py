@@ -49,13 +49,14 @@ _UNMARKED = {
     'importance': 'none',
 }
 _MARK_CHOICES = {
-    'algorithm': ('ddpg', 'ppo'),
+    'algorithm': ('ddpg', 'ppo', 'imitation'),
     'reward_type': ('sparse', 'dense'),
     'condition': ('none', 'threshold', 'horizon'),
     'importance': ('none', 'density', 'decision'),
 }
 _MARK_MEANINGS = {
-    'algorithm': '`ddpg`, or `ppo` (on policy: each cycle once, also with goals in hindsight).',
+    'algorithm': '`ddpg`, `ppo` (on policy: each cycle once, also with goals in hindsight) or '
+    '`imitation` of the policy in `init_from`, which sees the true state.',
     'reward_type': '`sparse` (-1 until success, then 0) or `dense` (negative distance).',
     'condition': 'An input more for actor and critic: `threshold` (log-uniform, .5 ... '
     '`widest_threshold` times that of success, also in the reward) or `horizon` (steps left, whose '

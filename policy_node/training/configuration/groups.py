@@ -269,3 +269,15 @@ class Ppo(Learner):
     def exploration(self) -> Exploration:
         """The noise of the policy."""
         return Exploration(random_epsilon=0.0, noise_std=self.noise_std)
+
+
+@dataclass(frozen=True, slots=True)
+class Imitation(Learner):
+    """Imitation of the policy in `init_from`, which sees the true state (DAgger)."""
+
+    marks: ClassVar[dict[str, Any]] = {'algorithm': 'imitation'}
+
+    @property
+    def exploration(self) -> Exploration:
+        """No noise: the imitating policy acts."""
+        return Exploration(random_epsilon=0.0, noise_std=0.0)

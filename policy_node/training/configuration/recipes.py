@@ -176,17 +176,20 @@ def _best(task: str) -> dict[str, Any]:
 
 
 def _robust(task: str) -> dict[str, Any]:
-    """As `best`, on a robot with the preset `hardware` and up to two ticks of action latency.
-
-    The last three actions are inputs: with them a delay can be known.
-    """
-    hardware = PRESETS['hardware']
-    action = dataclasses.replace(hardware.action, latency=(0, 2))
-    disturbances = dataclasses.replace(hardware, action=action).as_dict()
-    values = _best(task) | {'disturbances': json.dumps(disturbances), 'past_actions': 3}
-    if task == 'FetchReach':
-        values |= {'total_steps': 200_000, 'evaluate_every': 20_000}
-    return values
+    """Imitate the shipped policy on a robot with half of `hardware` and 0 to 2 ticks of latency."""
+    half = PRESETS['hardware'].scaled(0.5)
+    action = dataclasses.replace(half.action, latency=(0, 2))
+    disturbances = dataclasses.replace(half, action=action).as_dict()
+    return _shipped_networks(task) | {
+        'algorithm': 'imitation',
+        'init_from': task,
+        'disturbances': json.dumps(disturbances),
+        'past_actions': 4,
+        'total_steps': 10_000 * task_spec(task).episode_ticks,
+        'updates_per_cycle': 150,
+        'final_learning_rate': 0.02,
+        'evaluate_every': 100_000,
+    }
 
 
 def _object_in_hand(task: str) -> dict[str, Any]:
@@ -234,10 +237,20 @@ def _finetune(task: str) -> dict[str, Any]:
         'total_steps': 4_000_000,
         'evaluation_episodes': 300,
     }
-    if task == 'HandManipulateBlockFull' or 'Pen' in task:
-        # As the shipped networks are.
-        values['hidden_sizes'] = (512, 512, 512)
+    values |= _shipped_networks(task)
     if 'Pen' in task:
         coarser = {'reward_grades': '.5,1,1.5,2.5'}
         values |= {'ticks_after_drop': 3, 'drop_is_lost': True} | coarser
     return values
+
+
+def _shipped_networks(task: str) -> dict[str, Any]:
+    """Sizes and inputs of the shipped networks of a task."""
+    best = _best(task)
+    kept = ('layer_norm', 'goal_features')
+    networks: dict[str, Any] = {name: best[name] for name in kept if name in best}
+    if task == 'FetchSlide':
+        networks['goal_features'] = 'relative'
+    if task == 'HandManipulateBlockFull' or 'Pen' in task:
+        networks['hidden_sizes'] = (512, 512, 512)
+    return networks

@@ -23,10 +23,12 @@ from node_runtime.command_line import (
 from node_runtime.signals import on_stop_signals
 from node_runtime.source_revision import source_revision
 from policy_node.training.configuration.config import TrainConfig, idle_parts
+from policy_node.training.configuration.groups import Imitation
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import is_first_worker, join_workers, leave_workers
 from policy_node.training.machine.host import available_memory, why_too_large
+from policy_node.training.robustness.imitation import ImitationTrainer
 from policy_node.training.runs.finite_checks import TrainingError
 from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.read_networks import read_initial_networks
@@ -45,6 +47,7 @@ from policy_node.training.runs.training_state import Counters
 
 # Told of a cycle with what `progress.csv` has of it; what it returns matters if it is False.
 OnCycle = Callable[[Row], object]
+AnyTrainer = Trainer | ImitationTrainer
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +121,7 @@ def train_run(
         if not resume and (output / STATE_FILE).exists():
             raise UsageError(f'{output} holds a run; continue it with --resume or choose another')
         trainer = _make_trainer(config, output, command, networks, resume, experience)
-        if why := _too_large(trainer):
+        if isinstance(trainer, Trainer) and (why := _too_large(trainer)):
             complain(NAME, why)
         ending = _train_or_explain(trainer, output, command, caller, resume=resume)
         if trainer.workers.is_first:
@@ -137,7 +140,7 @@ def _make_trainer(
     networks: InitialNetworks | None,
     resume: bool,
     experience: Episodes | None,
-) -> Trainer:
+) -> AnyTrainer:
     """Return the trainer with what it starts from.
 
     Raises:
@@ -145,6 +148,9 @@ def _make_trainer(
     """
     try:
         workers = join_workers(choose_device(config.machine.device))
+        if isinstance(config.learner, Imitation):
+            assert networks is not None, 'imitation starts from a policy and is not resumed'
+            return ImitationTrainer(config, output, workers, command, source_revision(), networks)
         trainer = Trainer(config, output, workers, command, source_revision(), networks)
         if resume:
             trainer.resume(output / STATE_FILE)
@@ -158,7 +164,12 @@ def _make_trainer(
 
 
 def _train_or_explain(
-    trainer: Trainer, output: Path, command: str, caller: Caller | None, *, resume: bool
+    trainer: AnyTrainer,
+    output: Path,
+    command: str,
+    caller: Caller | None,
+    *,
+    resume: bool,
 ) -> Ending:
     """Trains; what fails is one line, and what the caller raised stays as it is."""
     try:
@@ -198,7 +209,12 @@ def _too_large(trainer: Trainer) -> str:
 
 
 def _train(
-    trainer: Trainer, output: Path, command: str, caller: Caller | None, *, resume: bool
+    trainer: AnyTrainer,
+    output: Path,
+    command: str,
+    caller: Caller | None,
+    *,
+    resume: bool,
 ) -> Ending:
     log = None
     if trainer.workers.is_first:
@@ -221,7 +237,7 @@ def _train(
     return Ending(reason, trainer.counters, received[0] if received else 0)
 
 
-def _prepare_folder(trainer: Trainer, output: Path, command: str, resume: bool) -> None:
+def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: bool) -> None:
     """Set files of an earlier run aside, record the command and warn of idle parts."""
     if not resume and (said := set_former_run_aside(output)):
         complain(NAME, said)
@@ -233,7 +249,7 @@ def _prepare_folder(trainer: Trainer, output: Path, command: str, resume: bool) 
         complain(NAME, line)
 
 
-def _row_listener(trainer: Trainer, caller: Caller | None) -> Callable[[Row], None] | None:
+def _row_listener(trainer: AnyTrainer, caller: Caller | None) -> Callable[[Row], None] | None:
     """Return the function that passes each cycle to the caller, or None."""
     on_cycle = caller.on_cycle if caller else None
     if on_cycle is None:
@@ -287,7 +303,7 @@ def _initial_networks(config: TrainConfig) -> InitialNetworks:
         networks = read_initial_networks(config.network.init_from).fitted(config)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    if not networks.has_critic:
+    if not networks.has_critic and not isinstance(config.learner, Imitation):
         complain(
             NAME, f'{config.network.init_from} has no critic for this run: a new one learns first'
         )
@@ -295,7 +311,7 @@ def _initial_networks(config: TrainConfig) -> InitialNetworks:
 
 
 @contextlib.contextmanager
-def _stop_on_signals(trainer: Trainer, is_guest: bool = False) -> Iterator[list[int]]:
+def _stop_on_signals(trainer: AnyTrainer, is_guest: bool = False) -> Iterator[list[int]]:
     """Ctrl-C, SIGTERM and SIGHUP end the run after the cycle; a second one ends it at once.
 
     Args:

@@ -1,0 +1,215 @@
+"""Imitate a policy of the undisturbed robot on a disturbed one (DAgger, Ross et al. 2011).
+
+The imitating policy acts. The imitated policy answers each state as it truly is at the tick in
+which the action arrives, so that latency is learned away; see docs/robustness.md.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from msgs_spec.arrays import Array, Array32
+from node_runtime.command_line import complain
+from policy_node.policies.actor import Actor
+from policy_node.policies.policy import past_after
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.evaluation.episodes import EpisodeOutcomes
+from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
+from policy_node.training.experience.simulations import make_simulation
+from policy_node.training.learners.network_shape import network_shape
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine.host import split_threads
+from policy_node.training.runs.initial_networks import InitialNetworks
+from policy_node.training.runs.progress_row import progress_row
+from policy_node.training.runs.run_clock import RunClock
+from policy_node.training.runs.run_folder import LATEST_FILE, RunFolder
+from policy_node.training.runs.run_log import RunLog
+from policy_node.training.runs.saving import NAME, Saver
+from policy_node.training.runs.training_state import Counters, part_of
+
+
+class Answers:
+    """The newest inputs of the imitating policy and the answers of the imitated one.
+
+    Args:
+        capacity: Most pairs kept.
+        inputs: Length of an input.
+        action_size: Length of an answer.
+    """
+
+    def __init__(self, capacity: int, inputs: int, action_size: int) -> None:
+        self._inputs = torch.empty(capacity, inputs)
+        self._answers = torch.empty(capacity, action_size)
+        self._count = 0
+
+    def add(self, inputs: Tensor, answers: Tensor) -> None:
+        """Store inputs (n, features) and answers (n, action size)."""
+        rows = (self._count + torch.arange(len(inputs))) % len(self._inputs)
+        self._inputs[rows], self._answers[rows] = inputs, answers
+        self._count += len(inputs)
+
+    def draw(self, count: int) -> tuple[Tensor, Tensor]:
+        """Draw `count` random pairs."""
+        rows = torch.randint(min(self._count, len(self._inputs)), (count,))
+        return self._inputs[rows], self._answers[rows]
+
+
+class ImitationTrainer:
+    """One run of imitation.
+
+    Args:
+        config: What to train and how.
+        output: Folder of the run.
+        workers: One worker.
+        command: Command line, for the metadata of actors.
+        source_revision: Revision of the source, likewise.
+        init_from: The policy to imitate.
+
+    Raises:
+        ValueError: With several workers.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        output: Path,
+        workers: Workers,
+        command: str,
+        source_revision: str,
+        init_from: InitialNetworks,
+    ) -> None:
+        if workers.world_size > 1:
+            raise ValueError(f'{workers.world_size} workers; algorithm imitation needs 1')
+        self.config, self.workers, self.counters = config, workers, Counters()
+        folder = RunFolder(output, config, command, source_revision, init_from.origin)
+        self._saver = Saver(folder, workers)
+        threads, torch_threads = split_threads(config)
+        torch.set_num_threads(torch_threads)
+        torch.manual_seed(config.seed)
+        self._simulation = make_simulation(config, config.collect.num_envs, threads)
+        count = min(config.collect.num_envs, config.run.evaluation_episodes)
+        self._evaluator = Evaluator(make_simulation(config, count, threads), config)
+        self.actor = Actor(network_shape(config))
+        self.actor.load_state_dict(part_of(init_from.tensors, 'actor'))
+        # The past actions, which the imitated policy does not have, have zero weights here.
+        self._imitated = copy.deepcopy(self.actor).requires_grad_(False)
+        self._optimizer = torch.optim.Adam(self.actor.network.parameters())
+        shape, capacity = self.actor.shape, config.replay.replay_transitions
+        self._answers = Answers(
+            min(capacity, config.run.total_steps), shape.feature_size, shape.action_size
+        )
+        self._stop_reason = ''
+
+    def stop(self, reason: str) -> None:
+        """Request the end of the run after the current cycle."""
+        self._stop_reason = reason
+
+    def train(self, log: RunLog | None = None) -> str:
+        """Run until a limit is reached or `stop` is called; return why it ended."""
+        config, counters, clock = self.config, self.counters, RunClock(self.counters)
+        while True:
+            before = time.monotonic()
+            success = self._collect()
+            loss = self._learn()
+            clock.write(counters)
+            reason = self._reason_to_stop()
+            outcomes = self._evaluate(is_last=bool(reason))
+            row = progress_row(counters, success, outcomes, config.collect.success_rule, [])
+            seconds = max(time.monotonic() - before, 1e-9)
+            ticks = self._simulation.spec.episode_ticks
+            row |= {
+                'actor_loss': loss,
+                'steps_per_second': config.collect.num_envs * ticks / seconds,
+                'samples_per_second': config.learner.updates_per_cycle
+                * config.learner.batch_size
+                / seconds,
+            }
+            if log is not None:
+                log.write(row)
+            if reason:
+                self._save()
+                return reason
+
+    def _collect(self) -> float:
+        """Run one episode of each simulation and store the answers; return the success rate."""
+        simulation, ticks = self._simulation, self._simulation.spec.episode_ticks
+        count = simulation.num_envs
+        seeds = np.random.SeedSequence([self.config.seed, self.counters.env_steps])
+        resets = seeds.generate_state(count) >> 2
+        observation = simulation.reset(seed=[int(each) % EVALUATION_SEED for each in resets])
+        latency = [simulation.variation(i).get('action_latency', 0.0) for i in range(count)]
+        past = np.zeros((count, self.actor.shape.past_size), np.float32)
+        nothing, diverged = past.copy(), np.zeros(count, np.bool_)
+        inputs, answers = [], []
+        for _ in range(ticks):
+            goal = torch.tensor(observation['desired_goal'], dtype=torch.float32)
+            true = simulation.observe_from(simulation.true_readings())['observation']
+            with torch.no_grad():
+                answers.append(self._imitated(self._features(true, nothing, goal)))
+                inputs.append(self._features(observation['observation'], past, goal))
+                action = self.actor(inputs[-1]).numpy()
+            past = past_after(past, action)
+            result = simulation.step(action)
+            observation, diverged = result.observation, diverged | result.diverged
+        for delay in np.unique(latency).astype(int):
+            rows = np.flatnonzero((np.array(latency) == delay) & ~diverged)
+            # An action takes effect `delay` ticks later; the last ones never do.
+            early = torch.stack(inputs[: ticks - delay])[:, rows].flatten(0, 1)
+            late = torch.stack(answers[delay:])[:, rows].flatten(0, 1)
+            self._answers.add(early, late)
+        self.counters.env_steps += count * ticks
+        self.counters.episodes += count
+        return float(result.success.mean())
+
+    def _features(self, observation: Array, past: Array32, goal: Tensor) -> Tensor:
+        seen = np.concatenate([observation, past], axis=-1)
+        return self.actor.features(torch.tensor(seen, dtype=torch.float32), goal)
+
+    def _learn(self) -> float:
+        """Fit the actor to stored answers; return the mean loss."""
+        learner, total = self.config.learner, 0.0
+        left = max(1.0 - self.counters.env_steps / self.config.run.total_steps, 0.0)
+        share = learner.final_learning_rate + (1.0 - learner.final_learning_rate) * left
+        for group in self._optimizer.param_groups:
+            group['lr'] = learner.learning_rate * share
+        for _ in range(learner.updates_per_cycle):
+            inputs, answers = self._answers.draw(learner.batch_size)
+            loss = (self.actor(inputs) - answers).square().mean()
+            self._optimizer.zero_grad()
+            loss.backward()
+            self._optimizer.step()
+            total += loss.item()
+        self.counters.updates += learner.updates_per_cycle
+        return total / max(learner.updates_per_cycle, 1)
+
+    def _evaluate(self, is_last: bool) -> EpisodeOutcomes | None:
+        counters = self.counters
+        if not is_last and counters.env_steps < counters.next_evaluation:
+            return None
+        counters.next_evaluation = counters.env_steps + self.config.run.evaluate_every
+        outcomes = self._evaluator.evaluate(self.actor, -1.0)
+        self._saver.keep_best(outcomes, self.actor, counters)
+        self._save()
+        return outcomes
+
+    def _save(self) -> None:
+        try:
+            self._saver.folder.save_actor(LATEST_FILE, self.actor, self.counters.env_steps)
+        except OSError as error:
+            complain(NAME, f'no checkpoint, the one before is kept: {error}')
+
+    def _reason_to_stop(self) -> str:
+        limits = self.config.run
+        if self._stop_reason:
+            return self._stop_reason
+        if self.counters.env_steps >= limits.total_steps:
+            return f'total_steps {limits.total_steps:,} reached'
+        if limits.time_limit and self.counters.seconds >= limits.time_limit:
+            return f'time_limit {limits.time_limit:g} s reached'
+        return ''
