@@ -1,0 +1,77 @@
+"""Recipe `robust`: imitation of the shipped policy on a disturbed robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from msgs_spec.tasks import TASKS
+from policy_node.policies import checkpoint
+from policy_node.policies.loading import load_actor
+from policy_node.training.configuration.recipes import recipe_config
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.robustness.imitation import Answers, ImitationTrainer
+from policy_node.training.runs.read_networks import read_initial_networks
+from policy_node.training.runs.run_log import read_progress
+from policy_node.training.train_her import main
+
+torch.set_num_threads(1)
+LATE = '{"action": {"latency": 1}}'
+
+
+def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_path: Path) -> None:
+    task = 'FetchPush'
+    config = recipe_config(task, 'robust', num_envs=2, disturbances=LATE)
+    networks = read_initial_networks(task).fitted(config)
+    trainer = ImitationTrainer(config, tmp_path, Workers(), '', '', networks)
+    trainer._collect()
+    pairs = 2 * (TASKS[task].episode_ticks - 1)
+    inputs, answers = trainer._answers._inputs[:pairs], trainer._answers._answers[:pairs]
+    # Without other disturbances, the next input contains the state in which the action arrives.
+    imitated, size = load_actor(task, task), config.network.past_actions * 4
+    start = trainer.actor.shape.past_start
+    seen = torch.cat([inputs[:, :start], inputs[:, start + size :]], dim=1)
+    expected = imitated(seen).detach()
+    torch.testing.assert_close(answers[:-2], expected[2:], rtol=1e-3, atol=1e-3)
+    assert not torch.allclose(answers[:-2], expected[:-2], rtol=1e-3, atol=1e-3)
+
+
+def test_the_newest_answers_are_kept() -> None:
+    answers = Answers(3, 1, 1)
+    for value in range(5):
+        answers.add(torch.full((1, 1), float(value)), torch.full((1, 1), -float(value)))
+    inputs, outputs = answers.draw(200)
+    assert set(inputs.flatten().tolist()) == {2.0, 3.0, 4.0}
+    assert torch.equal(outputs, -inputs)
+
+
+def test_a_run_writes_a_policy_with_past_actions(tmp_path: Path) -> None:
+    run = tmp_path / 'run'
+    arguments = ['--task', 'FetchReach', '--recipe', 'robust', '--steps', '6400']
+    small = ['--set', 'updates_per_cycle=10', '--set', 'evaluation_episodes=64']
+    assert main([*arguments, *small, '--threads', '1', '--output', str(run)]) == 0
+    actor, info = checkpoint.load(run / 'best.safetensors')
+    assert (info.past_actions, info.init_from['name']) == (4, 'FetchReach')
+    assert actor.shape.past_actions == 4
+    assert read_progress(run / 'progress.csv')[-1]['eval_success'] > 0.9
+    state = actor.predict({'observation': np.zeros(10), 'desired_goal': np.zeros(3)})[1]
+    assert state is not None
+
+
+@pytest.mark.parametrize(
+    'options, said',
+    [
+        (['--set', 'algorithm=imitation'], 'init_from'),
+        (['--recipe', 'robust', '--set', 'gamma=.9', '--set', 'past_actions=99'], 'past_actions'),
+        (['--recipe', 'robust', '--set', 'subgoal_every=5'], 'subgoal_every'),
+    ],
+)
+def test_a_setting_that_does_not_fit_is_one_line(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['--task', 'FetchReach', *options, '--output', str(tmp_path / 'run')]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and said in lines[0]
