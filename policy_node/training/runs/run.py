@@ -28,8 +28,8 @@ from policy_node.training.experience.replay import Episodes
 from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import is_first_worker, join_workers, leave_workers
 from policy_node.training.machine.host import available_memory, why_too_large
-from policy_node.training.robustness.imitation import ImitationTrainer
 from policy_node.training.runs.finite_checks import TrainingError
+from policy_node.training.runs.imitation import ImitationTrainer
 from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.read_networks import read_initial_networks
 from policy_node.training.runs.run_folder import (
