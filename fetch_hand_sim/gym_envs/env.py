@@ -21,8 +21,8 @@ from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observati
 from fetch_hand_sim.gym_envs.task_attributes import (
     TaskAttributes,
     check_reset_options,
+    given_by_options,
     goals_of_options,
-    variation_of,
 )
 from fetch_hand_sim.simulation import Observation, Simulation
 from fetch_hand_sim.simulation.arguments import finite_goal
@@ -116,6 +116,8 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
                 hemisphere nearest to the object's. What else is drawn stays that of the seed.
                 `variation`, a dictionary: values of this episode in place of drawn ones, such as
                 `{'friction': 0.7}` (`Simulation.variation` has the names; needs `disturbances`).
+                `start`, a dictionary: `joints`, `joint_velocities`, `object_pose` and
+                `object_velocity`, each optional, as `Simulation.reset` takes them.
 
         Returns:
             The observation, and an empty dictionary.
@@ -125,14 +127,14 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             ValueError: If an option is unknown or the goal is none.
             gymnasium.error.Error: If the seed is no integer or negative.
         """
-        check_reset_options(options, allowed=('goal', 'variation'))
+        check_reset_options(options, allowed=('goal', 'variation', 'start'))
         asked = goals_of_options(options, np.ones(1, dtype=bool), self.spec_of_task)
+        given = given_by_options(options, np.ones(1, dtype=bool))
         super().reset(seed=seed)
         self._physics.send()
         self._release_goal()
         draws_goals = self._draws_goals()
-        variation = variation_of(options)
-        observation = _first(self.simulation.reset(seed=[self.np_random], variation=variation))
+        observation = _first(self.simulation.reset(seed=[self.np_random], **given))
         self._physics.receive()
         if asked is not None:
             self.simulation.set_goal(asked)

@@ -48,29 +48,35 @@ class FetchHandVecEnv(VecEnv):
         self._actions: NDArray[np.float32] | None = None
 
     def reset(self) -> Observation:
-        """Starts all episodes, with the seeds and goals that `seed` and `set_options` set.
+        """Start all episodes, with the seeds and options that `seed` and `set_options` set.
+
+        Options are `goal`, `variation` and `start`, as `FetchHandEnv.reset` takes them.
 
         Raises:
-            ValueError: If `set_options` set another option than `goal`, or a goal that is none. It
-                is forgotten then.
+            ValueError: If an option is unknown or impossible. All options are forgotten then.
         """
-        goals = self._asked_goals()
+        options = self._options
+        self._reset_options()
+        goals = self._asked_goals(options)
+        given = {
+            name: [each.get(name) for each in options]
+            for name in ('variation', 'start')
+            if any(name in each for each in options)
+        }
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
-        observation, _ = self.batch.reset(seed=seeds)
+        observation, _ = self.batch.reset(seed=seeds, options=given)
         self._reset_seeds()
         if goals:
             self.batch.simulation.set_goal(np.array(list(goals.values())), list(goals))
             observation |= self.batch.simulation.observe()
         return observation
 
-    def _asked_goals(self) -> dict[int, Array]:
-        """The goals (goal size,) that options ask for, by environment; once."""
-        given = self._options
-        self._reset_options()
+    def _asked_goals(self, given: Sequence[dict[str, Any]]) -> dict[int, Array]:
+        """Return the goals (goal size,) that options set, by environment."""
         one = np.ones(1, dtype=bool)
         goals = {}
         for index, options in enumerate(given):
-            check_reset_options(options, allowed=('goal',))
+            check_reset_options(options, allowed=('goal', 'variation', 'start'))
             goal = goals_of_options(options, one, self.batch.spec_of_task)
             if goal is not None:
                 goals[index] = goal[0]

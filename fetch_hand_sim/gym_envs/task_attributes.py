@@ -173,9 +173,25 @@ def check_reset_options(options: Any, allowed: tuple[str, ...]) -> None:
             raise ValueError(f'reset option {name!r} is not known; allowed: {known}')
 
 
-def variation_of(options: Any) -> Any:
-    """Return the variation that options of `reset` ask for, or None."""
-    return (options or {}).get('variation')
+def given_by_options(options: Any, mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return what options of `reset` give in place of drawn values, for `Simulation.reset`.
+
+    Args:
+        options: A dictionary with `variation` or `start`, each one for all or a list of N, or None.
+        mask: (N,) which environments start.
+
+    Raises:
+        ValueError: If a list has another length.
+    """
+    given = {}
+    for name in ('variation', 'start'):
+        value = (options or {}).get(name)
+        if isinstance(value, list | tuple):
+            if len(value) != mask.size:
+                raise ValueError(f'{name}: {len(value)} values; allowed: one, or {mask.size}')
+            value = [each for each, starts in zip(value, mask, strict=True) if starts]
+        given[name] = value
+    return given
 
 
 def goals_of_options(options: Any, mask: NDArray[np.bool_], spec: TaskSpec) -> Array | None:

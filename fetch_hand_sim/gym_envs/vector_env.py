@@ -18,8 +18,8 @@ from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observati
 from fetch_hand_sim.gym_envs.task_attributes import (
     TaskAttributes,
     check_reset_options,
+    given_by_options,
     goals_of_options,
-    variation_of,
 )
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.arguments import finite_goal, require_whole
@@ -158,7 +158,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
                 generators go on.
             options: `reset_mask`, booleans (N,): which environments start again; default all.
                 `goal`, (N, goal size) or (goal size,) for all of them: desired goals of those that
-                start, as `FetchHandEnv.reset` takes one. `variation`, likewise, for all that start.
+                start, as `FetchHandEnv.reset` takes one. `variation` and `start`, likewise: one for
+                all, or a list of N with None for what is drawn.
 
         Returns:
             The observations of all environments, in the order of the space, and an empty
@@ -178,11 +179,10 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
                 f'the first reset is one of all; reset_mask leaves out {waiting.tolist()!s:.60}'
             )
         goals = goals_of_options(options, mask, self.spec_of_task)
+        given = given_by_options(options, mask)
         ids = np.flatnonzero(mask)
         seeds = self._each_seed(seed)
-        observation = self.simulation.reset(
-            seed=[seeds[i] for i in ids.tolist()], ids=ids, variation=variation_of(options)
-        )
+        observation = self.simulation.reset(seed=[seeds[i] for i in ids.tolist()], ids=ids, **given)
         for index in ids.tolist():
             if seeds[index] is not None:
                 self._seeds[index] = seeds[index]
@@ -402,7 +402,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         ]
 
     def _reset_mask(self, options: Any) -> Flags:
-        check_reset_options(options, allowed=('reset_mask', 'goal', 'variation'))
+        check_reset_options(options, allowed=('reset_mask', 'goal', 'variation', 'start'))
         if not options or 'reset_mask' not in options:
             return np.ones(self.num_envs, dtype=bool)
         mask = options['reset_mask']

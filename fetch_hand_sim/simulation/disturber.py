@@ -138,18 +138,18 @@ class Disturber:
         self,
         ids: Ids,
         streams: Sequence[np.random.Generator],
-        given: Mapping[str, float] | None = None,
+        given: Mapping[int, Mapping[str, float]] | None = None,
     ) -> None:
         """Begin episodes whose start state the task has set.
 
         Args:
             ids: The simulations, (n,).
             streams: A random stream for each.
-            given: Variations that are not drawn, by the names in `VARIATIONS`.
+            given: Variations that are not drawn, by simulation and the names in `VARIATIONS`.
         """
         for index, stream in zip(ids.tolist(), streams, strict=True):
             self._streams[index] = stream
-            self._draw_episode(index, stream, given or {})
+            self._draw_episode(index, stream, (given or {}).get(index, {}))
             self._draw_block(index)
         self._tick[ids] = 0
         self._lost[ids] = 0

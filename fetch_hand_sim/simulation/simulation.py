@@ -10,10 +10,10 @@ from __future__ import annotations
 import copy
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -35,6 +35,7 @@ from fetch_hand_sim.simulation.arguments import (
 from fetch_hand_sim.simulation.disturber import Disturber
 from fetch_hand_sim.simulation.engine import DivergenceWatch
 from fetch_hand_sim.simulation.models import asset_path
+from fetch_hand_sim.simulation.start_state import StartState, read_start
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import Disturbances, read_disturbances
@@ -49,6 +50,9 @@ from msgs_spec.tasks import (
 )
 
 Observation = dict[str, Array]
+# One mapping for all simulations, or one or None for each.
+EachGiven = Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None
+_Read = TypeVar('_Read')
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -144,8 +148,9 @@ class Simulation:
         self._is_started = np.zeros(num_envs, dtype=np.bool_)
         self._process = os.getpid()
         self._disturber: Disturber | None = None
-        # Variations that the episodes that begin now do not draw.
-        self._given: dict[str, float] = {}
+        # What the episodes that begin now do not draw, by simulation.
+        self._given: dict[int, dict[str, float]] = {}
+        self._starts: dict[int, StartState] = {}
         self.disturbances = disturbances
 
     def __repr__(self) -> str:
@@ -238,7 +243,8 @@ class Simulation:
         self,
         seed: Seeds = None,
         ids: ArrayLike | None = None,
-        variation: Mapping[str, Any] | None = None,
+        variation: EachGiven = None,
+        start: EachGiven = None,
     ) -> Observation:
         """Start new episodes.
 
@@ -248,28 +254,35 @@ class Simulation:
                 reference's draws. A generator in place of a seed is used from then on.
             ids: Indices or a boolean mask (N,) of the simulations; None for all.
             variation: Values for these episodes in place of drawn ones, by the names of
-                `Simulation.variation`; for simulations with `disturbances`.
+                `Simulation.variation`; for simulations with `disturbances`. One mapping for all, or
+                one or None for each simulation of `ids`.
+            start: Start states in place of drawn ones, likewise: a mapping with some of `joints`,
+                `joint_velocities` (numbers by name, or all in the order of `joint_states`; rad or
+                m), `object_pose` (7,) and `object_velocity` (6,). Velocities of what is placed are
+                zero unless given. Goals stay those of the seed; `disturbances` may shift the start.
 
         Returns:
             The observations of all N simulations.
 
         Raises:
             ValueError: If a seed is negative, ids or seeds do not match the simulations, or a
-                variation is unknown or impossible; nothing has moved then.
+                variation or start is unknown or impossible; nothing has moved then.
             TypeError: If a seed is not an integer.
             RuntimeError: If the object never stays on the palm, or this process was forked and
                 lacks the threads of the batch.
         """
         selected = self._select(ids)
-        self._given = self._given_variation(variation)
+        given = self._each_given('variation', variation, selected, self._allowed_variation)
+        starts = self._each_given('start', start, selected, self._read_start)
         fresh = generators(seed, selected)
         for index, generator in zip(selected.tolist(), fresh, strict=True):
             self._generators[index] = generator or self._generators[index]
+        self._given, self._starts = given, starts
         try:
             if selected.size:
                 self._start(np.sort(selected))
         finally:
-            self._given = {}
+            self._given, self._starts = {}, {}
         return self.observe()
 
     def step(self, actions: ArrayLike) -> StepResult:
@@ -462,9 +475,20 @@ class Simulation:
         self._is_pushed = state['is_pushed']
         self._is_started[:] = state['is_started']
 
-    def _given_variation(self, variation: Mapping[str, Any] | None) -> dict[str, float]:
-        if variation is None:
-            return {}
+    def _each_given(
+        self, name: str, given: EachGiven, ids: NDArray[np.intp], read: Callable[[Any], _Read]
+    ) -> dict[int, _Read]:
+        """Return what is given for single simulations, read and checked."""
+        each = list(given) if isinstance(given, list | tuple) else [given] * ids.size
+        if len(each) != ids.size:
+            raise ValueError(f'{name}: {len(each)} values; allowed: one, or {ids.size}')
+        pairs = zip(ids.tolist(), each, strict=True)
+        return {index: read(value) for index, value in pairs if value is not None}
+
+    def _read_start(self, given: Any) -> StartState:
+        return read_start(given, self._task)
+
+    def _allowed_variation(self, variation: Any) -> dict[str, float]:
         if not isinstance(variation, Mapping):
             raise ValueError(f'variation {variation!r:.60}; allowed: a mapping of names to numbers')
         if self._disturber is None:
@@ -483,6 +507,11 @@ class Simulation:
         if self._disturber is not None:
             self._disturber.start_nominal(ids)
         self.goals[ids] = self._task.reset(ids, own)
+        if self._starts:
+            batch = self._task.batch
+            for index, start in self._starts.items():
+                start.write(batch.bind('qpos')[index], batch.bind('qvel')[index])
+            batch.forward(np.array(sorted(self._starts)))
         if self._disturber is not None:
             self._disturber.start(ids, streams, self._given)
         self._divergence.forget()

@@ -68,10 +68,10 @@ class GambleSimulation(Simulation):
             setattr(self, name, values.copy())
 
     def reset(
-        self, seed: Seeds = None, ids: ArrayLike | None = None, variation: Any = None
+        self, seed: Seeds = None, ids: ArrayLike | None = None, *given: Any, **options: Any
     ) -> Observation:
-        """Starts simulations again, as `Simulation.reset`; the landing is drawn after the goal."""
-        return self._seen(super().reset(seed, ids, variation))
+        """Start episodes as `Simulation.reset` does; the landing is drawn after the goal."""
+        return self._seen(super().reset(seed, ids, *given, **options))
 
     def _start(self, ids: NDArray[np.intp]) -> None:
         super()._start(ids)

@@ -184,7 +184,7 @@ def test_an_id_makes_its_own_task_only(make_one):
     ('arguments', 'error', 'message'),
     [
         ({'options': 3}, TypeError, 'a dictionary or None, not 3'),
-        ({'options': {'start': 0}}, ValueError, "option 'start' is not known; allowed: goal"),
+        ({'options': {'begin': 0}}, ValueError, "option 'begin' is not known; allowed: goal"),
         (
             {'options': {'goal': [0, 0]}},
             ValueError,

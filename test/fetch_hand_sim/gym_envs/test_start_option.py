@@ -1,0 +1,163 @@
+"""The reset option `start`: joints, object pose and velocities in place of drawn ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import fetch_hand_sim
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.tasks import TASKS
+
+POSE = [1.25, 0.65, 0.45, 0.6, 0.0, 0.0, 0.8]
+PUSH = {'object_pose': POSE, 'object_velocity': [0.1, 0.0, 0.0, 0.0, 0.0, 2.0]}
+
+
+def row(env, topic, index=0):
+    return env.unwrapped.simulation.true_readings()[topic][index]
+
+
+def test_an_object_starts_where_it_was_placed_with_its_velocity():
+    env = fetch_hand_sim.make('FetchPush')
+    drawn, _ = env.reset(seed=1)
+    observation, _ = env.reset(seed=1, options={'start': PUSH})
+    assert observation['achieved_goal'] == pytest.approx(POSE[:3])
+    assert row(env, 'object_pose') == pytest.approx(POSE)
+    assert row(env, 'object_twist') == pytest.approx(PUSH['object_velocity'], abs=1e-9)
+    assert (observation['desired_goal'] == drawn['desired_goal']).all(), 'the goal of the seed'
+    env.step(np.zeros(4, np.float32))
+    assert row(env, 'object_pose')[0] > POSE[0]
+    env.reset(options={'start': {'object_pose': POSE}})
+    assert row(env, 'object_twist') == pytest.approx(np.zeros(6))
+    again, _ = env.reset(seed=1)
+    assert (again['observation'] == drawn['observation']).all(), 'the next start is drawn again'
+
+
+@pytest.mark.parametrize('task', TASKS)
+def test_the_same_start_gives_the_same_bits_and_a_state_can_be_given_again(task):
+    simulation = Simulation(task, 2)
+    simulation.reset(seed=4)
+    joints, readings = simulation.spec.robot.joints, simulation.true_readings()
+    count = len(joints)
+    start = {
+        'joints': readings['joint_states'][0, :count],
+        'joint_velocities': dict(
+            zip(joints, readings['joint_states'][0, count : 2 * count], strict=True)
+        ),
+    }
+    if 'object_pose' in readings:
+        start['object_pose'] = readings['object_pose'][0]
+        start['object_velocity'] = readings['object_twist'][0]
+    first = simulation.reset(seed=[7, 7], start=start)['observation']
+    assert (first[0] == first[1]).all()
+    assert (simulation.reset(seed=7, start=start)['observation'][0] == first[0]).all()
+    found = simulation.true_readings()
+    for name in {'joint_states', 'object_pose'} & found.keys():
+        size = 2 * count if name == 'joint_states' else None
+        assert found[name][0, :size] == pytest.approx(readings[name][0, :size], abs=1e-12)
+
+
+def test_joints_start_where_they_were_placed_and_the_gripper_follows():
+    env = fetch_hand_sim.make('HandReach')
+    name = 'robot0:FFJ2'
+    place = env.unwrapped.spec_of_task.robot.joints.index(name)
+    drawn, _ = env.reset(seed=0)
+    placed, _ = env.reset(seed=0, options={'start': {'joints': {name: 1.2}}})
+    assert row(env, 'joint_states')[place] == 1.2
+    assert np.linalg.norm(placed['achieved_goal'] - drawn['achieved_goal']) > 0.02
+
+
+@pytest.mark.parametrize('disturbances', [None, 'hardware'])
+def test_a_batch_takes_one_start_or_a_list(disturbances):
+    env = fetch_hand_sim.make_vec('FetchPush', 3, disturbances=disturbances)
+    drawn, _ = env.reset(seed=0)
+    placed, _ = env.reset(seed=0, options={'start': {'object_pose': POSE}})
+    near = 0.0 if disturbances is None else 0.01
+    assert placed['achieved_goal'] == pytest.approx(np.tile(POSE[:3], (3, 1)), abs=near + 1e-9)
+    mixed, _ = env.reset(seed=0, options={'start': [None, {'object_pose': POSE}, None]})
+    assert (mixed['achieved_goal'][[0, 2]] == drawn['achieved_goal'][[0, 2]]).all()
+    assert (mixed['achieved_goal'][1] == placed['achieved_goal'][1]).all()
+    mask = np.array([False, False, True])
+    last, _ = env.reset(options={'reset_mask': mask, 'start': [None, None, {'object_pose': POSE}]})
+    assert last['achieved_goal'][2] == pytest.approx(POSE[:3], abs=near + 1e-9)
+    with pytest.raises(ValueError, match='start: 2 values; allowed: one, or 3'):
+        env.reset(options={'start': [None, None]})
+
+
+def test_start_goal_and_variation_go_together():
+    env = fetch_hand_sim.make('FetchPush', disturbances={'physics': {'friction': [0.5, 2.0]}})
+    goal = [1.3, 0.8, 0.425]
+    options = {'goal': goal, 'variation': {'friction': 0.7}, 'start': {'object_pose': POSE}}
+    observation, _ = env.reset(seed=0, options=options)
+    assert observation['desired_goal'].tolist() == goal
+    assert observation['achieved_goal'] == pytest.approx(POSE[:3])
+    assert env.unwrapped.simulation.variation(0)['friction'] == 0.7
+
+
+def test_stable_baselines3_sets_all_three_for_each_environment():
+    pytest.importorskip('stable_baselines3')
+    from fetch_hand_sim.gym_envs.stable_baselines3 import FetchHandVecEnv
+
+    env = FetchHandVecEnv('FetchPush', 2, disturbances={'physics': {'friction': [0.5, 2.0]}})
+    goal = [1.3, 0.8, 0.425]
+    env.set_options(
+        [{'variation': {'friction': 0.7}}, {'start': {'object_pose': POSE}, 'goal': goal}]
+    )
+    observation = env.reset()
+    simulation = env.batch.simulation
+    assert simulation.variation(0)['friction'] == 0.7 != simulation.variation(1)['friction']
+    assert observation['achieved_goal'][1] == pytest.approx(POSE[:3])
+    assert observation['desired_goal'][1].tolist() == goal
+    env.set_options({'variation': {'friction': 1.5}})
+    env.reset()
+    assert [simulation.variation(i)['friction'] for i in range(2)] == [1.5, 1.5]
+    env.reset()
+    assert simulation.variation(0)['friction'] != 1.5, 'options count once'
+    env.set_options({'variation': {'friction': 100.0}})
+    with pytest.raises(ValueError, match='friction=100'):
+        env.reset()
+    env.reset()
+
+
+NAMES = 'allowed: joints, joint_velocities, object_pose, object_velocity'
+
+
+@pytest.mark.parametrize(
+    ('task', 'start', 'line'),
+    [
+        ('FetchPush', 0, f"^start '0'; allowed: a mapping of {NAMES[9:]}$"),
+        ('FetchPush', {'object': POSE}, f"start has no 'object'; {NAMES}; did you mean 'object_p"),
+        ('FetchPush', {'object_pose': POSE[:3]}, 'object_pose=.*; allowed: 7 finite numbers$'),
+        ('FetchPush', {'object_pose': 'here'}, 'object_pose=here; allowed: 7 finite numbers$'),
+        ('FetchPush', {'object_pose': [np.nan] * 7}, 'allowed: 7 finite numbers$'),
+        ('FetchPush', {'object_pose': [99.0, *POSE[1:]]}, 'object_pose=.99.*: -10 ... 10 each$'),
+        ('FetchPush', {'object_pose': [*POSE[:3], 0, 0, 0, 0]}, 'a quaternion of zeros; allowed'),
+        (
+            'FetchPush',
+            {'object_pose': [1.3, 0.7, 0.38, 1, 0, 0, 0]},
+            'start: (object0 and table0|table0 and object0) would overlap by 45 mm; allowed: up to',
+        ),
+        ('FetchPush', {'object_velocity': [0.0] * 6}, 'object_velocity without object_pose'),
+        ('FetchReach', {'object_pose': POSE}, 'FetchReach has no object; allowed: joints, joint_v'),
+        ('HandReach', {'joints': {'robot0:FFJ9': 0}}, "no joint 'robot0:FFJ9'; allowed: .*did you"),
+        (
+            'HandReach',
+            {'joints': {'robot0:FFJ3': 9}},
+            'robot0:FFJ3 at 9; allowed: -0.349 ... 0.349',
+        ),
+        ('HandReach', {'joints': [0.0] * 3}, 'start joints=.*; allowed: 24 finite numbers$'),
+        (
+            'HandReach',
+            {'joint_velocities': {'robot0:FFJ3': 1e9}},
+            'joint_velocities of robot0:FFJ3=.*; allowed: -100 ... 100 each$',
+        ),
+    ],
+)
+def test_an_impossible_start_is_refused_in_one_line_and_nothing_moves(task, start, line):
+    env = fetch_hand_sim.make_vec(task, 2)
+    before, _ = env.reset(seed=0)
+    with pytest.raises(ValueError, match=line) as caught:
+        env.reset(seed=1, options={'start': start})
+    assert '\n' not in str(caught.value)
+    after = env.unwrapped.simulation.observe()
+    assert all((after[name] == before[name]).all() for name in before)
