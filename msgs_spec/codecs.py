@@ -26,21 +26,13 @@ _ANSWER_LABEL = re.compile(r'answers ([0-9]{19})')
 
 
 def message_stamp(message: Any) -> int:
-    """Return the stamp of a message with a header, or of a Clock, in nanoseconds.
-
-    Raises:
-        ValueError: If its nanoseconds are a second or more.
-    """
+    """Return the stamp of a message with a header, or of a Clock, in ns; see `stamp_of`."""
     stamp = message.header.stamp if hasattr(message, 'header') else message.clock
     return stamp_of(int(stamp.sec), int(stamp.nanosec))
 
 
 def stamp_of(seconds: int, nanoseconds: int) -> int:
-    """Return a stamp in nanoseconds.
-
-    Raises:
-        ValueError: If the nanoseconds are a second or more, which rclpy cannot send.
-    """
+    """Return a stamp in ns; raise ValueError for a second or more of nanoseconds."""
     if nanoseconds >= _NANOSECONDS:
         raise ValueError(f'stamp with nanosec {nanoseconds}; allowed: less than {_NANOSECONDS}')
     return seconds * _NANOSECONDS + nanoseconds
@@ -52,10 +44,7 @@ def build_message(topic: TopicSpec, stamp: int, values: ArrayLike) -> Any:
     Args:
         topic: Any topic except those of type DiagnosticArray.
         stamp: Nanoseconds; ignored by types without a stamp.
-        values: (topic.size,) in the order of the layout.
-
-    Raises:
-        ValueError: If the number of values is wrong.
+        values: (topic.size,) in the order of the layout; ValueError for another number.
     """
     vector = checked_size(topic, values)
     fields = _CODECS[topic.type_name][0](topic, vector)
@@ -65,10 +54,8 @@ def build_message(topic: TopicSpec, stamp: int, values: ArrayLike) -> Any:
 def decode(topic: TopicSpec, message: Any) -> Array:
     """Return the vector (topic.size,) of a message of rclpy or of `schemas`.
 
-    Joints are found by name in any order; missing joints are NaN.
-
-    Raises:
-        ValueError: If the message has another number of values than the topic.
+    Joints are found by name in any order; missing joints are NaN. A message with another number of
+    values raises ValueError.
     """
     return checked_size(topic, _CODECS[topic.type_name][1](topic, message))
 
@@ -298,16 +285,10 @@ class LayoutError(ValueError):
 
 
 class TopicCodec:
-    """Encodes and decodes the vectors of one topic.
+    """Encodes and decodes the vectors of one topic, except those of type DiagnosticArray.
 
-    Stamps are nanoseconds; types without a stamp have 0.
-
-    Args:
-        topic: Any topic except those of type DiagnosticArray.
-        requires_frame: Whether `decode` rejects a `frame_id` that is neither empty nor the topic's.
-
-    Attributes:
-        size: Bytes of an encoded message.
+    Stamps are nanoseconds; types without a stamp have 0. If `requires_frame`, `decode` rejects a
+    `frame_id` that is neither empty nor the topic's. `size` is the length of encoded messages.
     """
 
     def __init__(self, topic: TopicSpec, *, requires_frame: bool = False) -> None:
@@ -337,13 +318,9 @@ class TopicCodec:
         return bytes(data)
 
     def decode(self, data: bytes) -> tuple[int, Array]:
-        """Return the stamp and the vector (topic.size,) of a message of any writer.
+        """Return the stamp and the vector (topic.size,) of a message, or raise ValueError.
 
-        Messages with this project's layout take a tenth of the time.
-
-        Raises:
-            ValueError: If the bytes are not such a message, do not fit the topic, or have another
-                frame where that counts.
+        Messages with this project's layout take a tenth of the time of others.
         """
         if len(data) != self.size or any(data[run] != fixed for run, fixed in self._fixed):
             message = deserialize(self.topic.type_name, data)
@@ -358,13 +335,9 @@ class TopicCodec:
         return stamp_of(seconds, nanoseconds), floats[self._slots]
 
     def decode_many(self, messages: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array]:
-        """Decode messages (n, size) with this project's layout at array speed.
+        """Return stamps (n,) and vectors (n, topic.size) of messages (n, size) at array speed.
 
-        Returns stamps (n,) and vectors (n, topic.size), equal to those of `decode`.
-
-        Raises:
-            LayoutError: If a message has other names, another frame or size. `decode` may still
-                read it.
+        Messages with another layout raise LayoutError; `decode` may still read them.
         """
         if messages.ndim != 2 or messages.shape[1] != self.size:
             raise LayoutError(f'{self.topic.name}: {messages.shape[-1]} bytes, not {self.size}')

@@ -242,11 +242,7 @@ class Disturbances:
 
     @classmethod
     def from_json(cls, text: str) -> Disturbances:
-        """Return the disturbances that `to_json` gave.
-
-        Raises:
-            ValueError: If the text is no JSON, or a value is not allowed.
-        """
+        """Return the disturbances in the text of `to_json`, or raise ValueError."""
         try:
             return cls.from_dict(json.loads(text))
         except RecursionError:
@@ -254,11 +250,7 @@ class Disturbances:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Disturbances:
-        """Return the disturbances that `as_dict` gave.
-
-        Raises:
-            ValueError: If a group or field is unknown, or a value is not allowed.
-        """
+        """Return the disturbances in the result of `as_dict`, or raise ValueError."""
         groups: dict[str, Any] = {each.name: type(each.default) for each in fields(cls)}
         found: dict[str, Any] = {}
         for name, given in _entries('disturbances', values, list(groups)):
@@ -275,12 +267,9 @@ def read_disturbances(given: str | Mapping[str, Any] | Disturbances | None) -> D
     """Return disturbances from any form in which a user may give them.
 
     Args:
-        given: A preset (`mild`, `hardware`, `severe`), scaled as in `hardware*0.5`; the path of a
-            JSON or YAML file; JSON text that begins with `{`; a mapping; `none` or None for no
-            disturbances.
-
-    Raises:
-        ValueError: If the form is unknown, or a value is not allowed.
+        given: A preset (`mild`, `hardware`, `severe`), scaled as in `hardware*0.5`. The path of a
+            JSON or YAML file. JSON text that begins with `{`. A mapping. `none` or None for no
+            disturbances. Other values raise ValueError.
     """
     if given is None or given in ('', 'none', 'off'):
         return Disturbances()

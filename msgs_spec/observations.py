@@ -40,10 +40,8 @@ def observed_topics(task: TaskSpec) -> tuple[str, ...]:
 def observation(task: TaskSpec, readings: Readings, tick_duration: float) -> Array:
     """Return observation vectors (..., task.observation_size); `task.observation` names the parts.
 
-    Args:
-        task: The task.
-        readings: At least its `observed_topics`; quaternions of unit length.
-        tick_duration: Seconds of one control period.
+    `readings` contain at least the `observed_topics`, with unit quaternions. `tick_duration` is one
+    control period, s.
     """
     if task.formulas is not None:
         return task.formulas.observation(readings, tick_duration)
@@ -109,14 +107,10 @@ class ObservationAssembler:
     """Computes the dict observation of a task from its topics of one stamp.
 
     Args:
-        task: The task.
-        control_hz: Ticks per simulated second, from `episode_status`.
+        control_hz: Ticks per simulated second, from `episode_status`; ValueError if not allowed.
 
     Attributes:
         topics: The needed topics.
-
-    Raises:
-        ValueError: If the rate is not allowed.
     """
 
     def __init__(self, task: TaskSpec, control_hz: float) -> None:
@@ -129,12 +123,10 @@ class ObservationAssembler:
         """Return `observation`, `achieved_goal` and `desired_goal`, float64.
 
         Args:
-            vectors: Vectors (..., topic.size) by topic, with any leading axes, such as ticks; other
-                topics are ignored.
+            vectors: Vectors (..., topic.size) by topic, with any leading axes, such as ticks.
 
         Raises:
-            ValueError: If a topic is missing or a needed value is not finite. Efforts are not
-                needed.
+            ValueError: If a topic is missing or a value is not finite, except efforts.
         """
         for name in (spec.name for spec in self.topics):
             if name not in vectors:

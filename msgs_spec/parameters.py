@@ -29,7 +29,6 @@ class ParameterSpec:
     """One parameter.
 
     Attributes:
-        description: Purpose and unit, one or two sentences.
         choices: Allowed strings; empty allows any.
         longest: Maximum number of characters; None for no limit.
         or_zero: Whether 0 is allowed below `lower`, to switch something off.
@@ -280,11 +279,7 @@ NODES = {
 
 
 def validate(spec: ParameterSpec, value: object) -> None:
-    """Check a value; integers are valid doubles.
-
-    Raises:
-        ValueError: If the value is not allowed; one line names the allowed values.
-    """
+    """Raise ValueError, which names the allowed values, for an invalid value."""
     if not _is_allowed(spec, value):
         hint = did_you_mean(str(value), spec.choices)
         if spec.type == 'string' and not spec.choices and isinstance(value, (int, float)):
@@ -330,12 +325,7 @@ def unknown_parameter(specs: Sequence[ParameterSpec], name: str) -> str | None:
 
 
 def usage(node: str, summary: str) -> str:
-    """Return the help text of a node.
-
-    Args:
-        node: Name of the executable.
-        summary: Description in one line.
-    """
+    """Return the help text of a node; `summary` describes it in one line."""
     entries = [
         f'  {spec.name} ({spec.type}, default {spec.default!r}'
         f'{"" if spec.read_only else ", settable at run time"})\n'

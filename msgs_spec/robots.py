@@ -23,10 +23,9 @@ LONGEST_JOINT_PREFIX = 64
 
 @dataclass(frozen=True, slots=True)
 class CommandPart:
-    """One number of the command vector.
+    """One number of the command vector: an axis or a joint.
 
     Attributes:
-        name: The axis or joint to move.
         lower: Smallest value after clipping.
         upper: Largest value after clipping.
         unit: SI unit, or 'x 0.05 m' for the dimensionless axes of Fetch.
@@ -44,11 +43,11 @@ class RobotSpec:
 
     Attributes:
         name: `fetch`, `shadow_hand`, or the name of a third-party robot.
-        joints: Scalar joints in the order and by the names of `joint_states`.
+        joints: Scalar joints, named and ordered as in `joint_states`.
         joint_units: 'm' or 'rad' for each joint.
-        command: Parts of the command vector. The normalised action has the same length and order.
-        has_gripper_command: Whether commands are dimensionless and move a gripper, as those of
-            Fetch do. Otherwise they are absolute joint positions.
+        command: Parts of the command, and of the normalised action.
+        has_gripper_command: Whether commands move a gripper and are dimensionless, as for Fetch.
+            Otherwise they are absolute joint positions.
     """
 
     name: str
@@ -80,11 +79,7 @@ class RobotSpec:
 
 
 def read_joint_prefix(robot: RobotSpec, prefix: str) -> str:
-    """Return the prefix that a value of the parameter `joint_prefix` stands for.
-
-    Raises:
-        ValueError: If the prefix would rename no joint of the robot.
-    """
+    """Return the prefix meant by the parameter; ValueError if it renames no joint."""
     if prefix in (MODEL_PREFIX, JOINT_PREFIX):
         return JOINT_PREFIX
     if robot.with_joint_prefix(prefix).joints == robot.joints:

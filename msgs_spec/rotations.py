@@ -153,11 +153,8 @@ def quaternion_to_euler(quaternion: ArrayLike) -> Array:
 def rotation_angle(first: ArrayLike, second: ArrayLike, antipodal: bool) -> Array:
     """Return the angle between unit quaternions wxyz (..., 4), rad.
 
-    Args:
-        first: Quaternions.
-        second: Quaternions.
-        antipodal: Whether q and -q are equal: angles are in [0, pi]. Otherwise they are 2 pi apart
-            and angles in [0, 2 pi], as in Gymnasium-Robotics.
+    If `antipodal`, q and -q are equal and angles are in [0, pi]. Otherwise q and -q are 2 pi apart
+    and angles are in [0, 2 pi], as in Gymnasium-Robotics.
     """
     real = _parts(quaternion_multiply(first, quaternion_conjugate(second)))[0]
     return np.asarray(2.0 * np.arccos(np.clip(np.abs(real) if antipodal else real, -1.0, 1.0)))

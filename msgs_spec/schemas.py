@@ -26,11 +26,7 @@ def _store() -> Typestore:
 
 
 def message_class(type_name: str) -> Any:
-    """Return the dataclass for messages of a type, without rclpy.
-
-    Raises:
-        ValueError: If the type is not part of ROS 2 Jazzy.
-    """
+    """Return the dataclass for messages of a type of ROS 2 Jazzy, or raise ValueError."""
     try:
         return _store().types[type_name]
     except KeyError:
@@ -66,11 +62,7 @@ def serialize(type_name: str, message: object) -> bytes:
 
 
 def deserialize(type_name: str, data: bytes) -> Any:
-    """Return the message in `data` as an instance of `message_class(type_name)`.
-
-    Raises:
-        ValueError: If the bytes are not such a message, or the type is unknown.
-    """
+    """Return the message in `data` as an instance of `message_class`, or raise ValueError."""
     message_class(type_name)
     try:
         return _store().deserialize_cdr(data, type_name)

@@ -254,15 +254,12 @@ TASKS: dict[str, TaskSpec] = {
 def task_spec(
     name: str, joint_prefix: str = JOINT_PREFIX, control_hz: float = DEFAULT_CONTROL_HZ
 ) -> TaskSpec:
-    """Return the task called `name`.
+    """Return a task, or raise ValueError, which lists all tasks.
 
     Args:
         name: One of `TASKS`.
         joint_prefix: Prefix of the joint names on the network.
         control_hz: Action frequency, Hz. An episode keeps its duration; its steps are rounded.
-
-    Raises:
-        ValueError: If the task is unknown (the message lists all), or the rate is not allowed.
     """
     try:
         task = TASKS[name]
@@ -279,12 +276,8 @@ def task_spec(
 def substeps_per_tick(control_hz: float) -> int:
     """Return the number of physics substeps in one control period.
 
-    Args:
-        control_hz: Action frequency, 12.5 ... 500 Hz.
-
-    Raises:
-        ValueError: If the period is not a whole number of substeps; the message names the nearest
-            valid rates.
+    `control_hz` is 12.5 ... 500 Hz. If the period is not a whole number of substeps, a ValueError
+    names the nearest valid rates.
     """
     if not isinstance(control_hz, Real):
         raise ValueError(f'control_hz {control_hz!r:.60} given; allowed: 12.5 ... 500')
@@ -351,11 +344,7 @@ def _accept(name: str, spec: Any) -> TaskSpec:
 
 
 def third_party_simulation(name: str) -> Any:
-    """Return the class that simulates a third-party task.
-
-    Raises:
-        ValueError: If no package has one, or it cannot be imported.
-    """
+    """Return the class that simulates a third-party task, or raise ValueError."""
     found = entry_points(group=SIMULATIONS, name=name)
     # Several packages may use the name: prefer the package of the specification.
     own = [each for each in found if _package(each) == _PACKAGES.get(name)]

@@ -14,9 +14,7 @@ _SHOWN = 40
 def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
     """Return `; did you mean 'task'?` for a misspelt name, or ''.
 
-    Args:
-        given: The misspelt name.
-        allowed: Known names. A mapping leads from accepted names to the names to suggest.
+    A mapping `allowed` leads from accepted names to the names to suggest.
     """
     meanings = allowed if isinstance(allowed, Mapping) else {name: name for name in allowed}
     by_lower = {name.lower(): meant for name, meant in meanings.items() if name}
@@ -25,13 +23,7 @@ def did_you_mean(given: str, allowed: Iterable[str] | Mapping[str, str]) -> str:
 
 
 def one_of(given: str, allowed: Sequence[Name], meaning: str) -> Name:
-    """Return `given` if it is allowed; raise ValueError otherwise.
-
-    Args:
-        given: A name from an untrusted source.
-        allowed: Known names.
-        meaning: Kind of the name, for the error.
-    """
+    """Return `given`, an untrusted `meaning`, if it is allowed; raise ValueError otherwise."""
     for name in allowed:
         if given == name:
             return name
@@ -50,12 +42,9 @@ def printable(text: str) -> str:
 
 
 def one_line(text: object, longest: int = 200) -> str:
-    """Return a text or an error as one line that is safe to print.
+    """Return a text or an error as one safe line of at most `longest` characters.
 
     An error without a message becomes the name of its type.
-
-    Args:
-        longest: Maximum number of characters of the line.
     """
     words = ' '.join(str(text).split())
     if not words and isinstance(text, BaseException):

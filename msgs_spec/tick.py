@@ -44,7 +44,6 @@ class EpisodeStatus:
     """Contents of `episode_status`.
 
     Attributes:
-        task: Name of the task.
         episode: Index of the episode since the node started, from 0.
         tick: Steps of the episode so far; 0 is the state after the reset.
         phase: See `PHASES`.
@@ -83,11 +82,7 @@ class EpisodeStatus:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> EpisodeStatus:
-        """Read the key/value pairs of a message; unknown keys are ignored.
-
-        Raises:
-            ValueError: If a pair is missing or invalid.
-        """
+        """Read the key/value pairs of a message, ignoring unknown keys, or raise ValueError."""
         values = {**_LEFT_OUT, **values}
         missing = [f.name for f in dataclasses.fields(cls) if f.name not in values]
         if missing:
@@ -135,15 +130,13 @@ class EpisodeStatus:
 class Tick:
     """State of the simulation at one stamp.
 
-    `reward` and `applied_command` are None at tick 0 of an episode, where no command has been
-    applied yet.
+    `reward` and `applied_command` are None at tick 0 of an episode, before the first command.
 
     Attributes:
         stamp_ns: Simulated time, nanoseconds.
         readings: Sensor readings, (topic.size,) for each topic.
         desired_goal: (goal,).
         achieved_goal: (goal,).
-        reward: Reward of the last step.
         applied_command: (action,), command units, after clipping.
         true_readings: Sensor readings without disturbances; None if there are none.
         has_diverged: Whether the simulation diverged in the last step, which ends the episode;
@@ -165,19 +158,6 @@ class Tick:
     late_commands: int | None = None
 
 
-def _vectors(tick: Tick) -> dict[str, ArrayLike | None]:
-    """Return the vector of each topic; None leaves the topic out of this tick."""
-    return {
-        **tick.readings,
-        '/clock': [],
-        'desired_goal': tick.desired_goal,
-        'achieved_goal': tick.achieved_goal,
-        'reward': None if tick.reward is None else [tick.reward],
-        'is_success': [tick.is_success],
-        'applied_command': tick.applied_command,
-    }
-
-
 class TickEncoder:
     """Turns ticks of one task into messages."""
 
@@ -191,17 +171,21 @@ class TickEncoder:
         """Return the messages of a tick with their CDR bytes, in the order of `topics`.
 
         `desired_goal` is latched and still part of every tick. So a policy that joins topics by
-        stamp never combines the state of an episode with the goal of the last one.
-
-        Args:
-            tick: The tick.
-            latched: Whether to add `episode_status`: at the reset and the end of an episode.
-
-        Raises:
-            ValueError: If a vector is missing or has a wrong size.
+        stamp never combines the state of an episode with the goal of the last one. `latched` adds
+        `episode_status`, at the reset and the end of an episode. A missing or wrong vector raises
+        ValueError.
         """
         messages = []
-        vectors = _vectors(tick)
+        # None leaves a topic out of this tick.
+        vectors: dict[str, ArrayLike | None] = {
+            **tick.readings,
+            '/clock': [],
+            'desired_goal': tick.desired_goal,
+            'achieved_goal': tick.achieved_goal,
+            'reward': None if tick.reward is None else [tick.reward],
+            'is_success': [tick.is_success],
+            'applied_command': tick.applied_command,
+        }
         for codec in self._codecs:
             if codec.topic.name not in vectors:
                 raise ValueError(f'no {codec.topic.name} in a tick of {tick.status.task}')
@@ -245,11 +229,7 @@ def join_messages(messages: Sequence[tuple[TopicSpec, bytes]]) -> bytes:
 
 
 def split_messages(data: bytes) -> dict[str, bytes]:
-    """Return the CDR bytes of each topic in a `latest_tick`, in order.
-
-    Raises:
-        ValueError: If the bytes are not such a message, or the sizes do not add up.
-    """
+    """Return the CDR bytes of each topic in a `latest_tick`, in order, or raise ValueError."""
     message = deserialize(LATEST_TICK.type_name, data)
     rest, parts = bytes(message.data), {}
     for part in message.layout.dim:

@@ -13,12 +13,7 @@ from msgs_spec.tasks import GoalKind, TaskSpec, VectorPart
 
 @dataclass(frozen=True, slots=True)
 class QosSpec:
-    """Quality of service; history is always keep_last.
-
-    Attributes:
-        depth: Messages kept.
-        durability: `transient_local` topics are latched: late subscribers get the last messages.
-    """
+    """Quality of service; late subscribers get the last `depth` `transient_local` messages."""
 
     depth: int
     reliability: Literal['reliable', 'best_effort']
@@ -65,7 +60,7 @@ class TopicSpec:
         name: Relative to the node's namespace, except `/clock`.
         layout: Parts of the float64 vector of the message. Quaternions are wxyz in the vector and
             xyzw in the message.
-        frame: `header.frame_id`; empty for topics without a frame.
+        frame: `header.frame_id`, or empty.
         names: Joint names in the message.
         direction: Seen from `sim_node`.
     """
@@ -281,11 +276,7 @@ def topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
 
 
 def topic(task: TaskSpec, name: str) -> TopicSpec:
-    """Return the topic of a task by name.
-
-    Raises:
-        ValueError: If the topic is unknown; the message lists the known ones.
-    """
+    """Return the topic of a task by name, or raise ValueError, which lists all names."""
     return _named(task, topics(task), name)
 
 
@@ -363,11 +354,7 @@ def view_topics(task: TaskSpec) -> tuple[TopicSpec, ...]:
 
 
 def view_topic(task: TaskSpec, name: str) -> TopicSpec:
-    """Return a topic of `visualization_node` by name.
-
-    Raises:
-        ValueError: If the topic is unknown; the message lists the known ones.
-    """
+    """Return a topic of `visualization_node` by name, or raise ValueError."""
     return _named(task, view_topics(task), name, ' to view')
 
 
@@ -376,13 +363,7 @@ def view_topic(task: TaskSpec, name: str) -> TopicSpec:
 
 @dataclass(frozen=True, slots=True)
 class ServiceSpec:
-    """One service.
-
-    Attributes:
-        name: `~/` stands for the node's own name.
-        type_name: ROS name of the service type.
-        description: Effect of a call.
-    """
+    """One service; `~/` in the name stands for the name of the node."""
 
     name: str
     type_name: str

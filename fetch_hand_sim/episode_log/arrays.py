@@ -25,9 +25,7 @@ from msgs_spec.topics import topic
 # Compared by identity, because `==` of arrays is an array.
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeArrays(HasOutcome):
-    """One episode of N steps.
-
-    Step k leads from observation k to observation k + 1.
+    """One episode of N steps; step k leads from observation k to observation k + 1.
 
     Attributes:
         path: The MCAP file.
@@ -41,9 +39,8 @@ class EpisodeArrays(HasOutcome):
         truncated: (N,): True at the last step, where time, divergence or an interruption ended it.
         success: (N + 1,): whether the goal was reached.
         stamps: (N + 1,) simulated time, nanoseconds.
-        metadata: The record `episode`.
-        record: The same, parsed.
-        result: The record `episode_result`; `outcome` is the same, parsed.
+        metadata: The metadata record `episode`; `record` is the same, parsed.
+        result: The metadata record `episode_result`; `outcome` is the same, parsed.
     """
 
     path: Path
@@ -78,11 +75,8 @@ def load_episodes(
 
     Args:
         path: A bag directory, an MCAP file, or a directory of either.
-        on_skip: Called with the error of each unreadable episode, which is left out; None raises
-            that error.
-
-    Raises:
-        EpisodeReadError: If the path, or with `on_skip` None any episode, cannot be read.
+        on_skip: Called with the error of each unreadable episode, which is left out; by default the
+            EpisodeReadError is raised.
     """
     episodes = []
     for candidate in expand_episodes(Path(path)):

@@ -51,13 +51,7 @@ _SafeDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A file stored with the episode.
-
-    Attributes:
-        name: File name.
-        media_type: MIME type.
-        data: Contents.
-    """
+    """A file stored with the episode; `media_type` is its MIME type."""
 
     name: str
     media_type: str
@@ -71,14 +65,11 @@ class LogSettings:
     Attributes:
         chunk_size: Bytes of messages per chunk, less than half of what readers accept; small chunks
             keep the longest write short.
-        compression: Of the chunks: 'none', 'lz4' or 'zstd'.
-        flush_period_ns: Simulated time after which messages are handed to the operating system, in
-            nanoseconds. The first tick after it does that, so a killed process loses up to a tick
-            more: less than a quarter of a second at the lowest rate, 12.5 Hz.
-        minimum_free_bytes: No episode is begun with less than this left on the disk.
-
-    Raises:
-        ValueError: If a value is out of range.
+        compression: Compression of the chunks.
+        flush_period_ns: Simulated time after which messages are handed to the operating system, ns.
+            The next tick does that, so a killed process loses up to a tick more: less than a
+            quarter of a second at 12.5 Hz.
+        minimum_free_bytes: No episode is begun with less free space on the disk.
     """
 
     chunk_size: int = 128 * 1024
@@ -119,16 +110,12 @@ def offered_qos(spec: QosSpec) -> list[dict[str, Any]]:
 
 @cache
 def offered_qos_text(spec: QosSpec) -> str:
-    """Return the same as YAML, for the channel of an MCAP file."""
+    """Return `offered_qos` as YAML, for the channel of an MCAP file."""
     return yaml.safe_dump(offered_qos(spec), sort_keys=False)
 
 
 def checked_strings(content: Mapping[str, str]) -> dict[str, str]:
-    """Return a copy of the contents of a metadata record.
-
-    Raises:
-        ValueError: If a key or value is not a string, or there are more than readers accept.
-    """
+    """Return a copy of a metadata record, or raise ValueError if readers would reject it."""
     for key, value in content.items():
         if not isinstance(key, str) or not isinstance(value, str):
             raise ValueError(f'episode metadata are strings, not {key!r}: {value!r}')
@@ -151,17 +138,14 @@ class _Channel:
 
 
 class BagFile:
-    """One episode as an MCAP file in an open stream.
+    """One episode as an MCAP file in an open stream, which the caller flushes and closes.
 
-    `OSError`s of the stream come through and end the file. The records that identify the episode
-    are written at once, so that a cut-off file identifies it too.
+    `OSError`s of the stream are passed on and end the file. The records that identify the episode
+    are written at once, so that a cut-off file contains them.
 
     Args:
-        stream: Where to write; the caller flushes and closes it.
         file_name: Name of the file in its bag directory.
-        settings: How to write.
         metadata: Contents of the record `episode`.
-        attachments: Files to store.
 
     Attributes:
         has_unflushed: Whether there are messages that the operating system does not have yet.
@@ -208,13 +192,12 @@ class BagFile:
         self.flush()
 
     def write(self, name: str, topic: TopicSpec, data: bytes, log_time_ns: int) -> None:
-        """Append a message; the first of a topic makes its channel, which may not be empty.
+        """Append a message; the first message of a topic also creates its channel.
 
-        The sequence number counts the messages of the topic from 0, so a gap is visible.
+        Sequence numbers count the messages of a topic from 0, so a gap is visible.
 
         Args:
             name: Resolved name of the topic.
-            topic: The topic.
             data: CDR bytes.
             log_time_ns: Later than that of the message before.
 
@@ -260,11 +243,7 @@ class BagFile:
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def finish(self, result: dict[str, str]) -> str:
-        """Write the last chunk, the record `episode_result` and the summary.
-
-        Returns:
-            The text of `metadata.yaml`.
-        """
+        """Write the last chunk, the result and the summary; return the text of `metadata.yaml`."""
         self.flush()
         custom_data = {**self._metadata, **result}
         self._writer.add_metadata(EPISODE_RESULT, result)

@@ -70,11 +70,8 @@ def is_mcap(path: Path) -> bool:
 def find_episodes(directory: Path | str) -> list[Path]:
     """Return bag directories and MCAP files in a directory, by name, without opening them.
 
-    Hidden directories are left out: episodes that are being written or were cut off, see
-    `find_leftovers`.
-
-    Raises:
-        EpisodeReadError: If it is no directory or cannot be read.
+    Hidden directories contain unfinished episodes (`find_leftovers`) and are left out. An
+    unreadable directory raises EpisodeReadError.
     """
     try:
         entries = sorted(Path(directory).iterdir())
@@ -113,11 +110,7 @@ def holds_no_episode(directory: Path) -> EpisodeReadError:
 
 
 def expand_episodes(path: Path | str) -> list[Path]:
-    """Return the path itself if it is an episode or no directory, else the episodes in it.
-
-    Raises:
-        EpisodeReadError: If it does not exist, or is a directory that cannot be read.
-    """
+    """Return the path itself, or the episodes in a directory, or raise EpisodeReadError."""
     path = Path(path)
     try:
         if not path.exists():
@@ -130,11 +123,7 @@ def expand_episodes(path: Path | str) -> list[Path]:
 
 
 def mcap_file(path: Path) -> Path:
-    """Return the MCAP file of a bag directory, or the path itself if it is no directory.
-
-    Raises:
-        EpisodeReadError: If the directory does not hold exactly one, or cannot be read.
-    """
+    """Return the MCAP file of a bag directory, or the path itself, or raise EpisodeReadError."""
     try:
         if not path.is_dir():
             if path.exists() and not path.is_file():
@@ -155,13 +144,11 @@ def mcap_file(path: Path) -> Path:
 
 
 def claim(directory: Path, name: str) -> BufferedWriter:
-    """Create the hidden directory of an episode; of several processes one succeeds.
-
-    Returns:
-        Its MCAP file, empty, locked and open for writing.
+    """Create the hidden directory of an episode and its locked, empty MCAP file.
 
     Raises:
-        EpisodeExistsError: If an episode of this name is finished, being written or cut off.
+        EpisodeExistsError: If an episode of this name is finished, being written or cut off. Of
+            several processes, one succeeds.
     """
     active = active_path(directory, name)
     try:
@@ -217,11 +204,7 @@ def try_lock(stream: IO[bytes], shared: bool = False) -> bool:
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading, without following links or waiting for pipes.
-
-    Raises:
-        OSError: If it is anything else; the reason names that.
-    """
+    """Open a regular file for reading without following links; raise OSError for others."""
     if not stat.S_ISREG(path.lstat().st_mode):
         raise OSError(errno.EINVAL, 'is no regular file', str(path))
     flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC

@@ -52,11 +52,7 @@ Summary = dict[int, list[tuple[int, int]]]
 
 
 def parse_file(data: bytes) -> tuple[Contents, Messages]:
-    """Parse a whole file.
-
-    Raises:
-        ValueError: If it is damaged, larger than the limits, or ambiguous.
-    """
+    """Parse a whole file; ValueError if it is damaged, beyond the limits, or ambiguous."""
     if not data.endswith(MCAP0_MAGIC):
         raise ValueError('truncated, damaged or no MCAP file: its last bytes are not those of one')
     contents = Contents()
@@ -88,11 +84,7 @@ def parse_file(data: bytes) -> tuple[Contents, Messages]:
 
 
 def require_one_meaning(contents: Contents) -> None:
-    """Refuse several episodes in a file, and two channels, metadata records or files of one name.
-
-    Raises:
-        ValueError: If it finds one.
-    """
+    """Raise ValueError for several episodes in a file, and for ambiguous names."""
     for name, count in Counter(each.name for each in contents.metadata).items():
         if count > 1 and name.startswith('episode'):
             raise ValueError(

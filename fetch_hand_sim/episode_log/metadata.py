@@ -48,17 +48,14 @@ class EpisodeRecord:
     """The record `episode`, parsed.
 
     Attributes:
-        task: The task, with the joint names that its messages have, `episode_ticks` at 25 Hz.
+        task: The task, with the joint names of its messages, `episode_ticks` at 25 Hz.
         episode: Number of the episode in its run, from 0.
         seed: Seed of the reset.
-        reward_type: 'sparse' or 'dense'.
-        success_rule: 'gymnasium' or 'paper'.
         control_hz: Ticks per simulated second.
-        joint_prefix: Beginning of the names of joints.
+        joint_prefix: Prefix of the joint names.
         interface_version: Meaning of the messages, see `INTERFACE_VERSION`.
         perturb_limit: Largest force of a push, N; 0 if pushes were off.
-        timing: Which of seconds and ticks stayed the same where the rate is not 25 Hz.
-        disturbances: Disturbances of the robot.
+        timing: Quantities kept at rates other than 25 Hz, see `msgs_spec.tasks.Timing`.
     """
 
     task: TaskSpec
@@ -75,21 +72,18 @@ class EpisodeRecord:
 
     @classmethod
     def parse(cls, metadata: Strings) -> EpisodeRecord:
-        """Parse the contents of the record.
-
-        Raises:
-            ValueError: If a value is missing or not allowed; the message names it.
-        """
+        """Parse the contents of the record; a ValueError names a missing or invalid value."""
+        metadata = {'interface_version': '1', 'perturb_limit': '0', **metadata}
         return cls(
             task=parse_task(metadata),
-            episode=_integer(metadata, 'episode'),
-            seed=_integer(metadata, 'seed'),
+            episode=_number(metadata, 'episode', int),
+            seed=_number(metadata, 'seed', int),
             reward_type=one_of(_text(metadata, 'reward_type'), REWARD_TYPES, 'reward_type'),
             success_rule=one_of(_text(metadata, 'success_rule'), SUCCESS_RULES, 'success_rule'),
             control_hz=parse_control_hz(metadata),
             joint_prefix=_joint_prefix(metadata),
-            interface_version=_integer(metadata, 'interface_version', default='1'),
-            perturb_limit=_perturb_limit(metadata),
+            interface_version=_number(metadata, 'interface_version', int),
+            perturb_limit=_number(metadata, 'perturb_limit', float, LARGEST_PERTURBATION),
             timing=one_of(metadata.get('timing', 'ticks'), TIMINGS, 'timing'),
             disturbances=Disturbances.from_json(metadata.get('disturbances', '{}')),
         )
@@ -108,7 +102,7 @@ class EpisodeOutcome:
 
     Attributes:
         is_complete: Whether the episode ran to its end.
-        reason: Why it was cut short.
+        reason: Reason of an interruption.
         steps: Steps taken.
         episode_return: Sum of rewards.
         is_success: Whether the goal was reached at the end.
@@ -156,7 +150,7 @@ class EpisodeOutcome:
 
 
 class HasOutcome:
-    """An episode with its record `episode_result`; `outcome` is that record, parsed."""
+    """An episode with its record `episode_result`."""
 
     __slots__ = ()
 
@@ -174,21 +168,13 @@ class HasOutcome:
 
 
 def parse_task(metadata: Strings) -> TaskSpec:
-    """Return the task of an episode, with the joint names that its messages have.
-
-    Raises:
-        ValueError: If it is unknown.
-    """
+    """Return the task of an episode with the joint names of its messages, or raise ValueError."""
     name = _text(metadata, 'task')
     return task_spec(name if name in TASKS else name[:_SHOWN], _joint_prefix(metadata))
 
 
 def parse_control_hz(metadata: Strings) -> float:
-    """Return the ticks per simulated second of an episode.
-
-    Raises:
-        ValueError: If the simulation has no such rate.
-    """
+    """Return the ticks per simulated second of an episode, or raise ValueError."""
     text = _text(metadata, 'control_hz')
     try:
         rate = float(text)
@@ -201,7 +187,7 @@ def parse_control_hz(metadata: Strings) -> float:
 def integer_or_none(metadata: Strings, name: str) -> int | None:
     """Return a number of the record `episode`, None if it is missing or not allowed."""
     try:
-        return _integer(metadata, name)
+        return _number(metadata, name, int)
     except ValueError:
         return None
 
@@ -221,20 +207,11 @@ def _text(content: Strings, name: str) -> str:
     return content[name]
 
 
-def _integer(content: Strings, name: str, default: str | None = None) -> int:
-    text = _text({name: default, **content} if default is not None else content, name)
-    value = _number_or_none(text, int)
-    if value is None or not 0 <= value <= _LARGEST:
-        raise ValueError(f'{name} {text[:_SHOWN]!r}; allowed: 0 ... {_LARGEST}')
-    return value
-
-
-def _perturb_limit(metadata: Strings) -> float:
-    text = _text({'perturb_limit': '0', **metadata}, 'perturb_limit')
-    value = _number_or_none(text, float)
-    if value is None or not 0.0 <= value <= LARGEST_PERTURBATION:
-        allowed = f'0 ... {LARGEST_PERTURBATION:g}'
-        raise ValueError(f'perturb_limit {text[:_SHOWN]!r}; allowed: {allowed}')
+def _number(content: Strings, name: str, kind: type[Number], highest: float = _LARGEST) -> Number:
+    text = _text(content, name)
+    value = _number_or_none(text, kind)
+    if value is None or not 0 <= value <= highest:
+        raise ValueError(f'{name} {text[:_SHOWN]!r}; allowed: 0 ... {highest}')
     return value
 
 
@@ -302,16 +279,15 @@ def episode_metadata(
     Args:
         episode: Number of the episode in this run, from 0; file names count over all runs.
         control_hz: Ticks per simulated second.
-        timing: Recorded only as `seconds` at another rate than 25 Hz, because robots up to 1.0
-            recorded nothing and kept `ticks`.
+        timing: Recorded only as `seconds` at another rate than 25 Hz; files without it mean
+            `ticks`, because robots up to 1.0 recorded nothing.
         joint_prefix: Recorded only if it is not the usual one.
         model_sha256: Fingerprint of the compiled model, see `model_sha256`.
-        checkpoint_sha256: Fingerprint of the actor that gives the commands, if known.
+        checkpoint_sha256: Fingerprint of the policy that gives the commands, if known.
         perturb_limit: Largest force of a push, N; recorded only if pushes are on.
-        disturbances: Disturbances of the robot, JSON; '' for none.
-        variation: Values that the episode drew from them, JSON; '' for none.
-        started: Wall-clock time of the start, ISO 8601. The one value that differs between equal
-            runs; leave it out for files that are equal byte by byte.
+        disturbances: Disturbances of the robot, JSON, or ''.
+        variation: Values that the episode drew from them, JSON, or ''.
+        started: Wall-clock time of the start, ISO 8601. Without it, equal runs give equal files.
     """
     in_seconds = timing == 'seconds' and control_hz != DEFAULT_CONTROL_HZ
     known = {

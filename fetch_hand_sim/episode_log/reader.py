@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -42,12 +42,7 @@ _LONGEST_SCHEMA = 8000
 
 @dataclass(frozen=True, slots=True)
 class MessageRows:
-    """The messages of one topic, in order of log time.
-
-    Attributes:
-        log_times: (n,), nanoseconds.
-        data: (n, size) CDR bytes.
-    """
+    """The n messages of one topic by log time: times (n,), ns, and CDR bytes (n, size)."""
 
     log_times: NDArray[np.int64]
     data: NDArray[np.uint8]
@@ -55,14 +50,7 @@ class MessageRows:
 
 @dataclass(frozen=True, slots=True)
 class LoggedMessage:
-    """One message.
-
-    Attributes:
-        log_time_ns: Simulated time plus rank, see `log_time`.
-        publish_time_ns: The same.
-        sequence: Number of the message in its topic, from 0.
-        data: CDR bytes; `msgs_spec.schemas.deserialize` reads them.
-    """
+    """One message; `sequence` counts the messages of a topic from 0, `data` are CDR bytes."""
 
     log_time_ns: int
     publish_time_ns: int
@@ -72,14 +60,7 @@ class LoggedMessage:
 
 @dataclass(frozen=True, slots=True)
 class LoggedTopic:
-    """A topic of an episode.
-
-    Attributes:
-        type_name: ROS name of the message type.
-        qos_yaml: Offered quality of service, rosbag2 YAML.
-        type_hash: RIHS01 hash of the type.
-        messages: Messages in order of log time.
-    """
+    """A topic of an episode with its messages by log time; `qos_yaml` is rosbag2 YAML."""
 
     type_name: str
     qos_yaml: str
@@ -88,28 +69,31 @@ class LoggedTopic:
 
 
 @dataclass(frozen=True, eq=False)
-class Episode(HasOutcome):
-    """An episode file, checked as a whole.
+class EpisodeSummary(HasOutcome):
+    """An episode without its messages; `path` is the MCAP file.
 
     Attributes:
-        path: The MCAP file.
-        metadata: The record `episode`.
-        result: The record `episode_result`.
-        attachments: Contents by file name.
-        schemas: Types by id.
-        channels: Topics by id; no two have the same name.
-        sorted_messages: All messages, sorted by log time.
-        size_bytes: Size of the file.
+        metadata: The metadata record `episode`.
+        result: The metadata record `episode_result`.
+        duration_s: Simulated seconds from the first message to the last.
     """
 
     path: Path
     metadata: dict[str, str]
     result: dict[str, str]
+    message_count: int
+    duration_s: float
+    size_bytes: int
+
+
+@dataclass(frozen=True, eq=False)
+class Episode(EpisodeSummary):
+    """An episode file, checked as a whole: attachments by file name, schemas and channels by id."""
+
     attachments: dict[str, bytes]
     schemas: dict[int, Schema]
     channels: dict[int, Channel]
     sorted_messages: Messages
-    size_bytes: int
 
     @cached_property
     def topics(self) -> dict[str, LoggedTopic]:
@@ -128,15 +112,11 @@ class Episode(HasOutcome):
         return {self.channels[id].topic: logged for id, logged in found.items()}
 
     def count(self, name: str) -> int:
-        """Return the number of messages of a topic, named as the contract names it."""
+        """Return the number of messages of a topic; its namespace does not matter."""
         return len(self._indices(name))
 
     def rows(self, name: str) -> MessageRows:
-        """Return the messages of a topic, named as the contract names it.
-
-        Raises:
-            EpisodeReadError: If there are none, or not all have the same size.
-        """
+        """Return the messages of a topic; raise EpisodeReadError unless they have one size."""
         indices, messages = self._indices(name), self.sorted_messages
         starts, headers = messages.starts[indices], messages.headers[indices]
         sizes = headers['size']
@@ -156,14 +136,11 @@ class Episode(HasOutcome):
 
 
 def read_episode(path: Path | str) -> Episode:
-    """Read an episode with all checks.
-
-    Args:
-        path: The bag directory, or its MCAP file.
+    """Read an episode, a bag directory or its MCAP file, with all checks.
 
     Raises:
-        EpisodeReadError: If there is no such file, it is damaged, ambiguous or no episode, or its
-            topics are not those of its task.
+        EpisodeReadError: If the file is missing, damaged, ambiguous or no episode, or its topics
+            are not those of its task.
     """
     file = files.mcap_file(Path(path))
     with one_line_errors(file):
@@ -180,15 +157,18 @@ def read_episode(path: Path | str) -> Episode:
                     'bags leave it out'
                 )
         require_contract(records[EPISODE], contents)
+        times = messages.headers['log_time']
         return Episode(
             path=file,
             metadata=records[EPISODE],
             result=records[EPISODE_RESULT],
+            message_count=len(times),
+            duration_s=(int(times[-1]) - int(times[0])) / 1e9 if len(times) else 0.0,
+            size_bytes=len(data),
             attachments={each.name: each.data for each in contents.attachments},
             schemas=contents.schemas,
             channels=contents.channels,
             sorted_messages=messages,
-            size_bytes=len(data),
         )
 
 
@@ -223,13 +203,10 @@ def _why_unfinished(file: Path) -> str:
 
 
 def require_contract(metadata: dict[str, str], contents: Contents) -> None:
-    """Compare names, types and definitions of the topics with those of the task.
+    """Raise ValueError unless names, types and definitions of the topics are those of the task.
 
-    Topics of an unknown task are not compared: nothing can decode them.
-
-    Raises:
-        ValueError: If a topic, its type or its definition is not that of the task, or the topics
-            have different namespaces.
+    All topics must have the same namespace. Topics of an unknown task are not compared, because
+    nothing can decode them.
     """
     try:
         task = parse_task(metadata)
@@ -262,11 +239,7 @@ def require_contract(metadata: dict[str, str], contents: Contents) -> None:
 
 
 def contract_topics(metadata: dict[str, str]) -> dict[str, TopicSpec]:
-    """Return the topics of the task of an episode, by name without a leading slash.
-
-    Raises:
-        ValueError: If the task is unknown.
-    """
+    """Return the topics of the task of an episode by name without leading slash, or ValueError."""
     return _known_topics(parse_task(metadata))
 
 
@@ -295,48 +268,11 @@ def _defines(type_name: str, text: bytes) -> bool:
     return all(name in found and found[name][1] == fields for name, (_, fields) in known.items())
 
 
-# Summaries
-
-
-@dataclass(frozen=True, slots=True)
-class EpisodeSummary(HasOutcome):
-    """An episode without its messages.
-
-    Attributes:
-        path: The MCAP file.
-        metadata: The record `episode`.
-        result: The record `episode_result`.
-        message_count: Messages in the file.
-        duration_s: Simulated seconds from the first message to the last.
-        size_bytes: Size of the file.
-    """
-
-    path: Path
-    metadata: dict[str, str]
-    result: dict[str, str]
-    message_count: int
-    duration_s: float
-    size_bytes: int
-
-
 def read_summary(path: Path | str) -> EpisodeSummary:
-    """Read what an episode is and how it ended, with the checks of `read_episode`.
-
-    Args:
-        path: The bag directory, or its MCAP file.
-
-    Raises:
-        EpisodeReadError: If there is no such file, or it is damaged, ambiguous or no episode.
-    """
+    """Return the description and the end of an episode, with the checks of `read_episode`."""
     episode = read_episode(path)
-    times = episode.sorted_messages.headers['log_time']
     return EpisodeSummary(
-        path=episode.path,
-        metadata=episode.metadata,
-        result=episode.result,
-        message_count=len(times),
-        duration_s=(int(times[-1]) - int(times[0])) / 1e9 if len(times) else 0.0,
-        size_bytes=episode.size_bytes,
+        **{each.name: getattr(episode, each.name) for each in fields(EpisodeSummary)}
     )
 
 
@@ -345,13 +281,7 @@ def read_summary(path: Path | str) -> EpisodeSummary:
 
 @dataclass(frozen=True, slots=True)
 class TickMessage:
-    """A message of a tick.
-
-    Attributes:
-        topic: Its topic; the name is relative to the namespace of the robot.
-        log_time_ns: Log time.
-        data: CDR bytes.
-    """
+    """A message of a tick; the topic name is relative to the namespace of the robot."""
 
     topic: TopicSpec
     log_time_ns: int
@@ -360,12 +290,11 @@ class TickMessage:
 
 @dataclass(frozen=True, slots=True)
 class LoggedTick:
-    """The messages from one stamp to the next.
+    """The messages from one stamp to the next, in order.
 
     Attributes:
-        stamp_ns: Stamp of the tick.
-        published: Messages that the robot published, in order.
-        received: Messages that the robot received after them, in order.
+        published: Messages that the robot published.
+        received: Messages that the robot received after them.
     """
 
     stamp_ns: int
@@ -378,11 +307,7 @@ class LoggedTick:
 
 
 def logged_topics(episode: Episode) -> dict[str, TopicSpec]:
-    """Return the topics of an episode as its task defines them, by resolved name.
-
-    Raises:
-        EpisodeReadError: If the task is unknown, or the episode has no messages.
-    """
+    """Return the topics of an episode by resolved name, or raise EpisodeReadError."""
     try:
         known = contract_topics(episode.metadata)
     except ValueError as error:
@@ -393,11 +318,7 @@ def logged_topics(episode: Episode) -> dict[str, TopicSpec]:
 
 
 def split_ticks(episode: Episode) -> list[LoggedTick]:
-    """Return the ticks of an episode in order; each begins with `/clock`.
-
-    Raises:
-        EpisodeReadError: If the task is unknown, or the messages do not begin with a clock.
-    """
+    """Return the ticks of an episode in order, each from `/clock` on, or raise EpisodeReadError."""
     specs = logged_topics(episode)
     messages = (
         TickMessage(specs[episode.channels[id].topic], log_time, data)

@@ -63,7 +63,7 @@ class TornError(ValueError):
 
     Attributes:
         opcode: Kind of that record; None if the file ends in its opcode and length.
-        length: Length that the record has according to itself.
+        length: Length in the header of that record.
         bytes_left: Bytes of the file from the beginning of that record.
     """
 
@@ -114,11 +114,7 @@ class Fields:
         return self._data[start : self._position].decode()
 
     def strings(self) -> dict[str, str]:
-        """Read a map from text to text.
-
-        Raises:
-            ValueError: If it has more than `MAX_MAP_ENTRIES` entries, or one key twice.
-        """
+        """Read a map from text to text; ValueError for too many entries or a repeated key."""
         fields = Fields(self.bytes(self.number(4)), self._kind)
         found: dict[str, str] = {}
         while not fields.is_at_end:
@@ -138,13 +134,7 @@ def shown(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ReadLimits:
-    """How much of a file is read.
-
-    Attributes:
-        chunk_bytes: Bytes of one chunk, unpacked.
-        unpacked_bytes: Bytes of all chunks together.
-        skips_long_messages: Whether messages above `MAX_MESSAGE_BYTES` are left out.
-    """
+    """Limits of reading: unpacked bytes of one chunk and of all chunks; length of messages."""
 
     chunk_bytes: int = MAX_CHUNK_BYTES
     unpacked_bytes: int = MAX_UNPACKED_BYTES
@@ -222,16 +212,8 @@ class Contents:
     """The records of the data section of a file, in or outside of chunks.
 
     `take` raises `ValueError` at damage, beyond the limits, and if an id is defined twice with
-    different contents; then it leaves out the record.
-
-    Attributes:
-        schemas: By id.
-        channels: By id.
-        metadata: All metadata records, in order.
-        attachments: All attachments, in order.
-        chunks: All chunks, in order.
-        message_indexes: All message indexes, in order.
-        messages_outside: Number of messages outside of chunks.
+    different contents; then it leaves out the record. Schemas and channels are stored by id, other
+    records in order.
     """
 
     def __init__(self, limits: ReadLimits = EPISODE_LIMITS) -> None:
@@ -295,11 +277,7 @@ class Contents:
         return len(self._starts)
 
     def messages(self) -> Messages:
-        """Return all messages, sorted by log time.
-
-        Raises:
-            ValueError: If two have the same time, or one belongs to an undefined channel.
-        """
+        """Return all messages by log time; ValueError for equal times or undefined channels."""
         unpacked = b''.join(self._runs)
         starts = np.array(self._starts, dtype=np.int64)
         buffer = np.frombuffer(unpacked, np.uint8)
@@ -413,7 +391,7 @@ class Messages:
 
     Attributes:
         unpacked: Contents of all chunks, and records outside of chunks, one after the other.
-        starts: (n,) where each message record begins in `unpacked`.
+        starts: (n,) start of each message record in `unpacked`.
         headers: (n,) of type `MESSAGE`.
     """
 
@@ -432,11 +410,9 @@ class Messages:
 def split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, position and end of each record of a file, from its header on.
 
-    The magic at the end of a whole file is no record; the caller stops at the footer.
-
-    Raises:
-        TornError: If the file ends within a record.
-        ValueError: If it is no MCAP file, or has more than `MAX_RECORDS` records.
+    The caller stops at the footer, because the magic at the end is no record. A file that ends
+    within a record raises TornError. Other files, and files with more than `MAX_RECORDS` records,
+    raise ValueError.
     """
     magic = len(MCAP0_MAGIC)
     if data[:magic] != MCAP0_MAGIC:

@@ -59,11 +59,10 @@ class Leftover:
     """An episode that was not completed.
 
     Attributes:
-        name: Name of the episode.
         path: Its hidden directory.
         size_bytes: Size of its files.
         age_s: Seconds since the last write.
-        problem: Why no robot can have left it like this; '' if one may have.
+        problem: Reason why no robot can have left it, or ''.
     """
 
     name: str
@@ -85,11 +84,8 @@ def find_leftovers(directory: Path | str, now_s: float | None = None) -> list[Le
     """Return the unfinished episodes in a directory by name, without those in progress.
 
     Args:
-        directory: Where episodes are collected; may be missing.
+        directory: Directory of episodes; may be missing. EpisodeLogError if it is unreadable.
         now_s: Time since the epoch to measure age by; the system clock by default.
-
-    Raises:
-        EpisodeLogError: If the directory cannot be read.
     """
     now = time.time() if now_s is None else now_s
     try:
@@ -124,11 +120,7 @@ def _inspect(path: Path, now_s: float) -> Leftover | None:
 
 
 def _entries(path: Path, name: str) -> list[Path]:
-    """Return the files of a hidden directory.
-
-    Raises:
-        OSError: If it is no directory, or contains anything that no writer puts there.
-    """
+    """Return the files of a hidden directory; raise OSError for files of other origin."""
     if not stat.S_ISDIR(path.lstat().st_mode):
         raise NotADirectoryError(errno.ENOTDIR, 'is no directory', str(path))
     file = files.bag_file(path, name)
@@ -143,11 +135,11 @@ def _entries(path: Path, name: str) -> list[Path]:
 
 
 def recover_episode(leftover: Path | str) -> Path | None:
-    """Complete an episode that a crash cut off.
+    """Complete an episode that a crash cut off; return its bag, or None without messages.
 
     All whole chunks become a bag under the name of the episode; at most the last quarter of a
-    second is missing. The new file replaces the torn one when it has been read back. If more
-    than a few bytes of the torn file are unreadable, it is kept in `.<name>.aside`.
+    second is missing. The new file replaces the torn one when it has been read back. If more than a
+    few bytes of the torn file are unreadable, it is kept in `.<name>.aside`.
 
     An episode without messages is moved to `.<name>.aside`. It is removed if its file is empty, or
     has only a few bytes beyond a good header.
@@ -155,11 +147,8 @@ def recover_episode(leftover: Path | str) -> Path | None:
     Args:
         leftover: Hidden directory of the episode, see `find_leftovers`.
 
-    Returns:
-        The bag directory; None if the episode has no messages.
-
     Raises:
-        EpisodeInUseError: If it is being written, or another process recovers it or has done so.
+        EpisodeInUseError: If another process writes, recovers or has recovered it.
         EpisodeLogError: If it is damaged, ambiguous or no leftover of a robot, or the disk fails.
             The leftover stays as it is.
     """
@@ -251,7 +240,7 @@ class _Remains:
         contents: Records up to the first damage.
         is_whole: Whether the file has a footer.
         is_empty: Whether the file has only a few bytes beyond a good header.
-        damage: Why reading stopped; '' at the end of the file.
+        damage: Reason why reading stopped; '' at the end of the file.
         unread_bytes: Bytes from there to the end of the file.
         was_killed_at_the_start: Whether the file ends among the records that come before messages.
     """

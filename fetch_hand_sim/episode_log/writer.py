@@ -40,11 +40,7 @@ _NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed(?P<seed>\d+)(\.active|\
 
 
 def log_time(stamp_ns: int, rank: int) -> int:
-    """Return the log time in nanoseconds of message number `rank` of the tick stamped `stamp_ns`.
-
-    Raises:
-        ValueError: If one of them is negative; MCAP times are unsigned.
-    """
+    """Return the log time, ns, of message number `rank` of a tick; both must not be negative."""
     if stamp_ns < 0 or rank < 0:
         raise ValueError(f'stamp {stamp_ns} ns and rank {rank} must not be negative')
     return stamp_ns + rank
@@ -65,13 +61,11 @@ class ReceivedAllowance:
     def accepts(
         self, topic: str, size: int, has_room: bool = True, *, is_refused: bool = False
     ) -> bool:
-        """Return whether a message of `size` bytes is logged.
+        """Return whether a received message of `size` bytes is logged.
 
-        Args:
-            has_room: Whether the file has room for it.
-            is_refused: Whether the robot rejected it. Rejected messages get half of the allowance
-                at most, so that a flood of them leaves room for the messages that decide the
-                episode. They are counted as `<topic> (refused)`.
+        Messages that the robot rejected (`is_refused`) get at most half of the allowance, so that a
+        flood of them leaves room for the messages that decide the episode. They are counted as
+        `<topic> (refused)`.
         """
         share = 2 if is_refused else 1
         if (
@@ -88,32 +82,29 @@ class ReceivedAllowance:
 
 
 class EpisodeWriter:
-    """A rosbag2 bag that appears in a directory under its name when it is complete, and not before.
+    """A rosbag2 bag that appears in a directory under its name when it is complete.
 
     It is written in the hidden directory `.<name>.active`, from which `finish` or `abort` makes a
     valid bag. A killed process leaves the hidden directory behind, see `find_leftovers`.
 
-    The simulation can go on after every error of the disk. Such an error is raised once, as one
-    line; after it `write` does nothing and returns False, and `finish` returns None. Not
-    thread-safe, and not for use in signal handlers.
+    The simulation can continue after every error of the disk. Such an error is raised once. Then
+    `write` returns False and `finish` returns None. Not thread-safe, and not for use in signal
+    handlers.
 
-    Files stay within the limits of readers, see `limits`. Received messages have an allowance; the
-    record `episode_result` counts the messages beyond it.
+    Files stay within the limits of readers. Received messages have an allowance; the record
+    `episode_result` counts the messages beyond it.
 
     Args:
-        directory: Where episodes are collected; created if missing.
+        directory: Directory of episodes; created if missing.
         name: Name of the episode, see `episode_name`.
-        metadata: Contents of the metadata record `episode`, see `episode_metadata`; `episode_id`,
-            the name, is added.
-        attachments: Files to store.
-        settings: How to write.
+        metadata: See `episode_metadata`; `episode_id`, the name, is added.
         namespace: ROS namespace of relative topic names.
 
     Raises:
         EpisodeExistsError: If the name is taken; episodes are never overwritten.
-        EpisodeLogError: If the disk is too full or the file cannot be written; then no file is
-            left behind.
-        ValueError: If metadata are not strings, or these or the attachments are too long.
+        EpisodeLogError: If the disk is too full or the file cannot be written; then no file is left
+            behind.
+        ValueError: If metadata or attachments are too long, or metadata are not strings.
     """
 
     def __init__(
@@ -157,15 +148,7 @@ class EpisodeWriter:
             raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
 
     def write(self, topic: TopicSpec, data: bytes, log_time_ns: int) -> bool:
-        """Append a message.
-
-        Args:
-            topic: Its topic.
-            data: Its CDR bytes.
-            log_time_ns: Simulated time, later than that of the message before.
-
-        Returns:
-            True if the message was logged, False if the episode is completed or has failed.
+        """Append a message with CDR bytes `data`; return False after the end or an error.
 
         Raises:
             EpisodeLogError: At the first error of the disk.
@@ -179,9 +162,8 @@ class EpisodeWriter:
     def write_tick(self, stamp_ns: int, messages: Iterable[tuple[TopicSpec, bytes]]) -> bool:
         """Append all messages of the tick stamped `stamp_ns`, in their order; see `write`.
 
-        Raises:
-            EpisodeLogError: At the first error of the disk, or when the episode exceeds the limits
-                of readers; the part before can be recovered.
+        An episode beyond the limits of readers raises EpisodeLogError; the part before can be
+        recovered.
         """
         self._tick_ns, self._rank = stamp_ns, 0
         for topic, data in messages:
@@ -194,18 +176,11 @@ class EpisodeWriter:
         return self._is_open
 
     def write_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> bool:
-        """Append a message received since the last tick, after the messages of that tick.
+        """Append a message received since the last tick; return whether it is logged.
 
-        Args:
-            topic: Its topic.
-            data: CDR bytes.
-            is_refused: Whether the robot rejected it; such messages have a smaller allowance.
-
-        Returns:
-            False if it is not logged: the allowance of its topic is used up, or see `write`.
-
-        Raises:
-            ValueError: Before the first tick: earlier commands are not part of the episode.
+        It follows the messages of the tick. `is_refused` marks messages that the robot rejected,
+        which have a smaller allowance. Before the first tick a ValueError is raised, because
+        earlier commands are not part of the episode.
         """
         if not self._is_open:
             return False
@@ -216,11 +191,7 @@ class EpisodeWriter:
         return self._append_next(topic, data)
 
     def flush(self) -> None:
-        """Hand all messages to the operating system now.
-
-        Raises:
-            EpisodeLogError: At the first error of the disk.
-        """
+        """Hand all messages to the operating system now; the disk may raise EpisodeLogError."""
         if self._is_open and self._tick_ns is not None:
             self._flush(log_time(self._tick_ns, self._rank))
 
@@ -230,17 +201,11 @@ class EpisodeWriter:
         return self._is_open and self._bag.has_unflushed
 
     def finish(self, result: Mapping[str, str]) -> Path | None:
-        """Complete the bag of an episode that ran to its end.
+        """Complete the bag of an episode that ran to its end, and return its directory.
 
-        Args:
-            result: Contents of the metadata record `episode_result`; `complete` is added.
-
-        Returns:
-            The bag directory. None, and no bag, if writing failed before or there is no message.
-
-        Raises:
-            EpisodeLogError: If the bag cannot be completed; the hidden directory stays.
-            ValueError: If a key or value of the result is not a string.
+        `result` is the record `episode_result`; `complete` is added. Returns None, without a bag,
+        if writing failed before or there is no message. If the bag cannot be completed,
+        EpisodeLogError is raised and the hidden directory stays.
         """
         self.end(result)
         return self.store()
@@ -251,15 +216,10 @@ class EpisodeWriter:
         return self.store()
 
     def end(self, result: Mapping[str, str], reason: str | None = None) -> bool:
-        """Do the first half of `finish`, or with a reason of `abort`: write everything.
+        """Do the first half of `finish`, or of `abort` if a reason is given: write everything.
 
-        If the process is killed after this, recovery finds the whole episode.
-
-        Returns:
-            Whether there is a bag to `store`.
-
-        Raises:
-            EpisodeLogError, ValueError: As `finish` does.
+        If the process is killed after this, recovery finds the whole episode. Returns whether there
+        is a bag to `store`.
         """
         record = {**result, 'complete': 'true' if reason is None else 'false'}
         if reason is not None:
@@ -280,11 +240,7 @@ class EpisodeWriter:
         return True
 
     def store(self) -> Path | None:
-        """Do the second half: wait for the disk several times, then show the episode.
-
-        Raises:
-            EpisodeLogError: If the bag cannot be completed; the hidden directory stays.
-        """
+        """Do the second half of `finish`: wait for the disk, then show the episode."""
         if self._description is None:
             return self._completed
         try:
@@ -376,14 +332,9 @@ def _names(directory: Path, task: str) -> Iterator[re.Match[str]]:
 class EpisodeDirectory:
     """Begins one episode after the other in a directory.
 
-    Numbers go on after those of existing episodes, so no run overwrites another. Several processes
-    may share the directory: the first one to create the hidden directory of a name owns it, the
-    others take the next number.
-
-    Args:
-        path: The directory; created with the first episode.
-        settings: How to write.
-        namespace: ROS namespace of relative topic names.
+    Numbers continue after those of existing episodes, so no run overwrites another. Several
+    processes may share the directory: the first one to create the hidden directory of a name owns
+    it, the others take the next number.
     """
 
     def __init__(
@@ -401,11 +352,7 @@ class EpisodeDirectory:
         metadata: Mapping[str, str],
         attachments: Sequence[Attachment] = (),
     ) -> EpisodeWriter:
-        """Return the writer of a new episode.
-
-        Raises:
-            EpisodeLogError: If it cannot be written, see `EpisodeWriter`.
-        """
+        """Return the writer of a new episode; for errors see `EpisodeWriter`."""
         index = self._next[task] if task in self._next else self._first_index(task)
         while True:
             name = episode_name(task, index, seed)

@@ -40,15 +40,9 @@ def numbers(values: ArrayLike, what: str, shape: str) -> NDArray[Any]:
 def finite_numbers(
     name: str, values: ArrayLike, shape: tuple[int, ...], owner: str
 ) -> NDArray[np.floating]:
-    """Return finite numbers, one row for each simulation, as float32 or float64.
+    """Return finite numbers of a shape (N, size) as float32 or float64, or raise ValueError.
 
-    Args:
-        name: Meaning of the numbers, for errors.
-        shape: The required shape, (N, size).
-        owner: Task or space of the numbers, for errors.
-
-    Raises:
-        ValueError: If the shape is wrong or a value is not a finite number.
+    `name` and `owner` describe the numbers in errors.
     """
     array = numbers(values, f'{name} of {owner}', f'{shape}')
     if array.shape != shape:
@@ -78,14 +72,9 @@ def finite_goals(goals: ArrayLike, count: int, spec: TaskSpec) -> Array:
 
 
 def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
-    """Return poses with unit quaternions in the hemisphere of the object's quaternion.
+    """Return poses (n, 7) with unit quaternions in the hemisphere of the object's quaternion.
 
-    Args:
-        goals: (n, 7), position in m and quaternion wxyz.
-        achieved_goals: (n, 7), poses of the objects.
-
-    Raises:
-        ValueError: If a quaternion is zero.
+    A zero quaternion raises ValueError.
     """
     norm = np.linalg.norm(goals[:, 3:], axis=1, keepdims=True)
     if not (norm > 1e-6).all():
@@ -96,11 +85,7 @@ def nearest_quaternions(goals: Array, achieved_goals: Array) -> Array:
 
 
 def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
-    """Return the indices given as such, in their order, or as a boolean mask (N,).
-
-    Raises:
-        ValueError: If an index is out of range or given twice.
-    """
+    """Return the simulations of distinct indices or of a mask (N,), or raise ValueError."""
     selected = np.asarray(ids)
     if selected.dtype == bool and selected.shape == (num_envs,):
         return np.flatnonzero(selected)
@@ -120,13 +105,8 @@ def selected_simulations(ids: ArrayLike, num_envs: int) -> NDArray[np.intp]:
 def generators(seed: Seeds, selected: NDArray[np.intp]) -> list[np.random.Generator | None]:
     """Return a new random generator for each selected simulation; None keeps the old one.
 
-    Args:
-        seed: As in `Simulation.reset`.
-        selected: Indices of the simulations.
-
-    Raises:
-        ValueError: If a seed is negative, or the number of seeds is wrong.
-        TypeError: If a seed is not an integer.
+    `seed` is that of `Simulation.reset`. A negative seed or a wrong number of seeds raises
+    ValueError, another type TypeError.
     """
     if seed is None:
         return [None] * selected.size

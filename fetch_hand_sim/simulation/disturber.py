@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.tasks import Task
+from fetch_hand_sim.simulation.tasks.task import chain_dofs
 from fetch_hand_sim.simulation.varied_physics import VariedPhysics, first_body, joint_dofs
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import MOST_TICKS, Disturbances, PhysicsDisturbance
@@ -54,13 +55,8 @@ class Disturber:
     All random numbers of an episode come from one stream that belongs to the episode's seed and is
     independent of the draws of start and goal.
 
-    Args:
-        task: The simulations.
-        disturbances: What is disturbed.
-
     Attributes:
-        disturbances: As given.
-        variations: What the running episodes drew, (N,) each, by the names in `VARIATIONS`.
+        variations: Values drawn for the running episodes, (N,) each, by the names in `VARIATIONS`.
     """
 
     def __init__(self, task: Task, disturbances: Disturbances) -> None:
@@ -113,12 +109,7 @@ class Disturber:
     # Episodes
 
     def allow(self, given: Mapping[str, Any]) -> dict[str, float]:
-        """Return requested variations as numbers, and make them possible.
-
-        Raises:
-            ValueError: If a name is unknown, a value is not allowed or the task lacks what it
-                changes.
-        """
+        """Make requested variations possible and return them as numbers, or raise ValueError."""
         wanted = {name: _variation(name, value) for name, value in given.items()}
         for name in wanted:
             if name in _PHYSICS:
@@ -421,7 +412,7 @@ class _Lever:
         body = int(model.site_bodyid[site])
         joints = [i for i, u in enumerate(task.spec.robot.joint_units) if u == 'rad']
         dofs = joint_dofs(task)[joints]
-        chain = {dof for dof in dofs.tolist() if _moves(model, dof, body)}
+        chain = set(chain_dofs(model, body).tolist())
         self._errors = [i for i, dof in enumerate(dofs.tolist()) if dof in chain]
         self._dofs = dofs[self._errors]
         self._position = task.output('site_xpos')[:, site]
@@ -434,16 +425,6 @@ class _Lever:
         spatial = weighted.sum(axis=1)
         shift: Array = spatial[:, 3:]
         return shift + np.cross(spatial[:, :3], self._position - self._center)
-
-
-def _moves(model: mujoco.MjModel, dof: int, body: int) -> bool:
-    """Return whether a degree of freedom moves a body."""
-    mover = int(model.dof_bodyid[dof])
-    while body:
-        if body == mover:
-            return True
-        body = int(model.body_parentid[body])
-    return False
 
 
 def _levers(task: Task) -> dict[str, list[_Lever]]:

@@ -57,11 +57,7 @@ def _stop_timers() -> None:
 
 
 class DivergenceWatch:
-    """Find the simulations that MuJoCo reported as diverged since the last look.
-
-    Args:
-        batch: The `mujoco.batch.Batch` of N simulations.
-    """
+    """Finds the simulations of a batch that MuJoCo reported as diverged since the last call."""
 
     def __init__(self, batch: Any) -> None:
         self._batch = batch

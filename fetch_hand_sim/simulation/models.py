@@ -47,11 +47,7 @@ FETCH_NEVER_TOUCHING = (
 
 
 def asset_path(relative: str) -> Path:
-    """Return the path of an asset such as `fetch/reach.xml`; absolute paths stay.
-
-    Raises:
-        FileNotFoundError: If `gymnasium-robotics` or the asset is missing.
-    """
+    """Return the path of an asset such as `fetch/reach.xml`, if it exists; absolute paths stay."""
     if Path(relative).is_absolute():
         return Path(relative)
     spec = util.find_spec('gymnasium_robotics')

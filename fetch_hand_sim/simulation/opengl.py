@@ -84,9 +84,6 @@ def _backend() -> str:
     """Choose the backend for this process: `MUJOCO_GL`, then a display, then EGL, then OSMesa.
 
     GLFW is not tried without a display, because MuJoCo's second attempt ends the process.
-
-    Raises:
-        RuntimeError: If no backend works.
     """
     asked = os.environ.get('MUJOCO_GL', '').strip().lower()
     if asked in _WINDOWS and not _has_display():

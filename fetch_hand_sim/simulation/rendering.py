@@ -83,11 +83,7 @@ class SceneRenderer:
             return np.asarray(self._renderer.render())
 
     def render_depth(self, frame: Frame) -> NDArray[np.float32]:
-        """Return distances from the camera plane, (height, width), m, without markers.
-
-        Raises:
-            RuntimeError: If the OpenGL context belongs to another thread.
-        """
+        """Return distances from the camera plane, (height, width), m, without markers."""
         self._update(frame)
         self._renderer.enable_depth_rendering()
         try:
@@ -133,11 +129,7 @@ def make_options() -> mujoco.MjvOption:
 
 
 def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.MjvCamera:
-    """Return a camera of the model by name, or the scene's view with changed attributes.
-
-    Raises:
-        ValueError: If the camera is unknown (the message lists all), or an attribute is invalid.
-    """
+    """Return a camera by name, or the view with changed attributes; ValueError if unknown."""
     camera = mujoco.MjvCamera()
     if name is None or isinstance(name, Mapping):
         scene.view.apply(camera)
@@ -154,12 +146,7 @@ def make_camera(scene: Scene, name: str | Mapping[str, Any] | None) -> mujoco.Mj
 def set_attributes(
     camera: mujoco.MjvCamera, attributes: Mapping[str, Any], model: mujoco.MjModel
 ) -> None:
-    """Set attributes of a camera of a model.
-
-    Raises:
-        ValueError: If a value has a wrong type or length, is not finite, or refers to an unknown
-            camera type, body or camera.
-    """
+    """Set attributes of a camera of a model; raise ValueError for invalid values."""
     for name, value in attributes.items():
         try:
             if np.ndim(value):

@@ -17,6 +17,7 @@ import numpy as np
 
 from fetch_hand_sim.simulation.models import geom_color, load_spec
 from fetch_hand_sim.simulation.tasks import task_asset
+from fetch_hand_sim.simulation.tasks.task import joint_qpos_slice
 from msgs_spec.arrays import Array
 from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.tasks import GoalKind, TaskSpec, task_spec
@@ -156,9 +157,7 @@ class Scene:
     @property
     def has_ghost(self) -> bool:
         """True if the model contains a ghost of the object that shows the goal."""
-        joint = mujoco.mj_name2id(
-            self.model, mujoco.mjtObj.mjOBJ_JOINT.value, _free_joint_of(GHOST)
-        )
+        joint = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT.value, f'{GHOST}:joint')
         return self.spec.goal is GoalKind.POSE and self.spec.has_object and joint >= 0
 
     def show(self, frame: Frame) -> None:
@@ -233,14 +232,7 @@ class Scene:
         return [Marker(int(geom.type[0]), size, pose[:3], tint, pose[3:])]
 
     def _free_joint(self, body: str | None) -> slice | None:
-        if body is None:
-            return None
-        start = int(self.model.joint(_free_joint_of(body)).qposadr[0])
-        return slice(start, start + 7)
-
-
-def _free_joint_of(body: str) -> str:
-    return f'{body}:joint'
+        return None if body is None else joint_qpos_slice(self.model, f'{body}:joint')
 
 
 def ghost_pose(spec: TaskSpec, goal: Array) -> Array:

@@ -219,11 +219,7 @@ class Simulation:
             self._disturber.note_written_state()
 
     def apply_model_changes(self) -> None:
-        """Step with `model` as it is now; the simulation keeps its own copy.
-
-        Raises:
-            ValueError: If disturbances vary the physics of each episode.
-        """
+        """Step with the present `model`; ValueError if disturbances vary the physics."""
         if self.varies_physics:
             raise ValueError(
                 f'the model of {self.spec.name} cannot be changed while disturbances vary its '
@@ -306,16 +302,11 @@ class Simulation:
         return self._result(self._advance(self._task.commands_from_actions(checked)))
 
     def step_commands(self, commands: ArrayLike) -> StepResult:
-        """Advance every simulation by one step, with commands in ROS units.
+        """Advance every simulation by one step, with commands in ROS units; see `step`.
 
         Args:
             commands: (N, action size), clipped to the limits (`msgs_spec.robots.clip_command`).
                 Fetch: as actions. Hand: absolute joint positions in radians.
-
-        Raises:
-            ValueError: If the shape is wrong or a value is not finite.
-            gymnasium.error.ResetNeeded: If a simulation has never been reset.
-            RuntimeError: If this process was forked and lacks the threads of the batch.
         """
         return self._result(self.advance(commands))
 
@@ -329,9 +320,6 @@ class Simulation:
         """Return rewards (...,) of goals (..., goal size) of any batch shape.
 
         `info` is ignored; it is part of Gymnasium's interface.
-
-        Raises:
-            ValueError: If the last axis is not the goal's, or the shapes differ.
         """
         return self.metric.reward(achieved_goal, desired_goal, info)
 
@@ -348,11 +336,8 @@ class Simulation:
         because the `gymnasium` success rule distinguishes q from -q.
 
         Args:
-            goals: (n, goal size), in the order of `ids`; units and frame as `goals`.
+            goals: (n, goal size), finite, in the order of `ids`; units and frame as `goals`.
             ids: The n simulations; None for all.
-
-        Raises:
-            ValueError: If the shape is wrong, a value is not finite or a quaternion is zero.
         """
         selected = self._select(ids)
         wanted = finite_goals(goals, selected.size, self.spec)
@@ -361,16 +346,12 @@ class Simulation:
         self.goals[selected] = wanted
 
     def perturb(self, body: str, wrench: ArrayLike, index: int = 0) -> None:
-        """Push a body of one simulation during the next step.
+        """Push a body of one simulation during the next step, or raise ValueError.
 
         Args:
             body: Name of a movable body of the model.
             wrench: (6,) force in N and torque in N m, world axes, at the centre of mass.
             index: The simulation.
-
-        Raises:
-            ValueError: If the simulation or body does not exist, the body cannot move, or a value
-                is not finite.
         """
         if not isinstance(body, str):
             raise ValueError(f'body {body!r:.60} is not a name; allowed: a movable body')

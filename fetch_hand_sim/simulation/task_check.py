@@ -23,13 +23,9 @@ _STEPS = 3
 
 
 def check_task(name: str) -> None:
-    """Check that the class of a task does what its specification promises.
+    """Check that the class of a task, one of `TASKS`, follows its specification.
 
-    Run it once in the tests of the package that brings the task. The simulation itself checks
-    none of this.
-
-    Args:
-        name: One of `msgs_spec.tasks.TASKS`.
+    Run it once in the tests of the third-party package. The simulation itself checks none of this.
 
     Raises:
         ValueError: If the task is invalid; the message names the first problem and its remedy.

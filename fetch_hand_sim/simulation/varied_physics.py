@@ -36,15 +36,7 @@ _FIELDS = {
 
 
 class VariedPhysics:
-    """Writes the variations of each simulation into its own copy of some model fields.
-
-    Args:
-        task: The simulations.
-        physics: The variations that are on.
-
-    Raises:
-        ValueError: If the task lacks what a variation changes.
-    """
+    """Writes the variations of each simulation into its own copy of some model fields."""
 
     def __init__(self, task: Task, physics: PhysicsDisturbance) -> None:
         self._task = task
@@ -74,11 +66,7 @@ class VariedPhysics:
         return tuple(self._names)
 
     def allow(self, name: str) -> None:
-        """Make a variation possible that is off by default.
-
-        Raises:
-            ValueError: If the task lacks what it changes.
-        """
+        """Make a variation possible that is off by default, or raise ValueError."""
         if name in self._names:
             return
         if not self._has(name):
@@ -104,11 +92,7 @@ class VariedPhysics:
             values[ids] = self._nominal[field]
 
     def apply(self, ids: Ids, variations: Mapping[str, Array]) -> bool:
-        """Write the variations (N,) of simulations that have the model's physics.
-
-        Returns:
-            Whether anything may have changed.
-        """
+        """Write variations (N,) of simulations in nominal physics; return whether any are on."""
         for name in self._names:
             change: Callable[[Ids, Mapping[str, Array]], None]
             change = getattr(self, f'_vary_{name}', None) or self._factor(name)

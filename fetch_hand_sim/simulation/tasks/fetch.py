@@ -27,6 +27,7 @@ from fetch_hand_sim.simulation.tasks.task import (
     Generators,
     Ids,
     Task,
+    chain_dofs,
     integration_state,
     joint_qpos_slice,
 )
@@ -282,7 +283,7 @@ class _SiteReader:
         body = int(model.site_bodyid[site])
         self._site_quaternion = model.site_quat[site].copy()
         self._site_aligned = bool((self._site_quaternion == [1.0, 0.0, 0.0, 0.0]).all())
-        self._dofs = _chain_dofs(model, body)
+        self._dofs = chain_dofs(model, body)
         self._position: Array = task.output('site_xpos')[:, site]
         self._body_quaternion: Array = task.output('xquat')[:, body]
         self._center = task.output('subtree_com')[:, int(model.body_rootid[body])]
@@ -313,16 +314,6 @@ def _cross(first: Array, second: Array) -> Array:
     product = first[:, [1, 2, 0]] * second[:, [2, 0, 1]]
     product -= first[:, [2, 0, 1]] * second[:, [1, 2, 0]]
     return product
-
-
-def _chain_dofs(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
-    """Return the degrees of freedom that move a body, ascending."""
-    dofs: list[int] = []
-    while body:
-        first, count = int(model.body_dofadr[body]), int(model.body_dofnum[body])
-        dofs.extend(range(first, first + count))
-        body = int(model.body_parentid[body])
-    return np.array(sorted(dofs), dtype=np.intp)
 
 
 def lead_scale(control_hz: float) -> float:

@@ -62,11 +62,7 @@ def _family(spec: TaskSpec) -> Any:
 
 
 def task_asset(name: str) -> str:
-    """Return the MJCF asset of a task, for example `fetch/reach.xml`.
-
-    Raises:
-        ValueError: If the task is unknown, or its class has no `ASSET`.
-    """
+    """Return the MJCF asset of a task, for example `fetch/reach.xml`, or raise ValueError."""
     spec = task_spec(name)
     if spec.name in FETCH_CONFIGS:
         return FETCH_CONFIGS[spec.name].asset

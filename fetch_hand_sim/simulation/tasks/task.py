@@ -315,3 +315,13 @@ def joint_qvel_slice(model: mujoco.MjModel, name: str) -> slice:
     """Return the six places of a free joint in qvel."""
     address = int(model.joint(name).dofadr[0])
     return slice(address, address + 6)
+
+
+def chain_dofs(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
+    """Return the degrees of freedom that move a body, ascending."""
+    dofs: list[int] = []
+    while body:
+        first, count = int(model.body_dofadr[body]), int(model.body_dofnum[body])
+        dofs.extend(range(first, first + count))
+        body = int(model.body_parentid[body])
+    return np.array(sorted(dofs), dtype=np.intp)
