@@ -599,7 +599,7 @@ def test_the_command_line_generates(tmp_path, capsys):
     assert generate_episodes.main(['--policy', 'random', '--output', str(tmp_path)]) == 2
     assert 'random needs a task' in capsys.readouterr().err
     assert generate_episodes.main([*arguments, '--episodes', '3', '--threads', '1']) == 0
-    assert 'holds 2 of these seeds of FetchReach already; --first-seed 2' in capsys.readouterr().err
+    assert '2 of these seeds of FetchReach; --first-seed 2' in capsys.readouterr().err
     more = ['--episodes', '1', '--threads', '1', '--first-seed', '3']
     assert generate_episodes.main([*arguments, *more]) == 0
     assert capsys.readouterr().err == ''
@@ -621,7 +621,7 @@ def test_a_policy_that_answers_nonsense_on_the_way_is_one_line(tmp_path, monkeyp
     arguments = ['--policy', 'strange_policy:make', '--trust', '--task', 'FetchReach']
     arguments += ['--episodes', '1', '--threads', '1', '--output', str(tmp_path / 'out')]
     assert generate_episodes.main(arguments) == 1
-    assert 'strange_policy:make fails: actions must be finite' in capsys.readouterr().err
+    assert 'strange_policy:make returned [[nan' in capsys.readouterr().err
 
 
 def test_actions_beyond_the_range_are_clipped_as_on_the_robot(tmp_path, monkeypatch):
