@@ -100,7 +100,7 @@ docs: env
 
 tables: env
 	$(BIN)/python tools/interface_table.py --write docs/interface.md
-	$(BIN)/python tools/readme_tables.py --write README.md docs/simulation.md docs/results.md
+	$(BIN)/python tools/readme_tables.py --write README.md docs/speed.md docs/results.md
 	$(BIN)/python tools/task_pages.py --write
 	$(BIN)/python tools/robustness_overview.py
 

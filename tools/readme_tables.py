@@ -1,8 +1,8 @@
-"""The tables of results in README.md, docs/simulation.md and docs/results.md.
+"""The tables of results in README.md, docs/speed.md and docs/results.md.
 
 Shipped actors come from the evaluation files beside them, speed from the last `make bench-sim`.
 
-python tools/readme_tables.py --write README.md docs/simulation.md docs/results.md
+python tools/readme_tables.py --write README.md docs/speed.md docs/results.md
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ ACTORS = ROOT / 'policy_node' / 'actors'
 TOOL = runpy.run_path(str(ROOT / 'tools' / 'readme_tables.py'))
 
 
-@pytest.mark.parametrize('page', ['README.md', 'docs/simulation.md', 'docs/results.md'])
+@pytest.mark.parametrize('page', ['README.md', 'docs/speed.md', 'docs/results.md'])
 def test_pages_have_the_present_tables(page: str) -> None:
     text = (ROOT / page).read_text(encoding='utf-8')
     assert TOOL['with_tables'](text) == text, 'run: make tables'
