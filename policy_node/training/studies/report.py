@@ -37,9 +37,10 @@ _ENOUGH_SEEDS = 5
 # An epoch of the paper: 50 cycles of 2 episodes on each of 19 workers.
 EPISODES_PER_EPOCH = 1900
 FAST_SUCCESS = 0.95
-# Colours of a figure; further curves are dashed.
-_COLORS = 10
-_MOST_INSIDE = 4
+# Okabe and Ito 2008: safe for colour blindness. Further curves are dashed.
+_COLORS = ('#000000', '#0072B2', '#D55E00', '#009E73', '#CC79A7', '#56B4E9', '#E69F00')
+# Most curves of one panel.
+_MOST_LINES = 5
 
 Bands = Mapping[str, Mapping[str, 'Band']]
 """Bands by task and variant."""
@@ -284,45 +285,60 @@ def _format_comparison(table: Sequence[dict[str, Any]]) -> str:
 
 
 def draw(bands: Bands, labels: Mapping[str, str], paper_epochs: bool = True) -> bytes:
-    """Return a PNG with one panel per task: the median of each variant over its quartiles.
+    """Return a PNG: the median of each variant over its quartiles.
+
+    A task has one panel. A task with more than `_MOST_LINES` variants has one panel for each
+    variant but the first, the baseline, which every one of these panels shows as well.
 
     Args:
         bands: The curves.
-        labels: By variant, in the order of their colours.
+        labels: By variant, in the order of their colours; the baseline first.
         paper_epochs: Mark the epochs of the paper on a second axis.
     """
     from matplotlib.figure import Figure
 
     top = _top_of_axis(bands)
-    columns = min(len(bands), 4)
-    rows = -(-len(bands) // columns)
-    figure = Figure(figsize=(4.6 * columns + 0.8, 3.9 * rows), layout='constrained')
+    shown = [panel for task, arms in bands.items() for panel in _panels(task, arms, labels)]
+    is_small = len(shown) > len(bands)
+    columns = min(len(shown), 4)
+    rows = -(-len(shown) // columns)
+    width, height = (3.4, 2.7) if is_small else (4.6, 3.9)
+    figure = Figure(figsize=(width * columns + 0.8, height * rows + 0.5), layout='constrained')
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in panels[len(bands) :]:
+    for axes in panels[len(shown) :]:
         axes.set_visible(False)
-    for axes, (task, arms) in zip(panels, bands.items(), strict=False):
+    for axes, (task, title, names) in zip(panels, shown, strict=False):
         for index, (arm, label) in enumerate(labels.items()):
-            if arm in arms:
-                band, color = arms[arm], f'C{index}'
-                style = '--' if index >= _COLORS else '-'
+            if arm in names:
+                band, color = bands[task][arm], _COLORS[index % len(_COLORS)]
+                style = '--' if index >= len(_COLORS) else '-'
                 axes.fill_between(band.env_steps, band.lower, band.upper, color=color, alpha=0.2)
                 axes.plot(band.env_steps, band.median, style, color=color, label=label)
         _label(axes, task, top, paper_epochs)
-    _add_legend(figure, list(panels[: len(bands)]), columns)
+        axes.set_title(title, fontsize='small' if is_small else 'medium')
+    _add_legend(figure, list(panels[: len(shown)]), columns)
     file = io.BytesIO()
-    figure.savefig(file, dpi=130)
+    figure.savefig(file, dpi=110 if is_small else 130)
     return file.getvalue()
 
 
+def _panels(
+    task: str, arms: Mapping[str, Band], labels: Mapping[str, str]
+) -> list[tuple[str, str, list[str]]]:
+    """Return task, title and variants of each panel that shows a task."""
+    names = [name for name in labels if name in arms]
+    if len(names) <= _MOST_LINES:
+        return [(task, task, names)]
+    baseline, *others = names
+    return [(task, f'{task}: {labels[name]}', [baseline, name]) for name in others]
+
+
 def _add_legend(figure: Any, panels: Sequence[Any], columns: int) -> None:
-    """Add a legend inside the first panel, or below all panels where it would hide curves."""
+    """Add a legend below all panels."""
     named: dict[str, Any] = {}
     for axes in panels:
         handles, labels = axes.get_legend_handles_labels()
         named |= zip(labels, handles, strict=True)
-    if len(named) <= _MOST_INSIDE:
-        panels[0].legend(named.values(), named.keys(), loc='best', fontsize='small')
-        return
     lines = -(-len(named) // columns)
     width, height = figure.get_size_inches()
     figure.set_size_inches(width, height + 0.2 * lines)
@@ -341,11 +357,10 @@ def _top_of_axis(bands: Bands) -> float:
 def _label(axes: Any, task: str, top: float, paper_epochs: bool) -> None:
     from matplotlib.ticker import EngFormatter
 
-    unit = 'environment steps' if paper_epochs else 'steps of 40 ms'
+    unit = 'environment steps' if paper_epochs else 'environment steps (40 ms)'
     axes.set(xlabel=unit, ylabel='success at the last step')
     axes.set_ylim(-0.02 * top, 1.02 * top)
     axes.xaxis.set_major_formatter(EngFormatter(sep=''))
-    axes.set_title(task)
     axes.grid(alpha=0.3)
     if not paper_epochs:
         return
