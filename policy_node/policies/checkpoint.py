@@ -113,13 +113,7 @@ def save(path: str | Path, actor: Actor, info: ActorInfo) -> None:
 
 
 def to_bytes(actor: Actor, info: ActorInfo) -> bytes:
-    """Return the contents of a checkpoint file.
-
-    Raises:
-        ValueError: If the metadata belong to an actor of another shape.
-    """
-    if actor.shape != info.shape:
-        raise ValueError(f'actor has shape {actor.shape}; its metadata have {info.shape}')
+    """Return the contents of a checkpoint file."""
     tensors = {name: value.detach().cpu() for name, value in actor.state_dict().items()}
     return tensor_bytes(tensors, to_metadata(info))
 

@@ -18,6 +18,7 @@ from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.text import one_line
 from policy_node.policies.policy import (
     LoadedPolicy,
+    MemorylessPolicy,
     Observation,
     Policy,
     RandomPolicy,
@@ -149,29 +150,22 @@ def _require_task(name: str, task: str | None) -> str:
 # Policies of the user's own code.
 
 
-class _FunctionPolicy:
+class _FunctionPolicy(MemorylessPolicy):
     """A function from one observation to one action; it gets a batch row by row."""
 
-    def __init__(self, act: Callable[[Observation], Any]) -> None:
-        self._act = act
+    def __init__(self, function: Callable[[Observation], Any]) -> None:
+        self._function = function
 
-    def predict(
-        self,
-        observation: Observation,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[Any], None]:
-        del state, episode_start, deterministic
+    def act(self, observation: Observation) -> NDArray[Any]:
         parts = {name: np.asarray(values) for name, values in observation.items()}
         leading = parts['observation'].shape[:-1]
         if not leading:
-            return np.asarray(self._act(parts)), None
+            return np.asarray(self._function(parts))
         rows = [
-            self._act({name: values[index] for name, values in parts.items()})
+            self._function({name: values[index] for name, values in parts.items()})
             for index in np.ndindex(leading)
         ]
-        return np.reshape(np.asarray(rows), (*leading, -1)), None
+        return np.reshape(np.asarray(rows), (*leading, -1))
 
 
 def is_python_name(name: str) -> bool:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import os
 import resource
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -25,7 +24,12 @@ from numpy.typing import NDArray
 from msgs_spec.text import one_line
 from policy_node.policies.checkpoint import ActorInfo, loaded_actor, parse_metadata
 from policy_node.policies.files import read_file, sha256
-from policy_node.policies.policy import LoadedPolicy, Observation, observation_and_goal
+from policy_node.policies.policy import (
+    LoadedPolicy,
+    MemorylessPolicy,
+    Observation,
+    observation_and_goal,
+)
 
 INPUTS = ('observation', 'desired_goal')
 OUTPUT = 'action'
@@ -38,7 +42,7 @@ _TRIAL_CPU_SECONDS = 2
 _TRIAL_TIMEOUT = 30.0
 
 
-class OnnxActor:
+class OnnxActor(MemorylessPolicy):
     """Run an ONNX file on one thread.
 
     Args:
@@ -60,21 +64,14 @@ class OnnxActor:
         self.info: ActorInfo = parse_metadata({'format_version': '1', **metadata}, path)
         self._check_sizes(path)
 
-    def predict(
-        self,
-        observation: Observation,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], None]:
+    def act(self, observation: Observation) -> NDArray[np.float32]:
         """Return actions (..., action size) in [-1, 1] for one observation or a batch."""
-        del state, episode_start, deterministic
         sizes = self.info.shape.observation_size, self.info.goal_size
         parts = dict(zip(INPUTS, observation_and_goal(observation, *sizes), strict=True))
         leading = parts['observation'].shape[:-1]
         flat = {name: part.reshape(-1, part.shape[-1]) for name, part in parts.items()}
         (action,) = self._session.run([OUTPUT], flat)
-        return np.asarray(action, np.float32).reshape(*leading, -1), None
+        return np.asarray(action, np.float32).reshape(*leading, -1)
 
     def _check_sizes(self, path: Path) -> None:
         places = (*self._session.get_inputs(), *self._session.get_outputs())
@@ -147,16 +144,8 @@ def _try_out(data: bytes, path: Path) -> None:
     if trial.returncode != 0:
         raise ValueError(
             f'{path} needs more than {_TRIAL_MEMORY >> 20} MiB or {_TRIAL_CPU_SECONDS} s for one '
-            f'observation, the largest values allowed; its trial {_ending(trial.returncode)}'
+            f'observation, the largest values allowed (exit code {trial.returncode})'
         )
-
-
-def _ending(code: int) -> str:
-    """Describe how a process ended, from its return code in `subprocess`."""
-    try:
-        return f'was ended by {signal.Signals(-code).name}'
-    except ValueError:
-        return f'ended with code {code}'
 
 
 def _trial(path: Path) -> int:

@@ -106,11 +106,30 @@ class LoadedPolicy:
         return action, answer[1]
 
 
+class MemorylessPolicy:
+    """A policy whose actions depend only on the observation."""
+
+    def act(self, observation: Observation) -> NDArray[Any]:
+        """Return actions (..., action size) in [-1, 1] for one observation or a batch."""
+        raise NotImplementedError
+
+    def predict(
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], None]:
+        """Return actions as `Policy.predict` does, without a state."""
+        del state, episode_start, deterministic
+        return self.act(observation), None
+
+
 # Keeps the random numbers of actions apart from those of resets with the same seed.
 _ACTION_STREAM = 1
 
 
-class RandomPolicy:
+class RandomPolicy(MemorylessPolicy):
     """Uniformly random actions, equal for equal seeds."""
 
     def __init__(self, action_size: int, seed: int = 0) -> None:
@@ -122,38 +141,24 @@ class RandomPolicy:
         """Begin an episode in each row of a batch; rows with equal seeds get equal actions."""
         self._row_generators = [np.random.default_rng((seed, _ACTION_STREAM)) for seed in seeds]
 
-    def predict(
-        self,
-        observation: Observation,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], None]:
+    def act(self, observation: Observation) -> NDArray[np.float32]:
         """Return random actions (..., action size) in [-1, 1]."""
-        del state, episode_start, deterministic
         shape = _action_shape(observation, self._action_size)
         if shape == (len(self._row_generators), self._action_size):
             rows = [generator.uniform(-1.0, 1.0, shape[1:]) for generator in self._row_generators]
-            return np.array(rows, np.float32), None
-        return self._generator.uniform(-1.0, 1.0, shape).astype(np.float32), None
+            return np.array(rows, np.float32)
+        return self._generator.uniform(-1.0, 1.0, shape).astype(np.float32)
 
 
-class RestingPolicy:
+class RestingPolicy(MemorylessPolicy):
     """The zero action: the gripper stays, the hand takes the middle of its ranges."""
 
     def __init__(self, action_size: int) -> None:
         self._action_size = action_size
 
-    def predict(
-        self,
-        observation: Observation,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], None]:
+    def act(self, observation: Observation) -> NDArray[np.float32]:
         """Return zeros (..., action size)."""
-        del state, episode_start, deterministic
-        return np.zeros(_action_shape(observation, self._action_size), np.float32), None
+        return np.zeros(_action_shape(observation, self._action_size), np.float32)
 
 
 def _action_shape(observation: Observation, action_size: int) -> tuple[int, ...]:

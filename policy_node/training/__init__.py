@@ -11,7 +11,7 @@ __all__ = ['Run', 'train']
 
 
 def __getattr__(name: str) -> Any:
-    # Commands look at what they were given before torch is loaded.
+    # Commands check their arguments before torch is imported.
     if name not in __all__:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     from importlib import import_module
@@ -21,6 +21,6 @@ def __getattr__(name: str) -> Any:
     try:
         require_extra('train')
     except UsageError as error:
-        # Python would name a module.
+        # Name the missing extra.
         raise ModuleNotFoundError(str(error)) from None
     return getattr(import_module('policy_node.training.train_function'), name)

@@ -1,10 +1,10 @@
-"""`critic_bias`: what the critic of a run promises, beside what its actor gets.
+"""`critic_bias`: compare the values of a run's critic with the returns of its actor.
 
     python -m policy_node.training.critic_bias runs/block
 
-A critic that promises more than there is cannot tell the actor what is better. Two things make it
-do so: actors seek the actions that it errs on, and goals chosen in hindsight count every landing
-as meant (docs/her_and_recipes.md).
+A critic that overestimates cannot show the actor which action is better. There are two causes.
+Actors prefer actions with errors of the critic. Hindsight goals treat every outcome as intended
+(docs/her_and_recipes.md).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _NAME = 'critic_bias'
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parses the command line."""
+    """Parse the command line."""
     parser = CommandParser(prog=_NAME, description=(__doc__ or '').splitlines()[0])
     parser.add_argument('run', type=Path, help='folder of a run')
     episodes = whole_number(2, 100_000)
@@ -37,7 +37,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit status."""
+    """Run the command and return its exit code."""
     options = parse_arguments(arguments)
     return run_command(_NAME, lambda: _run(options))
 
@@ -50,15 +50,20 @@ def _run(options: argparse.Namespace) -> int:
     from policy_node.training.values_and_returns import measure
 
     try:
-        promises = measure(options.run, options.episodes)
+        comparisons = measure(options.run, options.episodes)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    say(f'{options.run}: {options.episodes} fresh episodes, without noise')
+    say(f'{options.run}: {options.episodes} new episodes, without noise')
     table = Table()
-    for name in ('tick', 'value promised', 'return got', 'too much', 'correlation'):
+    for name in ('tick', 'value', 'return', 'difference', 'correlation'):
         table.add_column(name, justify='right')
-    for each in promises:
-        numbers = (each.value, each.gain, each.value - each.gain, each.correlation)
+    for each in comparisons:
+        numbers = (
+            each.value,
+            each.episode_return,
+            each.value - each.episode_return,
+            each.correlation,
+        )
         table.add_row(str(each.tick), *(f'{number:.2f}' for number in numbers))
     Console().print(table)
     return EXIT_SUCCESS

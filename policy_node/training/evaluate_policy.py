@@ -19,7 +19,6 @@ from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandError,
     CommandParser,
-    UsageError,
     progress,
     run_command,
     whole_number,
@@ -80,11 +79,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     loaded = load_chosen_policy(options)
     simulation = make_chosen_simulation(options, loaded)
-    files = [file for file in (options.json, options.csv) if file not in (None, _STDOUT)]
-    for file in files:
-        require_writable(file)
-    if len({file.resolve() for file in files}) < len(files) and _is_replaced(files[0]):
-        raise UsageError(f'--json and --csv are one file, {files[0]}: the second would replace it')
+    for file in (options.json, options.csv):
+        if file not in (None, _STDOUT):
+            require_writable(file)
     with policy_errors():
         outcomes, code = _evaluate(options, simulation, replace(loaded, is_bounded=True))
     report = {
@@ -94,8 +91,9 @@ def _run(options: argparse.Namespace) -> int:
         **summarize(outcomes),
         'reward_type': options.reward_type,
         'touched_rule': options.success_rule,
-        **_disturbed(simulation),
     }
+    if not simulation.disturbances.is_off:
+        report['disturbances'] = simulation.disturbances.as_dict()
     try:
         try:
             _show(report, options.json)
@@ -107,17 +105,6 @@ def _run(options: argparse.Namespace) -> int:
     except OSError as error:
         raise CommandError(f'{error.filename or "output"}: {error.strerror}') from None
     return code
-
-
-def _disturbed(simulation: Simulation) -> dict[str, Any]:
-    """Return the disturbances for the report; empty without disturbances."""
-    disturbances = simulation.disturbances
-    return {} if disturbances.is_off else {'disturbances': disturbances.as_dict()}
-
-
-def _is_replaced(file: Path) -> bool:
-    """Return whether writing replaces the contents; not so for `/dev/null` or a pipe."""
-    return file.is_file() or not file.exists()
 
 
 def _show(report: dict[str, Any], json_file: Path | None) -> None:

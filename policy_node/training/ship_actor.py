@@ -1,4 +1,4 @@
-"""`ship_actor`: puts the best actor of a run into the package, unless a better one is there."""
+"""`ship_actor`: copy the best actor of a run into the package if it beats the shipped actor."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ ACTORS = Path(__file__).parents[1] / 'actors'
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parses the command line."""
+    """Parse the command line."""
     parser = CommandParser(prog=_NAME, description=__doc__)
     add_batch_options(parser, num_envs=100)
     add = parser.add_argument
     add('run', type=Path, help='output folder of fetch_hand_sim train')
     add('--checkpoint', default='best.safetensors', help='file in the run; default: %(default)s')
-    add('--actors', type=Path, default=ACTORS, help='where to; default: the package')
+    add('--actors', type=Path, default=ACTORS, help='target folder; default: the package')
     return parser.parse_args(arguments)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit status."""
+    """Run the command and return its exit code."""
     options = parse_arguments(arguments)
     return run_command(_NAME, lambda: _run(options))
 

@@ -16,8 +16,7 @@ from node_runtime.command_line import CommandError, UsageError
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import typed_fields
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.runs.resumed_config import resumed_config
-from policy_node.training.runs.run import Caller, Ending, OnCycle, train_run
+from policy_node.training.runs.run import Caller, Ending, OnCycle, resumed_config, train_run
 from policy_node.training.runs.run_folder import (
     BEST_FILE,
     LATEST_FILE,
@@ -30,15 +29,15 @@ from policy_node.training.runs.run_log import read_progress
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run of `train` that has ended.
+    """The result of `train`.
 
     Attributes:
-        folder: Where its files are.
-        config: How it was configured.
-        reason: Why it ended, for people.
-        env_steps: Environment steps, of all its parts.
-        seconds: Time spent, likewise.
-        best_success: Success at the last step of the best evaluation; -1.0 without one.
+        folder: Folder of the run.
+        config: Configuration.
+        reason: Reason of its end, in words.
+        env_steps: Environment steps of all parts of the run.
+        seconds: Wall-clock time of all parts of the run.
+        best_success: Success at the last step in the best evaluation; -1.0 without an evaluation.
     """
 
     folder: Path
@@ -50,15 +49,12 @@ class Run:
 
     @property
     def actor(self) -> Path:
-        """File of the best actor, or of the newest where none was evaluated.
-
-        `policy_node.load_actor` and whatever takes a policy read it.
-        """
+        """File of the best actor, or of the latest one without an evaluation."""
         best = self.folder / BEST_FILE
         return best if best.is_file() else self.folder / LATEST_FILE
 
     def progress(self) -> list[dict[str, float]]:
-        """A row per cycle: `env_steps`, `train_success`, `eval_success` where evaluated, ..."""
+        """Return a row per cycle: `env_steps`, `train_success`, `eval_success` if evaluated, ..."""
         return read_progress(self.folder / PROGRESS_FILE)
 
 
@@ -72,27 +68,27 @@ def train(
     quiet: bool = False,
     **fields: Any,
 ) -> Run:
-    """Trains an actor with DDPG and hindsight experience replay, in this process.
+    """Train an actor with DDPG and hindsight experience replay, in this process.
 
-    Ctrl-C (or "interrupt" of a notebook) ends it after the cycle with all saved, and raises
-    KeyboardInterrupt; `resume=True` goes on from there. A second one raises at once. SIGTERM and
-    SIGHUP end it in the same way and raise SystemExit; a second SIGTERM ends the process. In a
-    thread other than the main one signals do nothing.
+    Ctrl-C (or "interrupt" in a notebook) saves the run after the cycle and raises
+    KeyboardInterrupt; `resume=True` continues it. A second Ctrl-C raises at once. SIGTERM and
+    SIGHUP also save the run, then raise SystemExit; a second SIGTERM ends the process. Outside the
+    main thread, signals have no effect.
 
     Args:
-        task: One of the tasks (`msgs_spec.tasks.TASKS`).
-        output: Folder of the run; None is `runs/<task>_<recipe>_seed<seed>`.
-        recipe: `best` (the default), `paper` or `finetune`.
-        resume: Go on with the run in `output`, whose configuration stays but for `fields`.
-        on_cycle: Called after every cycle with what `progress.csv` says of it, None for what was
-            not measured. The run ends when it returns False, or with what it raises.
-        quiet: Whether progress is not shown.
-        **fields: Of `TrainConfig`, such as `total_steps`, `seed`, `success_target`.
+        task: Task name (`msgs_spec.tasks.TASKS`).
+        output: Folder of the run; default: `runs/<task>_<recipe>_seed<seed>`.
+        recipe: `best` (the default), `paper`, `robust` or `finetune`.
+        resume: Continue the run in `output` with its configuration, changed by `fields`.
+        on_cycle: Called after every cycle with its row of `progress.csv`; values are None if not
+            measured. The run ends after this cycle if it returns False or raises an exception.
+        quiet: Show no progress.
+        **fields: Fields of `TrainConfig`, such as `total_steps`, `seed`, `success_target`.
 
     Raises:
-        ValueError: If something is not allowed, or the folder cannot be used; nothing was trained.
-        RuntimeError: If training failed, or another process trains in the folder.
-        ModuleNotFoundError: If what the extra `train` brings is missing.
+        ValueError: If an argument is invalid or the folder cannot be used. Nothing was trained.
+        RuntimeError: If training fails, or another process trains in the folder.
+        ModuleNotFoundError: If the extra `train` is missing.
         KeyboardInterrupt: After Ctrl-C.
         SystemExit: After SIGTERM or SIGHUP, with code 143 or 129.
     """
@@ -105,16 +101,14 @@ def train(
     fields = typed_fields(fields)
     if resume:
         if output is None:
-            raise ValueError('resume=True needs output, the folder of the run to go on with')
+            raise ValueError('resume=True needs output, the folder of the run')
         folder = Path(os.path.expanduser(output))
         config = resumed_config(folder, task, recipe, fields)
     else:
         config = recipe_config(task, 'best' if recipe is None else recipe, **fields)
         folder = Path(default_folder(config) if output is None else os.path.expanduser(output))
         if (folder / STATE_FILE).is_file():
-            raise ValueError(
-                f'{folder} holds a run: resume=True goes on with it, or choose another'
-            )
+            raise ValueError(f'{folder} contains a run. Use resume=True or choose another folder')
     given: dict[str, Any] = {} if recipe is None else {'recipe': recipe}
     given |= {'resume': True} if resume else {}
     command = _command(task, folder, given | fields)
@@ -131,7 +125,7 @@ def train(
 
 
 def _command(task: str, folder: Path, given: dict[str, Any]) -> str:
-    """The call in one line, for the record."""
+    """Return the call in one line, for the record."""
     named = [f'{name}={value!r}' for name, value in given.items()]
     return f'policy_node.training.train({", ".join([repr(task), repr(str(folder)), *named])})'
 
@@ -139,7 +133,7 @@ def _command(task: str, folder: Path, given: dict[str, Any]) -> str:
 def _ending(
     config: TrainConfig, folder: Path, resume: bool, command: str, caller: Caller
 ) -> Ending:
-    """Runs it; what commands say in one line are errors as Python has them."""
+    """Train; turn the errors of commands into those of Python."""
     try:
         return train_run(config, folder, resume=resume, command=command, caller=caller)
     except UsageError as error:
@@ -149,9 +143,9 @@ def _ending(
 
 
 class _Program:
-    """What a run changes in the program around it, given back when no run is left.
+    """Restore torch's threads and random numbers when the last run of the program ends.
 
-    Several may run at the same time, in threads.
+    Several runs may train at the same time, in threads.
     """
 
     def __init__(self) -> None:

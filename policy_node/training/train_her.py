@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 
 
 _NAME = 'fetch_hand_sim train'
-# Fields that say which recipe there is to start from.
+# Fields that choose the recipe.
 _OWN_OPTIONS = ('task', 'recipe')
-# A process that a signal ended returns 128 + its number, as shells say it.
+# Exit code after a signal: 128 + its number.
 EXIT_SIGNAL = 128
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parses the command line."""
+    """Parse the command line."""
     parser = CommandParser(
         prog=_NAME,
         description=__doc__,
@@ -50,21 +50,21 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add('--task', choices=list(TASKS), metavar='TASK', help=', '.join(TASKS))
     add('--recipe', choices=RECIPES, help='default: best')
     add('--her', action=argparse.BooleanOptionalAction, help='hindsight on or off; default: on')
-    add('--set', action='append', default=[], metavar='NAME=VALUE', help='a field by its name')
+    add('--set', action='append', default=[], metavar='NAME=VALUE', help='set a field')
     add('--output', type=Path, help='default: runs/<task>_<recipe>_seed<seed>')
     add('--resume', type=Path, help='folder of a run to continue; its configuration is kept')
-    add('--from-episodes', type=Path, metavar='DIR', help='logged episodes to learn from as well')
+    add('--from-episodes', type=Path, metavar='DIR', help='also learn from logged episodes')
     add_field_options(parser, _OWN_OPTIONS)
     return parser.parse_args(arguments)
 
 
 def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
-    """Builds the configuration: recipe or resumed run, then options, then `--set`.
+    """Return the configuration: recipe or resumed run, then options, then `--set`.
 
     Raises:
-        ValueError: If something is missing, unknown or not allowed.
+        ValueError: If a value is missing, unknown or not allowed.
     """
-    overrides = with_assignments(given_fields(options, _OWN_OPTIONS), options.set)
+    overrides = with_assignments(given_fields(options), options.set)
     if options.her is False:
         if overrides.get('strategy', 'none') != 'none':
             raise ValueError(f'--no-her excludes --strategy {overrides["strategy"]}')
@@ -76,12 +76,12 @@ def config_from_arguments(options: argparse.Namespace) -> TrainConfig:
 
 
 def _configured(options: argparse.Namespace, overrides: dict[str, Any]) -> TrainConfig:
-    """The recipe, or the run that goes on, with fields replaced."""
-    task, recipe = (_own_option(options, overrides, name) for name in _OWN_OPTIONS)
+    """Return the configuration of the recipe or the resumed run, with fields replaced."""
+    task, recipe = (overrides.pop(name, None) for name in _OWN_OPTIONS)
     if options.resume is not None:
         if options.output is not None:
-            raise ValueError(f'--output excludes --resume: the run goes on in {options.resume}')
-        from policy_node.training.runs.resumed_config import resumed_config
+            raise ValueError(f'--output excludes --resume: the run stays in {options.resume}')
+        from policy_node.training.runs.run import resumed_config
 
         return resumed_config(options.resume, task, recipe, overrides)
     if task is None:
@@ -89,21 +89,8 @@ def _configured(options: argparse.Namespace, overrides: dict[str, Any]) -> Train
     return recipe_config(task, recipe or 'best', **overrides)
 
 
-def _own_option(options: argparse.Namespace, overrides: dict[str, Any], name: str) -> str | None:
-    """What an option or `--set` says of a field, which leaves `overrides`; None if neither does.
-
-    Raises:
-        ValueError: If they contradict each other.
-    """
-    option: str | None = getattr(options, name)
-    assigned: str | None = overrides.pop(name, None)
-    if None not in (option, assigned) and option != assigned:
-        raise ValueError(f'--{name} {option} excludes --set {name}={assigned}')
-    return option or assigned
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit status."""
+    """Run the command and return its exit code."""
     options = parse_arguments(arguments)
     command = given_command(_NAME, arguments)
     return run_command(_NAME, lambda: _run(options, command))
@@ -135,23 +122,25 @@ def _run(options: argparse.Namespace, command: str) -> int:
 
 
 def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | None:
-    """Loads logged episodes and says what was left out; None without a directory.
+    """Load logged episodes and report rejected ones; return None without a directory.
 
     Raises:
-        ValueError: If there are none to learn from, or more than the replay holds.
+        ValueError: If no episode is usable, or the replay is too small.
     """
     if directory is None:
         return None
     if isinstance(config.learner, Ppo):
-        raise ValueError('algorithm ppo excludes --from-episodes: it learns from its own alone')
+        raise ValueError(
+            'algorithm ppo excludes --from-episodes: it learns only from its own episodes'
+        )
     if config.find(Held):
         raise ValueError(
-            'longest_hold above 1 excludes --from-episodes: their actions have no length'
+            'longest_hold above 1 excludes --from-episodes: logged actions have no length'
         )
     if config.find(Hierarchical):
-        raise ValueError('subgoal_every excludes --from-episodes: nobody gave them subgoals')
+        raise ValueError('subgoal_every excludes --from-episodes: logged episodes have no subgoals')
     if config.collect.gamble:
-        raise ValueError('gamble excludes --from-episodes: gambles in them ended nothing')
+        raise ValueError('gamble excludes --from-episodes: in logged episodes gambles end nothing')
     from policy_node.training.experience.logged_episodes import read_experience
 
     task = task_spec(config.task, control_hz=config.collect.control_hz)
@@ -159,7 +148,7 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
     transitions = len(episodes) * episodes.ticks
     if transitions > config.replay.replay_transitions:
         raise ValueError(
-            f'{directory} holds {transitions} transitions, '
+            f'{directory} contains {transitions} transitions, '
             f'the replay {config.replay.replay_transitions}; '
             f'allow more with --set replay_transitions={transitions}'
         )

@@ -1,4 +1,4 @@
-"""What a critic promises, and what its actor then gets, in fresh episodes."""
+"""Compare the values of a critic with the returns of its actor in new episodes."""
 
 from __future__ import annotations
 
@@ -22,40 +22,36 @@ from policy_node.training.machine.distributed import Workers
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.runs.training_state import load_state, read_state
 
-# After the last tick things go on as in the mean of so many before it.
+# Rewards after the episode are taken as the mean of its last ticks.
 _LAST_TICKS = 20
 # Shares of an episode at which values are compared with returns.
 _SHARES = (0.0, 0.25, 0.5)
-# Fields by which a critic says something else than what an action is worth; quantiles have a mean.
+# Fields with which values are not those of actions; quantiles have a mean.
 _OTHER_VALUES = ('algorithm', 'longest_hold', 'advantage', 'subgoal_every', 'condition')
 
 
 @dataclass(frozen=True, slots=True)
-class Promise:
-    """Values and returns of some episodes from one tick on.
+class Comparison:
+    """Values and returns from one tick on.
 
     Attributes:
-        tick: That tick.
-        value: What the critic says of the actor's action, mean over the episodes.
-        gain: Discounted rewards of training that followed, likewise.
-        correlation: Of both, over the episodes; NaN where one does not vary.
+        tick: The tick.
+        value: Value of the actor's action, mean over the episodes.
+        episode_return: Discounted training rewards from this tick on, mean over the episodes.
+        correlation: Correlation of both over the episodes; NaN if one is constant.
     """
 
     tick: int
     value: float
-    gain: float
+    episode_return: float
     correlation: float
 
 
-def measure(run: Path, episodes: int) -> list[Promise]:
-    """Compares values with returns in fresh episodes of the actor that collects.
-
-    Args:
-        run: Folder of a run.
-        episodes: How many.
+def measure(run: Path, episodes: int) -> list[Comparison]:
+    """Compare values with returns in new episodes of the collecting actor of a run.
 
     Raises:
-        ValueError: If there is no such run, or its values are not of states, goals and actions.
+        ValueError: If the folder contains no run, or its values are not those of actions.
     """
     config, progress = _read_config(run / STATE_FILE)
     simulation = make_simulation(config, episodes, 0)
@@ -72,19 +68,18 @@ def measure(run: Path, episodes: int) -> list[Promise]:
     values, rewards = _play(simulation, learner, sampler.at(progress).compute_reward)
     returns = discounted(rewards * sampler.reward_scale, config.tick_gamma)
     ticks = [int(share * len(values)) for share in _SHARES]
-    return [_promise(tick, values[tick], returns[tick]) for tick in ticks]
+    return [_compared(tick, values[tick], returns[tick]) for tick in ticks]
 
 
 def _read_config(file: Path) -> tuple[TrainConfig, float]:
-    """The configuration of a run, and how far its goals have narrowed."""
+    """Return the configuration of a run and its progress, 0 to 1."""
     state = read_state(file)
     config = config_from_dict(state.extra['config'])
     flat = to_flat(config)
     found = {name: flat[name] for name in _OTHER_VALUES}
     odd = [f'{name} {value}' for name, value in found.items() if value != DEFAULTS[name]]
     if odd:
-        raise ValueError(f'{file.parent} has other values than of actions: {", ".join(odd)}')
-    # Nothing is learnt from here.
+        raise ValueError(f'{file.parent} has no values of actions: {", ".join(odd)}')
     config = changed(config, replay_transitions=1, learning_starts=0, device='cpu')
     return config, state.counters.env_steps / config.run.total_steps
 
@@ -92,7 +87,7 @@ def _read_config(file: Path) -> tuple[TrainConfig, float]:
 def _play(
     simulation: Simulation, learner: ActorCritic, compute_reward: RewardFunction
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Values and rewards (ticks, episodes) of one episode of each simulation."""
+    """Return values and rewards (ticks, episodes) of one episode in each simulation."""
     count = simulation.num_envs
     observation = simulation.reset(seed=[FIRST_SEED + index for index in range(count)])
     values, rewards = [], []
@@ -109,7 +104,7 @@ def _play(
 def _judge(
     learner: ActorCritic, observation: NDArray[np.float64], goal: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What the actor does (episodes, action size), and what it is worth (episodes,)."""
+    """Return values (episodes,) and actions (episodes, action size) of the actor."""
     seen, wanted = (learner.tensor(values).float() for values in (observation, goal))
     features = learner.actor.features(seen, wanted)
     action = learner.actor(features)
@@ -120,7 +115,7 @@ def _judge(
 
 
 def discounted(rewards: NDArray[np.float64], gamma: float) -> NDArray[np.float64]:
-    """Returns (ticks, episodes) of rewards that go on for ever as they were in the last ticks."""
+    """Return returns (ticks, episodes); after the end, rewards stay the mean of the last ticks."""
     following = rewards[-_LAST_TICKS:].mean(axis=0) / (1.0 - gamma)
     returns = np.empty_like(rewards)
     for tick in reversed(range(len(rewards))):
@@ -128,7 +123,7 @@ def discounted(rewards: NDArray[np.float64], gamma: float) -> NDArray[np.float64
     return returns
 
 
-def _promise(tick: int, value: NDArray[np.float64], gain: NDArray[np.float64]) -> Promise:
-    varies = value.std() > 0.0 and gain.std() > 0.0
-    correlation = float(np.corrcoef(value, gain)[0, 1]) if varies else float('nan')
-    return Promise(tick, float(value.mean()), float(gain.mean()), correlation)
+def _compared(tick: int, value: NDArray[np.float64], returns: NDArray[np.float64]) -> Comparison:
+    varies = value.std() > 0.0 and returns.std() > 0.0
+    correlation = float(np.corrcoef(value, returns)[0, 1]) if varies else float('nan')
+    return Comparison(tick, float(value.mean()), float(returns.mean()), correlation)

@@ -474,10 +474,9 @@ def _reader(name: str) -> Any:
     return read
 
 
-def given_fields(options: argparse.Namespace, without: tuple[str, ...]) -> dict[str, Any]:
+def given_fields(options: argparse.Namespace) -> dict[str, Any]:
     """Return the fields that the command line has options for and that were given."""
-    names = FIELDS.keys() - set(without)
-    return {n: value for n, value in vars(options).items() if n in names and value is not None}
+    return {n: value for n, value in vars(options).items() if n in FIELDS and value is not None}
 
 
 def with_assignments(

@@ -26,12 +26,9 @@ from policy_node.training.learners.network_shape import network_shape
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.machine.host import split_threads
 from policy_node.training.runs.initial_networks import InitialNetworks
-from policy_node.training.runs.progress_row import progress_row
-from policy_node.training.runs.run_clock import RunClock
-from policy_node.training.runs.run_folder import LATEST_FILE, RunFolder
-from policy_node.training.runs.run_log import RunLog
-from policy_node.training.runs.saving import NAME, Saver
-from policy_node.training.runs.training_state import Counters, part_of
+from policy_node.training.runs.run_folder import LATEST_FILE, NAME, RunFolder
+from policy_node.training.runs.run_log import RunLog, progress_row
+from policy_node.training.runs.training_state import Counters, RunClock, part_of
 
 
 class Answers:
@@ -64,11 +61,11 @@ class ImitationTrainer:
     """One run of imitation.
 
     Args:
-        config: What to train and how.
+        config: The configuration.
         output: Folder of the run.
         workers: One worker.
         command: Command line, for the metadata of actors.
-        source_revision: Revision of the source, likewise.
+        source_revision: Git revision of the source, for the metadata of actors.
         init_from: The policy to imitate.
 
     Raises:
@@ -87,8 +84,8 @@ class ImitationTrainer:
         if workers.world_size > 1:
             raise ValueError(f'{workers.world_size} workers; algorithm imitation needs 1')
         self.config, self.workers, self.counters = config, workers, Counters()
-        folder = RunFolder(output, config, command, source_revision, init_from.origin)
-        self._saver = Saver(folder, workers)
+        origin = init_from.origin
+        self._folder = RunFolder(output, config, workers, command, source_revision, origin)
         threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
         torch.manual_seed(config.seed)
@@ -117,7 +114,7 @@ class ImitationTrainer:
             before = time.monotonic()
             success = self._collect()
             loss = self._learn()
-            clock.write(counters)
+            clock.update()
             reason = self._reason_to_stop()
             outcomes = self._evaluate(is_last=bool(reason))
             row = progress_row(counters, success, outcomes, config.collect.success_rule, [])
@@ -194,13 +191,13 @@ class ImitationTrainer:
             return None
         counters.next_evaluation = counters.env_steps + self.config.run.evaluate_every
         outcomes = self._evaluator.evaluate(self.actor, -1.0)
-        self._saver.keep_best(outcomes, self.actor, counters)
+        self._folder.keep_best(outcomes, self.actor, counters)
         self._save()
         return outcomes
 
     def _save(self) -> None:
         try:
-            self._saver.folder.save_actor(LATEST_FILE, self.actor, self.counters.env_steps)
+            self._folder.save_actor(LATEST_FILE, self.actor, self.counters.env_steps)
         except OSError as error:
             complain(NAME, f'no checkpoint, the one before is kept: {error}')
 

@@ -1,4 +1,4 @@
-"""Networks that a run starts from instead of random ones, and how they fit another run."""
+"""Networks that a run starts from instead of random ones, adapted to its configuration."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from policy_node.training.learners.critics import (
 from policy_node.training.learners.network_shape import network_shape
 from policy_node.training.runs.training_state import part_of
 
-# Updates of the critics alone where one starts from nothing beside an actor that is already good:
-# the gradient of a critic that knows nothing would ruin it.
+# Updates of the critics alone if a random critic starts beside a trained actor: the gradient of an
+# untrained critic would ruin the actor.
 CRITIC_FIRST = 5_000
-# A critic of runs that differ in these says what has no meaning: dense rewards are distances, and
-# values are per tick.
+# If these differ, the values of a critic have another meaning: dense rewards are distances, and
+# discounts are per tick.
 VALUED_BY = ('reward_type', 'control_hz')
 # Parts of a training state that are critics.
 _CRITICS = ('critic', 'target_critic')
@@ -42,7 +42,7 @@ _PREFIXES = tuple(f'{part}.' for part in _CRITICS)
 
 
 def described(shape: NetworkShape, goal_features: str) -> dict[str, object]:
-    """Sizes and inputs of networks by name, for who compares two."""
+    """Return sizes and inputs of networks by name, to compare two networks."""
     return {
         'observation': shape.observation_size,
         'goal': shape.goal_size,
@@ -60,12 +60,12 @@ class InitialNetworks:
     """Weights and normalisers to start from.
 
     Attributes:
-        tensors: Named as in a training state; without optimisers, counters and generators.
-        shape: What they fit.
-        goal_features: Their kind of inputs.
-        norm: What normalises hidden layers of the critic alone.
-        origin: Where they come from, for the record: name, task, environment steps and command.
-        valued_by: Fields of the run that its critic's values are of, see `VALUED_BY`.
+        tensors: Named as in a training state, without optimisers and generators.
+        shape: Shape of the actor.
+        goal_features: Kind of inputs.
+        norm: Normalisation of the hidden layers of the critic.
+        origin: Name, task, environment steps and command of their training, for the record.
+        valued_by: Fields of the run that give the values of its critic a meaning (`VALUED_BY`).
     """
 
     tensors: dict[str, Tensor]
@@ -77,15 +77,11 @@ class InitialNetworks:
 
     @property
     def has_critic(self) -> bool:
-        """Whether there is more than an actor."""
+        """True if they contain a critic."""
         return any(name.startswith('critic.') for name in self.tensors)
 
     def require_fit(self, config: TrainConfig) -> None:
-        """Refuses networks that another run cannot start from.
-
-        Raises:
-            ValueError: One line names the sizes of both.
-        """
+        """Raise ValueError if a run with this configuration cannot start from these networks."""
         ours = described(network_shape(config), config.network.goal_features)
         theirs = described(self._with_past_of(config).shape, self.goal_features)
         if can_widen(self.shape.hidden_sizes, config.network.hidden_sizes):
@@ -100,25 +96,24 @@ class InitialNetworks:
             raise ValueError(f'{config.task} cannot start from {origin}: {"; ".join(differing)}')
 
     def fitted(self, config: TrainConfig) -> InitialNetworks:
-        """These networks for another run, in which other inputs may begin to count.
+        """Return these networks, adapted to another run.
 
-        A critic whose hidden layers are normalised otherwise, or whose values are of other rewards,
-        is left behind; one of another `gamma` is kept, and `critic_first` gives its values time.
-        Hidden layers may become wider, and past actions may become inputs.
-
-        Where the position of an object did not count, the goal's position was always about the
-        object's own: networks have learnt nothing from it, and what they do elsewhere is chance (an
-        actor that dropped 1 block in 200 dropped half of them). So they start blind to it: its
-        weights become zero. They start blind to a condition as well.
+        - A critic is left out if its hidden layers have another normalisation, or its values
+          another meaning. A critic with another `gamma` stays; `critic_first` lets it adapt.
+        - Hidden layers may become wider, and past actions may become inputs.
+        - If the object's position counts only in the new task, the weights of the goal position
+          become zero. In the old task it equalled that of the object, so the networks have learnt
+          nothing from it. An actor that dropped 1 block in 200 would drop half.
+        - A condition input gets zero weights.
 
         Raises:
-            ValueError: If the run cannot start from them; one line names the sizes of both.
+            ValueError: If the run cannot start from them.
         """
         self.require_fit(config)
         before, now = task_spec(self.origin['task']), task_spec(config.task)
         fitted = self._with_past_of(config)
         shape = fitted.shape
-        # The critic's inputs are the actor's, then the action.
+        # The critic has the inputs of the actor, then the action.
         if shape.goal_features is not None and now.position_counts and not before.position_counts:
             inputs = shape.goal_features.goal_position(shape.observation_size, shape.goal_size)
             changed = {name: fitted.tensors[name].clone() for name in first_weights(fitted.tensors)}
@@ -141,7 +136,7 @@ class InitialNetworks:
         return replace(fitted, tensors=tensors, shape=wider)
 
     def _with_past_of(self, config: TrainConfig) -> InitialNetworks:
-        """These networks with the past actions of a run as inputs, if they have none.
+        """Return these networks with the past actions of a run as inputs, if they have none.
 
         The weights of these inputs start at zero; the normaliser starts at mean 0 and deviation 1.
         """
@@ -163,17 +158,17 @@ class InitialNetworks:
         return replace(self, tensors=tensors, shape=shape)
 
     def without_critic(self) -> InitialNetworks:
-        """The actor and its normalisers alone."""
+        """Return only the actor and its normalisers."""
         tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
         return replace(self, tensors=tensors, origin=self.origin | {'critic': False})
 
     @property
     def critics(self) -> int:
-        """How many critics there are."""
+        """Number of critics."""
         return count_critics(part_of(self.tensors, 'critic'))
 
     def with_critics(self, critics: int) -> InitialNetworks:
-        """These networks, critics named as those of so many are; there may be fewer of them."""
+        """Return these networks with tensor names for `critics` critics; some may be missing."""
         if critics == 1 == self.critics and not is_ensemble(part_of(self.tensors, 'critic')):
             return self
         tensors = {n: v for n, v in self.tensors.items() if not n.startswith(_PREFIXES)}
@@ -184,7 +179,7 @@ class InitialNetworks:
         return replace(self, tensors=tensors, origin=self.origin | known)
 
     def completed(self, learner: ActorCritic) -> dict[str, Tensor]:
-        """The tensors, and the learner's own for critics of which there are none."""
+        """Return the tensors, with those of the learner for missing critics."""
         tensors = dict(self.tensors)
         for part, module in learner.modules().items():
             given = part_of(tensors, part)

@@ -1,14 +1,15 @@
-"""One run from its first step to its last: what it needs, its folder, signals, log and curve."""
+"""One run from start to end: its start networks, folder lock, signals, log and curve."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
 import signal
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from node_runtime.command_line import (
 from node_runtime.signals import on_stop_signals
 from node_runtime.source_revision import source_revision
 from policy_node.training.configuration.config import TrainConfig, idle_parts
+from policy_node.training.configuration.flat import config_from_dict, removed_fields, to_flat
 from policy_node.training.configuration.groups import Imitation
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.machine.devices import choose_device
@@ -36,58 +38,83 @@ from policy_node.training.runs.run_folder import (
     COMMAND_FILE,
     CURVE_FILE,
     LOCK_FILE,
+    NAME,
     PROGRESS_FILE,
     STATE_FILE,
     set_former_run_aside,
 )
 from policy_node.training.runs.run_log import Row, RunLog, draw_curve, read_progress
-from policy_node.training.runs.saving import NAME
 from policy_node.training.runs.trainer import Trainer
-from policy_node.training.runs.training_state import Counters
+from policy_node.training.runs.training_state import Counters, read_state
 
-# Told of a cycle with what `progress.csv` has of it; what it returns matters if it is False.
+# Called after each cycle with its row of `progress.csv`; the run ends if it returns False.
 OnCycle = Callable[[Row], object]
 AnyTrainer = Trainer | ImitationTrainer
+# Fields that a resumed run cannot change.
+_NETWORK_FIELDS = (
+    'hidden_sizes layer_norm goal_features algorithm critics quantiles norm advantage condition '
+    'longest_hold subgoal_every init_from'
+).split()
+_EXPERIENCE_FIELDS = 'seed control_hz reward_type discount gamble'.split()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Caller:
-    """A program that trains; a second Ctrl-C raises KeyboardInterrupt there and does not end it.
+    """A Python program that calls `train`. Its second Ctrl-C raises KeyboardInterrupt.
 
     Attributes:
-        on_cycle: Is told of each cycle; the run ends when it returns False.
-        quiet: Whether progress is not shown.
+        on_cycle: Called after each cycle, or None.
+        quiet: Show no progress.
+        error: Exception of `on_cycle`; it ends the run.
     """
 
     on_cycle: OnCycle | None = None
     quiet: bool = False
-
-
-class _OfCallerError(Exception):
-    """What `on_cycle` raised, so that no error of a run is taken for it, nor it for one."""
-
-    def __init__(self, error: Exception) -> None:
-        super().__init__(error)
-        self.error = error
+    error: Exception | None = field(default=None, init=False)
 
 
 class RunTakenError(CommandError):
-    """Another process works on the run."""
+    """Another process trains in the folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """How a run, or this part of it, ended.
+    """The end of a run, or of one part of it.
 
     Attributes:
-        reason: Why, for people.
-        counters: How far it is.
-        signal: Number of the signal that stopped it; 0 if it ended by itself.
+        reason: Reason in words.
+        counters: Progress of the run.
+        signal: Number of the signal that stopped it; 0 without a signal.
     """
 
     reason: str
     counters: Counters
     signal: int = 0
+
+
+def resumed_config(
+    folder: Path, task: str | None, recipe: str | None, changes: Mapping[str, Any]
+) -> TrainConfig:
+    """Return the configuration of a run to resume, with changed fields.
+
+    Raises:
+        ValueError: If the folder contains no run, `task` or `recipe` differ from it, or a field
+            cannot change.
+    """
+    if not (folder / STATE_FILE).is_file():
+        raise ValueError(f'{folder} is not the folder of a run: it has no {STATE_FILE}')
+    stored = read_state(folder / STATE_FILE).extra['config']
+    for name, chosen in (('task', task), ('recipe', recipe)):
+        if chosen not in (None, stored.get(name)):
+            raise ValueError(f'{folder} is a run of {stored.get(name)}, not of {chosen}')
+    for name, value in removed_fields(stored).items():
+        raise ValueError(f'{folder} was trained with {name} {value!r}, removed in version 2.0')
+    before, config = config_from_dict(stored), config_from_dict(stored, **changes)
+    for name in (*_NETWORK_FIELDS, *_EXPERIENCE_FIELDS):
+        old, new = to_flat(before)[name], to_flat(config)[name]
+        if old != new:
+            raise ValueError(f'{folder} has {name} {old!r}, which cannot change to {new!r}')
+    return config
 
 
 def train_run(
@@ -99,31 +126,42 @@ def train_run(
     experience: Episodes | None = None,
     caller: Caller | None = None,
 ) -> Ending:
-    """Trains as configured, in this process, until a limit or a signal ends it.
+    """Train in this process until a limit is reached or a signal arrives.
 
     Args:
-        config: What to train and how.
+        config: The configuration.
         output: Folder of the run.
-        resume: Continue the run in the folder; else it must hold none.
+        resume: Continue the run in the folder; otherwise the folder must contain no run.
         command: Command line, for the record.
-        experience: Episodes to learn from as well.
-        caller: The program that this is called from; None is a command of ours.
+        experience: Logged episodes to learn from as well.
+        caller: The calling Python program; None for a command.
 
     Raises:
-        UsageError: If something that the run needs is missing or does not fit; nothing is written
-            but the folder and its lock.
-        RunTakenError: If another process works on the folder.
-        CommandError: If training failed; the last checkpoint is kept.
+        UsageError: If a requirement is missing or does not fit. Only the folder and its lock are
+            written.
+        RunTakenError: If another process trains in the folder.
+        CommandError: If training fails; the last checkpoint stays.
     """
     require_extra('train')
     networks = _initial_networks(config) if config.network.init_from and not resume else None
     with lock_run(output) if is_first_worker() else contextlib.nullcontext():
         if not resume and (output / STATE_FILE).exists():
-            raise UsageError(f'{output} holds a run; continue it with --resume or choose another')
+            raise UsageError(f'{output} contains a run. Use --resume or choose another folder')
         trainer = _make_trainer(config, output, command, networks, resume, experience)
         if isinstance(trainer, Trainer) and (why := _too_large(trainer)):
             complain(NAME, why)
-        ending = _train_or_explain(trainer, output, command, caller, resume=resume)
+        try:
+            ending = _train(trainer, output, command, caller, resume=resume)
+        except (TrainingError, OSError) as error:
+            kept = f'the last checkpoint is in {output}'
+            none = f'{output} contains no checkpoint'
+            raise CommandError(
+                f'{error}; {kept if (output / STATE_FILE).is_file() else none}'
+            ) from None
+        finally:
+            leave_workers(trainer.workers)
+        if caller is not None and caller.error is not None:
+            raise caller.error
         if trainer.workers.is_first:
             title = f'{config.task}, {config.recipe} recipe, seed {config.seed}'
             try:
@@ -131,6 +169,18 @@ def train_run(
             except OSError as error:
                 complain(NAME, f'no curve, the run itself is saved: {error}')
         return ending
+
+
+def _initial_networks(config: TrainConfig) -> InitialNetworks:
+    try:
+        networks = read_initial_networks(config.network.init_from).fitted(config)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    if not networks.has_critic and not isinstance(config.learner, Imitation):
+        complain(
+            NAME, f'{config.network.init_from} has no critic for this run; a new one learns first'
+        )
+    return networks
 
 
 def _make_trainer(
@@ -141,7 +191,7 @@ def _make_trainer(
     resume: bool,
     experience: Episodes | None,
 ) -> AnyTrainer:
-    """Return the trainer with what it starts from.
+    """Return the trainer with its start state and logged episodes.
 
     Raises:
         UsageError: If something does not fit the configuration or the memory of the machine.
@@ -159,48 +209,16 @@ def _make_trainer(
     except ValueError as error:
         raise UsageError(str(error)) from None
     except (MemoryError, RuntimeError) as error:
-        raise _without_memory(error) from None
+        # torch has no class for this error.
+        if isinstance(error, RuntimeError) and 'allocate' not in str(error):
+            raise
+        fields = 'replay_transitions, num_envs or hidden_sizes'
+        raise UsageError(f'not enough memory; use smaller {fields}: {one_line(error)}') from None
     return trainer
 
 
-def _train_or_explain(
-    trainer: AnyTrainer,
-    output: Path,
-    command: str,
-    caller: Caller | None,
-    *,
-    resume: bool,
-) -> Ending:
-    """Trains; what fails is one line, and what the caller raised stays as it is."""
-    try:
-        return _train(trainer, output, command, caller, resume=resume)
-    except (TrainingError, OSError) as error:
-        raise CommandError(f'{error}; {_kept(output)}') from None
-    except _OfCallerError as error:
-        theirs = error.error
-    finally:
-        leave_workers(trainer.workers)
-    # Here, so that nothing of ours is around it.
-    raise theirs
-
-
-def _kept(output: Path) -> str:
-    """What is left of a run that failed."""
-    if (output / STATE_FILE).is_file():
-        return f'the last checkpoint is kept in {output}'
-    return f'{output} has no checkpoint to go on from'
-
-
-def _without_memory(error: MemoryError | RuntimeError) -> Exception:
-    """What to raise where a run is larger than the machine; torch has no class for that."""
-    if isinstance(error, RuntimeError) and 'allocate' not in str(error):
-        return error
-    fields = 'replay_transitions, num_envs and hidden_sizes decide how much is needed'
-    return UsageError(f'not enough memory; {fields}: {one_line(error)}')
-
-
 def _too_large(trainer: Trainer) -> str:
-    """Warns of a replay that this worker's memory will not hold, which ends a run hours later."""
+    """Return a warning if the replay will exceed the memory of this worker hours later."""
     replay = trainer.experience.replay
     left = max(trainer.config.run.total_steps - trainer.counters.env_steps, 0)
     episodes = len(replay) + trainer.workers.share(left) // replay.ticks
@@ -209,24 +227,18 @@ def _too_large(trainer: Trainer) -> str:
 
 
 def _train(
-    trainer: AnyTrainer,
-    output: Path,
-    command: str,
-    caller: Caller | None,
-    *,
-    resume: bool,
+    trainer: AnyTrainer, output: Path, command: str, caller: Caller | None, *, resume: bool
 ) -> Ending:
-    log = None
+    log, run = None, trainer.config.run
     if trainer.workers.is_first:
         _prepare_folder(trainer, output, command, resume)
-        config, on_row = trainer.config, _row_listener(trainer, caller)
         log = RunLog(
             output,
-            config.run.total_steps,
-            config.run.time_limit,
+            run.total_steps,
+            run.time_limit,
             trainer.counters.env_steps,
             quiet=caller is not None and caller.quiet,
-            on_row=on_row,
+            on_row=_row_listener(trainer, caller),
         )
     try:
         with _stop_on_signals(trainer, is_guest=caller is not None) as received:
@@ -239,10 +251,10 @@ def _train(
 
 def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: bool) -> None:
     """Set files of an earlier run aside, record the command and warn of idle parts."""
-    if not resume and (said := set_former_run_aside(output)):
-        complain(NAME, said)
-    # One line for each part; a run that was killed before its first checkpoint leaves none.
+    if not resume and (note := set_former_run_aside(output)):
+        complain(NAME, note)
     if not resume or trainer.counters.env_steps < trainer.config.run.total_steps:
+        # One line for each part of the run.
         with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
             file.write(command + '\n')
     for line in idle_parts(trainer.config):
@@ -250,76 +262,58 @@ def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: boo
 
 
 def _row_listener(trainer: AnyTrainer, caller: Caller | None) -> Callable[[Row], None] | None:
-    """Return the function that passes each cycle to the caller, or None."""
-    on_cycle = caller.on_cycle if caller else None
-    if on_cycle is None:
+    """Return the function that passes each row to the caller, or None."""
+    if caller is None or (on_cycle := caller.on_cycle) is None:
         return None
 
-    def tell(row: Row) -> None:
+    def listen(row: Row) -> None:
         try:
             result = on_cycle(row)
         except Exception as error:
-            raise _OfCallerError(error) from error
-        if isinstance(result, bool | np.bool_) and not result:
-            trainer.stop('stopped by on_cycle')
+            caller.error = error
+            trainer.stop('stopped by an error in on_cycle')
+        else:
+            if isinstance(result, bool | np.bool_) and not result:
+                trainer.stop('stopped by on_cycle')
 
-    return tell
+    return listen
 
 
 @contextlib.contextmanager
 def lock_run(folder: Path) -> Iterator[None]:
-    """Makes the folder of a run and keeps other processes out of it.
+    """Create the folder of a run and keep other processes out of it.
 
-    The lock ends with the process, however that ends. Some file systems of clusters have none; a
-    line says so.
+    The lock ends with the process. Some file systems of clusters have no locks; then a line warns.
 
     Raises:
-        UsageError: If the folder cannot be made or written to.
-        RunTakenError: If another process works on it.
+        UsageError: If the folder cannot be created or written.
+        RunTakenError: If another process trains in it.
     """
     try:
-        str(folder).encode()
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / LOCK_FILE).open('w')
     except OSError as error:
         raise UsageError(f'{folder} cannot hold a run: {error.strerror}') from None
-    except UnicodeEncodeError:
-        why = 'TensorBoard takes names in UTF-8 alone'
-        raise UsageError(f'{folder} cannot hold a run: {why}') from None
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise RunTakenError(f'{folder} is being trained by another process') from None
         except OSError as error:
-            why = f'no locks where it lies ({error.strerror})'
-            complain(NAME, f'{folder} cannot be kept from other processes: {why}')
+            complain(NAME, f'{folder} has no lock against other processes: {error.strerror}')
         yield
-
-
-def _initial_networks(config: TrainConfig) -> InitialNetworks:
-    """Reads the networks to start from."""
-    try:
-        networks = read_initial_networks(config.network.init_from).fitted(config)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
-    if not networks.has_critic and not isinstance(config.learner, Imitation):
-        complain(
-            NAME, f'{config.network.init_from} has no critic for this run: a new one learns first'
-        )
-    return networks
 
 
 @contextlib.contextmanager
 def _stop_on_signals(trainer: AnyTrainer, is_guest: bool = False) -> Iterator[list[int]]:
-    """Ctrl-C, SIGTERM and SIGHUP end the run after the cycle; a second one ends it at once.
+    """End the run after the cycle on Ctrl-C, SIGTERM or SIGHUP, and at once on a second signal.
 
     Args:
-        trainer: Of the run.
-        is_guest: Whether a second Ctrl-C must leave the process alive.
+        trainer: Trainer of the run.
+        is_guest: A second Ctrl-C raises KeyboardInterrupt instead of ending the process.
 
     Yields:
-        A list that will hold the number of the signal.
+        A list that gets the number of the signal.
     """
 
     def stop(number: int, frame: FrameType | None) -> None:

@@ -1,23 +1,30 @@
-"""The files of a run and what goes into them."""
+"""The files of a run: best and latest actor, training state, replay."""
 
 from __future__ import annotations
 
 import itertools
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from msgs_spec.tasks import task_spec
+from node_runtime.command_line import complain
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import to_flat
+from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
+from policy_node.training.evaluation.evaluator import success_rate
+from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.frame_skip import plain_actor
-from policy_node.training.experience.statistics import RunningStatistics
+from policy_node.training.experience.replay_file import save_replay
 from policy_node.training.learners.actor_critic import ActorCritic
-from policy_node.training.runs.training_state import Counters, save_state
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.runs.training_state import Counters, is_finite, save_state
 
+NAME = 'fetch_hand_sim train'
 STATE_FILE = 'training_state.safetensors'
 LATEST_FILE = 'latest.safetensors'
 BEST_FILE = 'best.safetensors'
@@ -27,82 +34,173 @@ COMMAND_FILE = 'command.txt'
 BOARD_FOLDER = 'tensorboard'
 PROGRESS_FILE = 'progress.csv'
 CURVE_FILE = 'curve.png'
-_OF_FORMER_RUNS = (BEST_FILE, LATEST_FILE, PROGRESS_FILE, CURVE_FILE)
+# Seconds between copies of the newest episodes.
+REPLAY_SECONDS = 900.0
 
 
 def default_folder(config: TrainConfig) -> Path:
-    """Where a run goes that was given no folder."""
+    """Return the default folder of a run."""
     return Path('runs') / f'{config.task}_{config.recipe}_seed{config.seed}'
 
 
 def companion_file(actor: Path) -> Path:
-    """Where the critic of an actor lies, so that training can go on from it."""
+    """Return the file of the critic beside a shipped actor."""
     return actor.with_suffix('.training.safetensors')
 
 
 def set_former_run_aside(folder: Path) -> str:
-    """Makes room for a run that begins in the folder of another, of which no state is left.
+    """Move the files of an earlier run without a training state into a subfolder `former*`.
 
-    It would take the best actor for its own. Actors, log and curve may be all that somebody has
-    kept, so they get other names, `former_*`; the rest goes.
+    Otherwise the new run would append to its log or keep its best actor.
 
     Returns:
-        What to say of it; '' if nothing.
-
-    Raises:
-        OSError: If a file cannot be renamed or removed.
+        A sentence about the moved files; '' without files.
     """
-    kept = [name for name in _OF_FORMER_RUNS if _holds_something(folder / name)]
-    prefixes = itertools.chain(['former'], (f'former{number}' for number in itertools.count(2)))
-    prefix = next(each for each in prefixes if not any(folder.glob(f'{each}_*')))
-    for name in kept:
-        (folder / name).replace(folder / f'{prefix}_{name}')
-    said = f'{", ".join(kept)} of an earlier run in {folder}: now {prefix}_*' if kept else ''
-    files = [folder / REPLAY_FILE]
-    replays = folder.glob(f'*.{REPLAY_FILE}')
-    files += [file for file in replays if file.name.partition('.')[0].isdecimal()]
-    files += folder.glob(f'{BOARD_FOLDER}/events.out.tfevents.*')
-    for file in files:
-        file.unlink(missing_ok=True)
-    return said
+    names = (BEST_FILE, LATEST_FILE, PROGRESS_FILE, CURVE_FILE, BOARD_FOLDER)
+    found = [folder / name for name in names if (folder / name).exists()]
+    found += folder.glob(f'*{REPLAY_FILE}')
+    if not found:
+        return ''
+    former = (folder / f'former{number}' for number in itertools.count(1))
+    target = next(each for each in former if not each.exists())
+    target.mkdir()
+    for path in found:
+        path.replace(target / path.name)
+    return f'files of an earlier run in {folder} are now in {target}'
 
 
-def _holds_something(path: Path) -> bool:
-    """Whether a file is worth keeping: a log that no cycle has ended in is not."""
-    if not path.is_file():
-        return False
-    return path.name != PROGRESS_FILE or path.read_bytes().count(b'\n') > 1
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class RunFolder:
-    """Where a run writes its actors and the state that `--resume` goes on from.
+    """Save the actors and the training state of a run, on one of several workers.
 
     Attributes:
         path: The folder.
         config: Configuration of the run.
+        workers: This worker among all. Only the first one writes actors and the state.
         command: Command line, for the metadata of actors.
-        source_revision: Revision of the source, likewise.
-        init_from: Origin of the networks the run started from; empty if they were random.
+        source_revision: Git revision of the source, for the metadata of actors.
+        init_from: Origin of the first networks; empty if they were random.
     """
 
     path: Path
     config: TrainConfig
+    workers: Workers
     command: str = ''
     source_revision: str = ''
     init_from: dict[str, Any] = field(default_factory=dict)
+    _last_checkpoint: float = field(default_factory=time.monotonic)
+    _last_replay: float = field(default_factory=time.monotonic)
+
+    def replay_file(self) -> Path:
+        """Return the file for the newest episodes of this worker."""
+        rank = self.workers.rank
+        return self.path / (REPLAY_FILE if rank == 0 else f'{rank}.{REPLAY_FILE}')
+
+    def keep_best(
+        self,
+        outcomes: EpisodeOutcomes,
+        actor: Actor,
+        counters: Counters,
+        env_steps: int | None = None,
+    ) -> None:
+        """Save an evaluated actor if its success is higher, or equal with a higher return.
+
+        Args:
+            outcomes: Its evaluation.
+            actor: The actor.
+            counters: Progress of the run, with the best evaluation so far.
+            env_steps: Environment steps of the actor; None means those of the run.
+        """
+        rule = self.config.collect.success_rule
+        success = success_rate(outcomes, rule)
+        mean_return = float(outcomes.episode_return.mean())
+        if (success, mean_return) <= (counters.best_success, counters.best_return):
+            return
+        counters.best_success, counters.best_return = success, mean_return
+        if self.workers.is_first:
+            measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
+            measured |= {'mean_return': mean_return, **diagnose(outcomes)}
+            steps = counters.env_steps if env_steps is None else env_steps
+            self.save_actor(BEST_FILE, actor, steps, measured)
+
+    def check_best(self, counters: Counters) -> tuple[Actor, ActorInfo] | None:
+        """Compare the counters of a resumed run with its best actor, which may be newer.
+
+        If the actor is missing, damaged or of another task, the next evaluated actor replaces it.
+
+        Returns:
+            The best actor if it must be evaluated again, because it was measured by another rule or
+            on fewer episodes; else None.
+        """
+        file = self.path / BEST_FILE
+        try:
+            if not file.is_file():
+                if counters.best_success < 0:
+                    return None
+                raise ValueError(f'{file} is missing')
+            actor, info = checkpoint.load(file, self.config.task)
+        except ValueError as error:
+            self._forget_best(counters, f'{error}; the next evaluated actor replaces it')
+            return None
+        found, rule = info.success, self.config.collect.success_rule
+        episodes = found.get('episodes')
+        is_short = is_finite(episodes) and episodes < self.config.run.evaluation_episodes
+        if is_short or found.get('rule', rule) != rule:
+            self._forget_best(counters, f'{file} had another evaluation; it is evaluated again')
+            return actor, info
+        success, mean_return = found.get('last_step'), found.get('mean_return')
+        is_measured = 'rule' in found and is_finite(episodes)
+        if is_measured and is_finite(success) and is_finite(mean_return) and 0 <= success <= 1:
+            known = counters.best_success, counters.best_return
+            counters.best_success, counters.best_return = max(known, (success, mean_return))
+        return None
+
+    def _forget_best(self, counters: Counters, why: str) -> None:
+        if self.workers.is_first:
+            complain(NAME, why)
+        unknown = Counters()
+        counters.best_success, counters.best_return = unknown.best_success, unknown.best_return
+
+    def save_when_due(
+        self, learner: ActorCritic, experience: Experience, counters: Counters
+    ) -> None:
+        """Save every `checkpoint_seconds`, the replay less often; report a full disk."""
+        now = time.monotonic()
+        if now - self._last_checkpoint < self.config.run.checkpoint_seconds:
+            return
+        try:
+            due = now - self._last_replay >= REPLAY_SECONDS
+            self.save(learner, experience, counters, with_replay=due)
+        except OSError as error:
+            complain(NAME, f'no checkpoint, the one before is kept: {error}')
+
+    def save(
+        self,
+        learner: ActorCritic,
+        experience: Experience,
+        counters: Counters,
+        with_replay: bool = True,
+    ) -> None:
+        """Write the newest episodes and, as the first worker, the latest actor and the state.
+
+        Raises:
+            OSError: If a file cannot be written; the earlier files stay.
+        """
+        self._last_checkpoint = time.monotonic()
+        if with_replay:
+            self._last_replay = self._last_checkpoint
+            kept = self.workers.share(self.config.replay.kept_transitions)
+            save_replay(self.replay_file(), experience.replay, kept)
+        if self.workers.is_first:
+            self.save_actor(LATEST_FILE, learner.evaluation_actor(), counters.env_steps)
+            extra = {'config': to_flat(self.config), 'command': self.command}
+            extra |= {'init_from': self.init_from}
+            save_state(self.path / STATE_FILE, learner, experience.statistics, counters, extra)
 
     def save_actor(
         self, name: str, actor: Actor, env_steps: int, success: dict[str, Any] | None = None
     ) -> None:
-        """Writes an actor with everything that is needed to run it and to know it by.
-
-        Args:
-            name: `LATEST_FILE` or `BEST_FILE`.
-            actor: The actor.
-            env_steps: Environment steps behind it.
-            success: Measured success, if any.
-        """
+        """Write an actor with its metadata to the file `name`, with its measured success if any."""
         config, spec = self.config, task_spec(self.config.task)
         info = ActorInfo(
             task=config.task,
@@ -123,15 +221,3 @@ class RunFolder:
             past_actions=config.network.past_actions,
         )
         checkpoint.save(self.path / name, plain_actor(actor, config), info)
-
-    def replay_file(self, rank: int) -> Path:
-        """Where a worker keeps its newest episodes."""
-        return self.path / (REPLAY_FILE if rank == 0 else f'{rank}.{REPLAY_FILE}')
-
-    def save_state(
-        self, learner: ActorCritic, statistics: dict[str, RunningStatistics], counters: Counters
-    ) -> None:
-        """Writes everything that a resumed run needs but the replay."""
-        config = to_flat(self.config)
-        extra = {'config': config, 'command': self.command, 'init_from': self.init_from}
-        save_state(self.path / STATE_FILE, learner, statistics, counters, extra)

@@ -1,4 +1,4 @@
-"""Progress of a run: a live line, CSV, TensorBoard where installed, and the curve as PNG."""
+"""The log of a run: a live line, CSV, TensorBoard if installed, and the curve as PNG."""
 
 from __future__ import annotations
 
@@ -8,16 +8,21 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
+import torch
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from node_runtime.command_line import complain
 from node_runtime.signals import discard_unread_output
+from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
+from policy_node.training.evaluation.evaluator import success_rate
+from policy_node.training.learners.actor_critic import Losses
 from policy_node.training.runs.run_folder import BOARD_FOLDER, PROGRESS_FILE
+from policy_node.training.runs.training_state import Counters
 
 COLUMNS = (
     'seconds',
@@ -25,7 +30,6 @@ COLUMNS = (
     'episodes',
     'updates',
     'train_success',
-    'narrowing_steps',
     'eval_success',
     'eval_episodes',
     'eval_touched',
@@ -42,23 +46,25 @@ COLUMNS = (
     'samples_per_second',
     'processor_seconds',
 )
-# A cycle by those names; None is what it did not measure.
+# Values of a cycle by column; None if not measured.
 Row = dict[str, float | None]
-# Seconds between lines where the output is no terminal.
+# Columns by field of `Losses`.
+_LOSS_COLUMNS = {'critic': 'critic_loss', 'actor': 'actor_loss', 'value': 'mean_value'}
+# Seconds between lines if the output is not a terminal.
 _PLAIN_INTERVAL = 15.0
 
 
 class RunLog:
-    """Writes one row per cycle; a resumed run appends to the same file.
+    """Write one row per cycle; a resumed run appends to the same file.
 
     Args:
         output: Folder of the run.
         total_steps: Environment steps of the whole run, for the ETA.
-        time_limit: Its limit, seconds; 0 is none.
-        resumed_steps: Environment steps of the checkpoint the run goes on from. What was logged
-            after it, and is about to be run again, is removed.
-        quiet: Whether nothing is shown.
-        on_row: Called with each row when it is written.
+        time_limit: Time limit of the run, seconds; 0 means none.
+        resumed_steps: Environment steps of the checkpoint that the run resumes from. Later rows are
+            removed, because the run repeats these steps.
+        quiet: Show no progress.
+        on_row: Called with each written row.
     """
 
     def __init__(
@@ -74,15 +80,9 @@ class RunLog:
         self._total_steps = total_steps
         self._time_limit = time_limit
         kept = _rows_until(self.path, resumed_steps)
-        logged = float(kept[-1]['env_steps']) if kept else 0.0
-        if logged < resumed_steps and not quiet:
-            complain(
-                'fetch_hand_sim train',
-                f'{self.path} has no rows from {logged:,.0f} to {resumed_steps:,} steps',
-            )
         partial = self.path.with_name(f'.{self.path.name}.partial')
         self._file: IO[str] = partial.open('w', newline='')
-        # Logs from before a column was added leave it empty.
+        # Older logs lack some columns.
         self._writer = csv.DictWriter(
             self._file, COLUMNS, restval='', extrasaction='ignore', lineterminator='\n'
         )
@@ -103,10 +103,8 @@ class RunLog:
         """Record one cycle; None leaves a column empty.
 
         Raises:
-            OSError: If the log was removed, or there is no room for it.
+            OSError: If the row cannot be written.
         """
-        if not self.path.is_file():
-            raise OSError(f'{self.path} was removed while the run trained')
         self._writer.writerow({name: _short(row.get(name)) for name in COLUMNS})
         self._file.flush()
         if self._board is not None:
@@ -120,12 +118,12 @@ class RunLog:
             self._on_row(row)
 
     def close(self) -> None:
-        """Ends the live line and closes the files."""
+        """End the live line and close the files."""
         discard_unread_output()
         if self._live.is_started:
             self._live.stop()
         self._file.close()
-        if self._board is not None and self.path.is_file():
+        if self._board is not None:
             self._board.close()
 
     def _show(self, row: Row) -> None:
@@ -138,7 +136,7 @@ class RunLog:
             f'train {row["train_success"] or 0:.2f}  eval {self._last_eval or "-"}  '
             f'{_clock(seconds)}  ETA {self._remaining(row)}'
         )
-        # A run does not end because nobody watches it any more.
+        # A closed terminal must not end the run.
         discard_unread_output()
         if self._console.is_terminal:
             self._live.update(Text(line))
@@ -156,6 +154,34 @@ class RunLog:
         return _clock(max(remaining, 0.0))
 
 
+def progress_row(
+    counters: Counters,
+    train_success: float,
+    outcomes: EpisodeOutcomes | None,
+    success_rule: str,
+    losses: Sequence[Losses],
+) -> Row:
+    """Return the values of a cycle by column; `outcomes` are those of its evaluation, if any."""
+    row: Row = {
+        'seconds': counters.seconds,
+        'env_steps': counters.env_steps,
+        'episodes': counters.episodes,
+        'updates': counters.updates,
+        'train_success': train_success,
+        'processor_seconds': counters.processor_seconds,
+    }
+    for name, column in _LOSS_COLUMNS.items():
+        values = [getattr(loss, name) for loss in losses]
+        row[column] = float(torch.stack(values).mean()) if values else None
+    if outcomes is not None:
+        row['eval_success'] = success_rate(outcomes, success_rule)
+        row['eval_episodes'] = len(outcomes)
+        row['eval_touched'] = float(outcomes.touched.mean())
+        found = diagnose(outcomes)
+        row |= {f'eval_{name}': found[name] for name in found if name != 'long_way_share'}
+    return row
+
+
 def _short(value: float | None) -> str:
     return '' if value is None else f'{value:.6g}' if isinstance(value, float) else str(value)
 
@@ -167,34 +193,25 @@ def _clock(seconds: float) -> str:
 
 
 def _rows_until(path: Path, env_steps: int) -> list[dict[str, str]]:
-    """Rows of a log up to `env_steps`, as they were written."""
+    """Return the rows of a log up to `env_steps`, as text."""
     if env_steps == 0 or not path.is_file():
         return []
-    return [row for row, numbers in _whole_rows(path) if numbers['env_steps'] <= env_steps]
+    return [row for row, numbers in _valid_rows(path) if numbers['env_steps'] <= env_steps]
 
 
-def _whole_rows(path: str | Path) -> Iterator[tuple[dict[str, str], dict[str, float]]]:
-    """Rows of a log as text and as numbers; what is no row is left out, whatever it is."""
-    with open(path, newline='', encoding='utf-8', errors='replace') as file:
-        try:
-            for row in csv.DictReader(file):
-                numbers = _numbers(row)
-                if numbers is not None:
-                    yield row, numbers
-        except csv.Error:
-            # Binary where a line should end: nothing after it is a row either.
-            return
+def _valid_rows(path: str | Path) -> Iterator[tuple[dict[str, str], dict[str, float]]]:
+    """Yield the rows of a log as text and as numbers, without empty columns.
 
-
-def _numbers(row: dict[str, str]) -> dict[str, float] | None:
-    """The numbers of a row; None if a killed run has cut it short, or a disk has damaged it."""
-    try:
-        # A column that is missing is None, an empty one is left out.
-        numbers = {name: float(text) for name, text in row.items() if text != ''}
-    except (TypeError, ValueError):
-        return None
-    whole = 'env_steps' in numbers and all(map(math.isfinite, numbers.values()))
-    return numbers if whole else None
+    A killed run can cut the last row short. Such rows and damaged ones are left out.
+    """
+    with open(path, newline='', encoding='utf-8', errors='replace') as file, suppress(csv.Error):
+        for row in csv.DictReader(file):
+            try:
+                numbers = {name: float(text) for name, text in row.items() if text != ''}
+            except (TypeError, ValueError):
+                continue
+            if 'env_steps' in numbers and all(map(math.isfinite, numbers.values())):
+                yield row, numbers
 
 
 def _tensorboard(output: Path, resumed_steps: int) -> Any:
@@ -202,19 +219,19 @@ def _tensorboard(output: Path, resumed_steps: int) -> Any:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         return None
-    # `RunLog.write` flushes: in a thread of TensorBoard an error would be a traceback.
+    # `RunLog.write` flushes; an error in a thread of TensorBoard would print a traceback.
     never = threading.TIMEOUT_MAX / 2
     folder = str(output / BOARD_FOLDER)
     return SummaryWriter(folder, purge_step=resumed_steps + 1, flush_secs=never)
 
 
 def read_progress(path: str | Path) -> list[dict[str, float]]:
-    """Reads `progress.csv`; empty columns are left out of a row, and rows that are damaged."""
-    return [numbers for _, numbers in _whole_rows(path)]
+    """Read `progress.csv` without empty columns and damaged rows."""
+    return [numbers for _, numbers in _valid_rows(path)]
 
 
 def draw_curve(rows: Sequence[dict[str, float]], title: str, file: str | Path | IO[bytes]) -> None:
-    """Draws success against environment steps as PNG."""
+    """Draw success against environment steps as PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 4.0), layout='constrained')

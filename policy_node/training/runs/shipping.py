@@ -1,4 +1,4 @@
-"""Puts an actor of a run into the package: evaluation, critic and curve beside it."""
+"""Copy an actor of a run into the package, with its evaluation, critic and curve."""
 
 from __future__ import annotations
 
@@ -27,10 +27,14 @@ from policy_node.training.runs.run_folder import (
     companion_file,
 )
 from policy_node.training.runs.run_log import draw_curve, read_progress
-from policy_node.training.runs.state_checks import is_finite
-from policy_node.training.runs.training_state import TrainingState, read_state, state_bytes
+from policy_node.training.runs.training_state import (
+    TrainingState,
+    is_finite,
+    read_state,
+    state_bytes,
+)
 
-# What decides which of two actors is better, the first first.
+# An actor is better by the first of these; equal values are decided by the next.
 _BETTER = ('success_gymnasium', 'mean_return')
 
 
@@ -43,61 +47,50 @@ def ship(
     threads: int = 0,
     name: str = BEST_FILE,
 ) -> bool:
-    """Evaluates and, if it is better than the shipped actor, copies what belongs to an actor.
-
-    An actor that is the shipped one, evaluated on as many episodes, is left as it is.
+    """Evaluate an actor of a run and copy it with its files if it beats the shipped actor.
 
     Args:
         run: Folder of the run.
-        actors: Where actors go.
-        episodes: Fresh episodes.
+        actors: Folder of the shipped actors.
+        episodes: Number of new episodes.
         num_envs: Simulations in the batch.
-        threads: Simulation threads; 0 is all cores.
+        threads: Simulation threads; 0 means all cores.
         name: File of the actor in the run.
 
     Returns:
-        Whether the actor of the run is the shipped one now.
+        Whether the actor is now shipped.
 
     Raises:
-        ValueError: If there is no such actor, no log beside it, a file of either folder is damaged,
-            the shipped actor acts at another rate, or it was evaluated on more episodes: a few may
-            all succeed by chance.
-        UsageError: If the folder takes no file.
+        ValueError: If the actor or its log is missing or damaged, or the shipped actor has another
+            action frequency or was evaluated on more episodes. A few episodes may all succeed by
+            chance.
+        UsageError: If the folder cannot be written.
     """
     candidate = _read_candidate(run, name)
     target = actors / f'{candidate.name}.safetensors'
     _require_rate(target, candidate.info.control_hz)
-    old = _evaluation_in(_evaluation_file(target))
+    old = _read_evaluation(target.with_suffix('.json'))
     if (old.get('run_sha256'), old.get('episodes')) == (candidate.sha256, episodes):
-        print(f'ship_actor: the actor in {actors} is this one; nothing changed')
+        print(f'ship_actor: {target} is already this actor')
         return True
     if old and old['episodes'] > episodes:
         raise ValueError(
-            f'the actor in {actors} was evaluated on {old["episodes"]} episodes, this one would be '
-            f'on {episodes}: give --episodes {old["episodes"]} or more'
+            f'{target} was evaluated on {old["episodes"]} episodes, more than {episodes}: '
+            f'give --episodes {old["episodes"]} or more'
         )
     require_writable(target)
     summary = _evaluate(candidate, episodes, num_envs, threads)
-    if old and not is_better(summary, old):
-        print(f'ship_actor: the actor in {actors} is at least as good; nothing changed')
+    if old and [summary[key] for key in _BETTER] <= [old[key] for key in _BETTER]:
+        print(f'ship_actor: {target} is at least as good; it stays')
         return False
     _write(candidate, target, summary)
-    print(f'ship_actor: {target} is the actor of {run} now')
+    print(f'ship_actor: {target} is now the actor of {run}')
     return True
 
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """An actor of a run, and what the folder holds beside it.
-
-    Attributes:
-        run: Folder of the run.
-        actor: The actor.
-        info: What its file says about it.
-        sha256: Fingerprint of its file.
-        progress: Log of the run, one row at least.
-        state: State of the run; None where it left none.
-    """
+    """An actor of a run, with log and state of the run; the state may be missing."""
 
     run: Path
     actor: Actor
@@ -108,35 +101,40 @@ class _Candidate:
 
     @property
     def name(self) -> str:
-        """Name of the shipped file: the task, with `_robust` where that recipe trained it."""
+        """Name of the shipped file: the task, with `_robust` for that recipe."""
         is_robust = self.info.config.get('recipe') == ROBUST
         return shipped_name(self.info.task, ROBUST if is_robust else '')
 
     @property
     def disturbances(self) -> str | None:
-        """Disturbances that it was trained with and is evaluated with."""
+        """Disturbances of its training, which its evaluation repeats."""
         return self.info.config.get('disturbances') or None
 
     @property
     def command(self) -> str:
-        """What it was trained with."""
-        return commands_of(self.run) or self.info.command
+        """Every command of the run in order, each once."""
+        path = self.run / COMMAND_FILE
+        if not path.is_file():
+            return self.info.command
+        return ' && '.join(dict.fromkeys(path.read_text().splitlines()))
 
 
 def _read_candidate(run: Path, name: str) -> _Candidate:
-    """Reads all that may be shipped, before anything is evaluated or replaced.
-
-    Raises:
-        ValueError: If there is no such actor, no log beside it, or a file is damaged.
-    """
+    """Read all files before the evaluation; raise ValueError if one is missing or damaged."""
     actor, info = checkpoint.load(run / name)
-    progress, has_state = _progress_of(run), (run / STATE_FILE).is_file()
-    state = read_state(run / STATE_FILE) if has_state else None
-    return _Candidate(run, actor, info, checkpoint.checkpoint_hash(run / name), progress, state)
+    log, state = run / PROGRESS_FILE, run / STATE_FILE
+    try:
+        progress = read_progress(log)
+    except OSError as error:
+        raise ValueError(f'{log} cannot be read: {error.strerror}') from None
+    if not progress:
+        raise ValueError(f'{log} has no row')
+    digest = checkpoint.checkpoint_hash(run / name)
+    found = read_state(state) if state.is_file() else None
+    return _Candidate(run, actor, info, digest, progress, found)
 
 
 def _evaluate(candidate: _Candidate, episodes: int, num_envs: int, threads: int) -> dict[str, Any]:
-    """Evaluates on fresh episodes and shows the table."""
     info = candidate.info
     simulation = Simulation(
         info.task,
@@ -146,21 +144,21 @@ def _evaluate(candidate: _Candidate, episodes: int, num_envs: int, threads: int)
         disturbances=candidate.disturbances,
     )
     summary = summarize(evaluate(simulation, candidate.actor, episodes, FIRST_SEED))
-    # After an hour of episodes nobody may read the table any more; the actor is saved all the same.
+    # A closed terminal must not stop the copy.
     discard_unread_output()
     print_table({'policy': str(candidate.run), 'task': info.task, **summary})
     return summary
 
 
 def _write(candidate: _Candidate, target: Path, summary: dict[str, Any]) -> None:
-    """Writes the actor, and beside it critic, curve and evaluation, once there is room for all."""
+    """Write the actor with critic, curve and evaluation: all or none."""
     info = replace(candidate.info, success=summary, command=candidate.command)
     actor = checkpoint.to_bytes(candidate.actor, info)
     files = {target: actor}
     if candidate.state is not None:
         files[companion_file(target)] = _critic_bytes(candidate.state, sha256(actor))
     curve = target.with_suffix('.png')
-    # A mean of networks, taken as it is, has no curve of its own: that of a part stays.
+    # A mean of networks has no curve of its own; the old one stays.
     if candidate.progress[-1].get('updates') or not curve.is_file():
         files[curve] = _curve_bytes(candidate)
     report = {
@@ -174,31 +172,26 @@ def _write(candidate: _Candidate, target: Path, summary: dict[str, Any]) -> None
         **({'disturbances': candidate.disturbances} if candidate.disturbances else {}),
         **summary,
     }
-    # The last: without it the actor is shipped again.
-    files[_evaluation_file(target)] = to_json(report)
+    # The last file: without it the actor is shipped again.
+    files[target.with_suffix('.json')] = to_json(report)
     # Links stay links.
     write_files({path.resolve(): data for path, data in files.items()})
     if candidate.state is None:
-        # That of the actor before would be refused beside this one.
+        # Remove the critic of the former actor.
         companion_file(target).unlink(missing_ok=True)
 
 
-def _evaluation_file(target: Path) -> Path:
-    return target.with_suffix('.json')
-
-
 def _curve_bytes(candidate: _Candidate) -> bytes:
-    info = candidate.info
+    info, picture = candidate.info, BytesIO()
     recipe = info.config.get('recipe', 'an unknown')
-    picture = BytesIO()
     draw_curve(candidate.progress, f'{info.task}, {recipe} recipe, seed {info.seed}', picture)
     return picture.getvalue()
 
 
 def _critic_bytes(state: TrainingState, actor_sha256: str) -> bytes:
-    """The critic of a run as it lies beside its shipped actor, so that training can go on there.
+    """Return the file of the critic, from which another training can start.
 
-    The actor holds its normalisers itself; optimisers start fresh.
+    The actor file contains the normalisers; optimisers start fresh.
     """
     tensors = {name: value for name, value in state.tensors.items() if name.startswith('critic.')}
     extra = {'config': state.extra['config'], 'actor_sha256': actor_sha256}
@@ -206,26 +199,22 @@ def _critic_bytes(state: TrainingState, actor_sha256: str) -> bytes:
 
 
 def _require_rate(target: Path, control_hz: float) -> None:
-    """Refuses to replace an actor by one for other robots, whatever its success there.
-
-    Raises:
-        ValueError: If the one that is there acts at another rate, or is damaged.
-    """
+    """Raise ValueError if the shipped actor has another action frequency."""
     if not target.is_file():
         return
-    there = checkpoint.read_info(target).control_hz
-    if there != control_hz:
+    shipped = checkpoint.read_info(target).control_hz
+    if shipped != control_hz:
         raise ValueError(
-            f'{target} acts at {there:g} Hz, this one at {control_hz:g} Hz: name another folder '
-            'with --actors'
+            f'{target} acts at {shipped:g} Hz, this actor at {control_hz:g} Hz: give another '
+            'folder with --actors'
         )
 
 
-def _evaluation_in(file: Path) -> dict[str, Any]:
-    """What lies beside a shipped actor; empty where none is shipped.
+def _read_evaluation(file: Path) -> dict[str, Any]:
+    """Return the evaluation of a shipped actor; empty without an actor.
 
     Raises:
-        ValueError: If it is no evaluation.
+        ValueError: If the file contains no evaluation.
     """
     if not file.is_file():
         return {}
@@ -233,31 +222,7 @@ def _evaluation_in(file: Path) -> dict[str, Any]:
         found = json.loads(file.read_text())
         for key in (*_BETTER, 'episodes'):
             if not is_finite(found[key]):
-                raise ValueError(f'{key} {found[key]!r} is no number')
+                raise ValueError(f'{key} {found[key]!r} is not a number')
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f'{file} is no evaluation of an actor: {error!r}') from None
     return dict(found)
-
-
-def _progress_of(run: Path) -> list[dict[str, float]]:
-    """The log of a run, asked for before anything is evaluated or replaced."""
-    file = run / PROGRESS_FILE
-    try:
-        progress = read_progress(file)
-    except OSError as error:
-        raise ValueError(f'{file} cannot be read: {error.strerror}') from None
-    if not progress:
-        raise ValueError(f'{file} has no row')
-    return progress
-
-
-def commands_of(run: Path) -> str:
-    """Every command of a run in order, the first and those that resumed it; '' if unknown."""
-    path = run / COMMAND_FILE
-    # The same command again goes on where it stopped: once is enough to say it.
-    return ' && '.join(dict.fromkeys(path.read_text().splitlines())) if path.is_file() else ''
-
-
-def is_better(new: dict[str, Any], old: dict[str, Any]) -> bool:
-    """Whether an evaluation is better: by last-step success, then by return."""
-    return [new[key] for key in _BETTER] > [old[key] for key in _BETTER]

@@ -35,13 +35,11 @@ from policy_node.training.runs.finite_checks import (
     require_finite_networks,
 )
 from policy_node.training.runs.initial_networks import CRITIC_FIRST, InitialNetworks
-from policy_node.training.runs.progress_row import progress_row
-from policy_node.training.runs.run_clock import RunClock
-from policy_node.training.runs.run_folder import RunFolder
-from policy_node.training.runs.run_log import RunLog
-from policy_node.training.runs.saving import NAME, Saver
+from policy_node.training.runs.run_folder import NAME, RunFolder
+from policy_node.training.runs.run_log import RunLog, progress_row
 from policy_node.training.runs.training_state import (
     Counters,
+    RunClock,
     fitting,
     load_networks,
     load_state,
@@ -50,13 +48,13 @@ from policy_node.training.runs.training_state import (
 
 Submit = Callable[..., 'Future[Collected]']
 
-# Steps that a resumed run without these episodes collects before it goes on.
+# Largest number of steps that a resumed run without its replay collects before it learns.
 MOST_REFILLED = 100_000
 
 
 @dataclass(frozen=True, slots=True)
 class Collected:
-    """What one cycle of collection, and the evaluation when one was due, gave."""
+    """The episodes of one cycle, and its evaluation if one was due."""
 
     episodes: Episodes
     train_success: float
@@ -69,11 +67,11 @@ class Trainer:
     """One run of one configuration, on one of several workers.
 
     Args:
-        config: What to train and how.
+        config: The configuration.
         output: Folder for checkpoints and logs.
         workers: This worker among all.
         command: Command line, for the metadata of checkpoints.
-        source_revision: Revision of the source, likewise.
+        source_revision: Git revision of the source, for the metadata of checkpoints.
         init_from: Networks to start from; None starts from random ones.
     """
 
@@ -89,8 +87,7 @@ class Trainer:
         self.config = config
         self.workers = workers
         origin = {} if init_from is None else init_from.origin
-        folder = RunFolder(output, config, command, source_revision, origin)
-        self._saver = Saver(folder, workers)
+        self._folder = RunFolder(output, config, workers, command, source_revision, origin)
         self.device = choose_device(config.machine.device)
         self._simulation_threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
@@ -106,6 +103,7 @@ class Trainer:
         self._part_noise()
         self._stop_reason = ''
         self._steps_to_refill = 0
+        self._clock = RunClock(self.counters)
 
     def _build_simulations(self) -> None:
         config, share = self.config, self.workers.share
@@ -116,11 +114,11 @@ class Trainer:
         self.spec = self.simulation.spec
 
     def _seed(self, env_steps: int) -> np.random.Generator:
-        """Seeds resets and exploration from `env_steps` on; returns the generator of batches."""
+        """Seed resets and exploration for a run at `env_steps`; return the generator of batches."""
         config = self.config
         seeds = np.random.SeedSequence([config.seed, self.workers.rank, env_steps])
         collector_seeds, sampler_seed = seeds.spawn(2)
-        # Below the seeds of evaluation, whose episodes must stay unseen.
+        # Evaluation uses larger seeds, so its episodes are never trained on.
         resets = collector_seeds.generate_state(self.simulation.num_envs) >> 2
         starts = [int(seed) % EVALUATION_SEED for seed in resets]
         self.collector = Collector(self.simulation, starts, config)
@@ -136,68 +134,67 @@ class Trainer:
         require_readable(self.learner)
 
     def _part_noise(self) -> None:
-        """Lets workers that began with the same networks draw noise of their own."""
+        """Give workers with equal networks different noise."""
         rank = self.workers.rank
         if rank > 0:
             seeds = np.random.SeedSequence([self.config.seed, rank, self.counters.env_steps])
             torch.manual_seed(int(seeds.generate_state(1)[0]))
 
     def stop(self, reason: str) -> None:
-        """Asks the run to end after the current cycle, with a checkpoint."""
+        """End the run after the current cycle, with a checkpoint."""
         self._stop_reason = reason
 
     def resume(self, path: Path) -> None:
-        """Continues from a training state and the episodes beside it.
+        """Continue from a training state and the episodes beside it.
 
-        Where these are missing, as many are collected before learning goes on; they do not count as
-        steps of the run.
+        If the episodes are missing, the run first collects as many. They do not count as steps.
 
         Raises:
             ValueError: If the file does not fit the configuration.
         """
         state = load_state(path, self.learner, self.experience.statistics)
         self.counters = counters = state.counters
-        # Sooner where evaluations come more often from now on; else it is due before that anyway.
+        # The new configuration may evaluate more often.
         soonest = counters.env_steps + self.config.run.evaluate_every
         counters.next_evaluation = min(counters.next_evaluation, soonest)
         self._part_noise()
         self._narrow()
         origin = state.extra.get('init_from', {})
-        self._saver.folder = replace(self._saver.folder, init_from=origin)
+        self._folder.init_from = origin
         self._let_critic_learn_first()
-        measured_otherwise = self._saver.keep_no_worse(self.counters)
-        if measured_otherwise is not None and self.workers.is_first:
-            actor, info = measured_otherwise
+        unmeasured = self._folder.check_best(self.counters)
+        if unmeasured is not None and self.workers.is_first:
+            actor, info = unmeasured
             outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
-            self._saver.keep_best(outcomes, actor, self.counters, info.env_steps)
-        # Simulations are not part of the state: fresh seeds, so that no episode comes twice.
+            self._folder.keep_best(outcomes, actor, self.counters, info.env_steps)
+        # The state contains no simulations. Use new seeds, so that no episode is repeated.
         self.experience.generator = self._seed(self.counters.env_steps)
         limits = (self.counters.env_steps, self.config.replay.replay_transitions, MOST_REFILLED)
         held = self.experience.replay.capacity * self.spec.episode_ticks
         self._steps_to_refill = min(self.workers.share(min(limits)), held)
-        file = self._saver.folder.replay_file(self.workers.rank)
+        file = self._folder.replay_file()
         try:
             load_replay(file, self.experience.replay)
         except ValueError as error:
             if file.exists():
                 complain(NAME, error)
             complain(
-                NAME, f'{self._steps_to_refill:,} steps fill the replay before learning goes on'
+                NAME, f'{self._steps_to_refill:,} steps fill the replay before learning continues'
             )
 
     def _let_critic_learn_first(self) -> None:
-        """Holds an actor back that began without all its critics."""
-        origin = self._saver.folder.init_from
+        """Train only the critics at first, if some of them started from random weights."""
+        origin = self._folder.init_from
         critics = (self.config.find(Critics) or Critics()).critics
         known = origin.get('critics', critics if origin.get('critic', True) else 0)
         if known < critics and self.config.learner.critic_first == 0:
             self.learner.critic_first = CRITIC_FIRST
 
     def add_experience(self, episodes: Episodes) -> None:
-        """Puts episodes from elsewhere into the replay; each worker takes its share.
+        """Put logged episodes into the replay; each worker takes its share.
 
         They do not count as environment steps. Normalisers learn from them too, unless the run was
-        resumed and so may have seen them.
+        resumed and may have seen them.
 
         Raises:
             ValueError: If they do not fit into the replay.
@@ -209,17 +206,17 @@ class Trainer:
             self.experience.normalize(share, self.learner.actor)
 
     def train(self, log: RunLog | None = None) -> str:
-        """Runs until a limit is reached or `stop` is called; returns why it ended.
+        """Train until a limit is reached or `stop` is called; return the reason.
 
         Raises:
-            TrainingError: If a loss, a weight or an observation is not finite; the checkpoints
-                written before are left as they are.
+            TrainingError: If a loss, a weight or an observation is not finite. Earlier checkpoints
+                stay.
         """
         ended = self._ended()
         if self.workers.any(ended is not None):
             field, reason = ended or ('configuration', 'another worker had ended')
             return f'{reason} before; give another {field} to go on'
-        clock = RunClock(self.counters)
+        self._clock = RunClock(self.counters)
         with _collecting_thread() as executor:
             submit = executor.submit if self.config.machine.overlap else _run_now
             collected = self._collect_first(submit)
@@ -228,20 +225,18 @@ class Trainer:
                 return self._stop_reason or 'another worker stopped'
             self._warn_of_rewards(collected.episodes)
             while True:
-                collected = self._run_cycle(collected, submit, clock, log)
+                collected = self._run_cycle(collected, submit, log)
                 if reason := self._reason_to_stop():
                     self.save()
                     return reason
-                self._saver.save_when_due(self.learner, self.experience, self.counters)
+                self._folder.save_when_due(self.learner, self.experience, self.counters)
 
-    def _run_cycle(
-        self, collected: Collected, submit: Submit, clock: RunClock, log: RunLog | None
-    ) -> Collected:
-        """Store and learn from the episodes of one cycle while those of the next are collected."""
+    def _run_cycle(self, collected: Collected, submit: Submit, log: RunLog | None) -> Collected:
+        """Store and learn from the episodes of one cycle; collect those of the next meanwhile."""
         before = time.monotonic()
         self._store(collected)
         if self.config.machine.overlap:
-            # At the end the actor after this cycle is evaluated, not the one before it.
+            # At the end, evaluate the actor after this cycle, not before it.
             may_evaluate = self._ended() is None
             job = submit(self._collect, *self._prepare_collection(may_evaluate))
             losses = self._learn()
@@ -249,10 +244,10 @@ class Trainer:
             losses = self._learn()
             job = submit(self._collect, *self._prepare_collection())
         collected = self._collect_or_explain(job)
-        clock.write(self.counters)
-        knows = self.counters.updates > 0 or bool(self.config.network.init_from)
-        if collected.evaluation is None and knows and self._ended():
-            # Noise and learning rate have fallen, and nothing else would measure it.
+        self._clock.update()
+        is_trained = self.counters.updates > 0 or bool(self.config.network.init_from)
+        if collected.evaluation is None and is_trained and self._ended():
+            # Evaluate the last actor.
             collected = submit(self._evaluate, collected, self._actor_to_evaluate()).result()
         self._keep_best(collected)
         if log is not None:
@@ -260,7 +255,7 @@ class Trainer:
         return collected
 
     def _warn_of_rewards(self, episodes: Episodes) -> None:
-        """Says that values of a task's own rewards are clipped where these are above 0."""
+        """Warn if rewards of a third-party task exceed 0: values are clipped to 0."""
         metric = self.simulation.metric
         if isinstance(self.config.learner, Ppo) or not metric.has_own_reward:
             return
@@ -269,14 +264,15 @@ class Trainer:
         if highest > 0.0 and self.workers.is_first:
             complain(
                 NAME,
-                f'rewards of {self.spec.name} are up to {highest:g}; values are clipped to those '
-                'of rewards within -1 ... 0, so that nothing is learnt of more',
+                f'rewards of {self.spec.name} are up to {highest:g}, but values are clipped to '
+                'those of rewards within -1 ... 0. Nothing is learnt from larger rewards.',
             )
 
     def _collect_first(self, submit: Submit) -> Collected | None:
-        """Fills the replay of a resumed run that has lost it, then collects the first cycle.
+        """Fill the replay of a resumed run if it is missing, then collect the first cycle.
 
-        None where the run is stopped before: it has nothing to learn from yet.
+        Returns:
+            The first cycle; None if the run is stopped before.
         """
         while True:
             actor, random, _ = self._prepare_collection(may_evaluate=False)
@@ -289,7 +285,7 @@ class Trainer:
                 return None
 
     def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Actor, bool, Actor | None]:
-        """Readies the collector; with which actor, whether at random, and which to evaluate."""
+        """Prepare collection; return actor, whether actions are random, and actor to evaluate."""
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
         self.collector.proposer = self.learner.proposer()
@@ -300,7 +296,7 @@ class Trainer:
         return actor, steps < self.config.learner.exploration.random_steps, evaluated
 
     def _actor_to_evaluate(self) -> Actor | None:
-        """The actor as it is evaluated now; None where another worker does it."""
+        """Return the actor to evaluate; None on all workers but the first."""
         if not self.workers.is_first:
             return None
         self._evaluator.proposer = self.learner.proposer(averaged=True)
@@ -317,7 +313,7 @@ class Trainer:
         return replace(collected, evaluation=outcomes, evaluated=actor, guided=guided)
 
     def _exploration(self) -> float:
-        """Share of noise and random actions for a run as far as this one."""
+        """Return the present share of exploration noise and random actions."""
         left = 3.0 * (1.0 - self.counters.env_steps / self.config.run.total_steps)
         final = self.config.learner.exploration.final_exploration
         return final + (1.0 - final) * min(max(left, 0.0), 1.0)
@@ -328,7 +324,7 @@ class Trainer:
         return collected
 
     def _store(self, collected: Collected) -> None:
-        """Puts new episodes into the replay and into the normalisers."""
+        """Put new episodes into the replay and the normalisers."""
         episodes = collected.episodes
         if len(episodes):
             self.experience.replay.add(episodes)
@@ -339,7 +335,7 @@ class Trainer:
         self._narrow()
 
     def _narrow(self) -> None:
-        """Lets goals that are rewarded become as narrow as they are now."""
+        """Set the width of rewarded goals for the progress of the run."""
         self.experience.narrow(self.counters.env_steps / self.config.run.total_steps)
 
     def _learn(self) -> list[Losses]:
@@ -360,7 +356,7 @@ class Trainer:
         ]
         self.learner.average()
         self.counters.updates = self.learner.updates
-        # Before anything acts by them or is saved.
+        # Check before acting or saving.
         require_finite_losses(losses, self.counters)
         require_finite_networks(self.learner.modules(), self.counters)
         return losses
@@ -368,10 +364,10 @@ class Trainer:
     def _keep_best(self, collected: Collected) -> None:
         outcomes, actor = collected.evaluation, collected.evaluated
         if outcomes is not None and actor is not None and self._evaluator.is_complete(outcomes):
-            self._saver.keep_best(outcomes, actor, self.counters)
+            self._folder.keep_best(outcomes, actor, self.counters)
 
     def _ended(self) -> tuple[str, str] | None:
-        """The field by which the run is over, and why in words; None if it is not."""
+        """Return the field that ends the run and the reason in words, or None."""
         config, counters = self.config, self.counters
         if 0 < config.run.success_target <= counters.best_success:
             return 'success_target', f'success target {config.run.success_target:g} reached'
@@ -387,23 +383,22 @@ class Trainer:
         return (reason or 'another worker stopped') if self.workers.any(bool(reason)) else ''
 
     def save(self) -> None:
-        """Writes the newest episodes and, as worker 0, the latest actor and the training state.
+        """Write the newest episodes and, as the first worker, the latest actor and the state.
 
         Raises:
-            OSError: If there is no room for them; what was there before is kept.
+            OSError: If a file cannot be written; the earlier files stay.
         """
-        self._saver.save(self.learner, self.experience, self.counters)
+        self._folder.save(self.learner, self.experience, self.counters)
 
     def _row(
         self, collected: Collected, losses: list[Losses], seconds: float
     ) -> dict[str, float | None]:
-        workers, batch = self.workers.world_size, self.experience.batch_size
-        steps = self.simulation.num_envs * self.spec.episode_ticks * workers
+        workers, rule = self.workers.world_size, self.config.collect.success_rule
         success, outcomes = collected.train_success, collected.evaluation
-        rule = self.config.collect.success_rule
         row = progress_row(self.counters, success, outcomes, rule, losses)
+        steps = self.simulation.num_envs * self.spec.episode_ticks * workers
         row['steps_per_second'] = steps / seconds
-        row['samples_per_second'] = len(losses) * batch * workers / seconds
+        row['samples_per_second'] = len(losses) * self.experience.batch_size * workers / seconds
         if collected.guided is not None:
             row['eval_guided'] = success_rate(collected.guided, rule)
         return row
@@ -411,9 +406,9 @@ class Trainer:
 
 @contextmanager
 def _collecting_thread() -> Iterator[ThreadPoolExecutor]:
-    """A thread to collect in; who interrupts the block does not wait for its job."""
-    # The number of tensor threads belongs to a thread: without its own, the collector's small
-    # products would start one per core, which then spin against the simulation and the learner.
+    """Provide a thread for collection; after Ctrl-C, do not wait for its job."""
+    # torch counts threads per thread. With its default, the collector's small products would start
+    # one per core, and these would slow down simulation and learner.
     executor = ThreadPoolExecutor(1, 'collector', torch.set_num_threads, (1,))
     is_interrupted = False
     try:
@@ -426,7 +421,7 @@ def _collecting_thread() -> Iterator[ThreadPoolExecutor]:
 
 
 def _run_now(function: Callable[..., Collected], *arguments: Any) -> Future[Collected]:
-    """Runs a job at once, in this thread, behind the interface of an executor."""
+    """Run a job in this thread, with the interface of an executor."""
     future: Future[Collected] = Future()
     future.set_result(function(*arguments))
     return future

@@ -1,19 +1,20 @@
-"""Networks, optimisers, normalisers and counters of a run in one safetensors file."""
+"""The training state of a run: networks, optimisers, normalisers and counters in one file."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import math
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor
 
 from policy_node.policies.files import (
-    LARGEST_HEADER,
     LARGEST_POLICY,
     LARGEST_TENSOR_FILE,
     read_tensors,
@@ -22,32 +23,28 @@ from policy_node.policies.files import (
 )
 from policy_node.training.experience.statistics import RunningStatistics
 from policy_node.training.learners.actor_critic import HIGH_LEVEL, ActorCritic
-from policy_node.training.runs.state_checks import (
-    require_adam,
-    require_counters,
-    require_finite,
-)
 
 FORMAT = 'fetch_hand_training'
 FORMAT_VERSION = 1
-# Of an entry of the header: a name, a type, a shape and where the numbers lie.
-_BYTES_OF_AN_ENTRY = 160
+# Counts up to here are exact as float64.
+_LARGEST_COUNT = 2**53
+# Tensors of Adam for each parameter.
+_ADAM = {'step', 'exp_avg', 'exp_avg_sq'}
 
 
 @dataclass(slots=True)
 class Counters:
-    """How far a run is.
+    """The progress of a run, over all its parts.
 
     Attributes:
         env_steps: Environment steps of all workers.
         episodes: Episodes of all workers.
         updates: Gradient updates.
-        seconds: Time spent, over all parts of a resumed run.
-        processor_seconds: Processor time of all threads of this process, likewise.
-        best_success: Best evaluated success so far; -1 before the first evaluation.
+        seconds: Wall-clock time.
+        processor_seconds: CPU time of all threads of this process.
+        best_success: Best evaluated success; -1 before the first evaluation.
         best_return: Mean return of that evaluation.
         next_evaluation: Environment steps at which the next evaluation is due.
-        narrowing_steps: Environment steps during which goals narrowed (`narrow_above`).
     """
 
     env_steps: int = 0
@@ -58,16 +55,29 @@ class Counters:
     best_success: float = -1.0
     best_return: float = -1e9
     next_evaluation: int = 0
-    narrowing_steps: int = 0
+
+
+class RunClock:
+    """Write wall-clock and CPU time into the counters of a run, including its earlier parts."""
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+        self._wall_start = time.monotonic() - counters.seconds
+        self._cpu_start = time.process_time() - counters.processor_seconds
+
+    def update(self) -> None:
+        """Set `seconds` and `processor_seconds`."""
+        self._counters.seconds = time.monotonic() - self._wall_start
+        self._counters.processor_seconds = time.process_time() - self._cpu_start
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingState:
-    """What a file holds.
+    """The contents of a file.
 
     Attributes:
-        tensors: By part and name, `critic.network.output.bias`.
-        counters: How far the run was.
+        tensors: By part and name, for example `critic.network.output.bias`.
+        counters: Progress of the run.
         extra: JSON values: configuration, command, origin of the first networks.
     """
 
@@ -83,15 +93,7 @@ def save_state(
     counters: Counters,
     extra: dict[str, Any],
 ) -> None:
-    """Writes everything that a resumed run needs but the replay.
-
-    Args:
-        path: File to write.
-        learner: The learner.
-        statistics: The normalisers by name.
-        counters: How far the run is.
-        extra: JSON values to give back on load.
-    """
+    """Write all that a resumed run needs, except the replay; `extra` contains JSON values."""
     tensors: dict[str, Tensor] = {'torch_generator': torch.get_rng_state()}
     for part, module in learner.modules().items():
         for name, value in module.state_dict().items():
@@ -103,26 +105,33 @@ def save_state(
     for part, running in statistics.items():
         for name, value in running.state().items():
             tensors[f'{part}.{name}'] = value
-    write_state(path, TrainingState(tensors, counters, extra))
+    write_file(path, state_bytes(TrainingState(tensors, counters, extra)))
+
+
+def state_bytes(state: TrainingState) -> bytes:
+    """Return the contents of the file of a state."""
+    metadata = {'format': FORMAT, 'format_version': str(FORMAT_VERSION)}
+    metadata |= {
+        'counters': json.dumps(asdict(state.counters)),
+        'extra': json.dumps(state.extra),
+    }
+    return tensor_bytes(state.tensors, metadata)
 
 
 def require_readable(learner: ActorCritic) -> None:
-    """Refuses networks whose files could not be read back, before hours are spent on them.
+    """Reject networks whose files would be too large to read, before hours of training.
 
     Raises:
-        ValueError: One line names what is too large.
+        ValueError: If a file would be too large.
     """
     actor = sum(value.nbytes for value in learner.actor.state_dict().values())
     modules, optimizers = learner.modules().values(), learner.optimizers().values()
-    values = [value for module in modules for value in module.state_dict().values()]
-    moved = [each for optimizer in optimizers for each in optimizer.param_groups[0]['params']]
-    # Adam keeps two numbers beside each, and a count.
-    state = sum(value.nbytes for value in values) + 2 * sum(each.nbytes for each in moved)
-    header = _BYTES_OF_AN_ENTRY * (len(values) + 3 * len(moved))
+    state = sum(value.nbytes for module in modules for value in module.state_dict().values())
+    # Adam keeps two numbers for each.
+    state += 2 * sum(v.nbytes for each in optimizers for v in each.param_groups[0]['params'])
     for what, needed, allowed in (
         ('an actor', actor, LARGEST_POLICY),
         ('a training state', state, LARGEST_TENSOR_FILE),
-        ('the header of a training state', header, LARGEST_HEADER),
     ):
         if needed > allowed:
             raise ValueError(
@@ -130,56 +139,39 @@ def require_readable(learner: ActorCritic) -> None:
             )
 
 
-def write_state(path: Path, state: TrainingState) -> None:
-    """Writes a state; the file is complete or not there."""
-    write_file(path, state_bytes(state))
-
-
-def state_bytes(state: TrainingState) -> bytes:
-    """Returns what `write_state` writes."""
-    values = {name: getattr(state.counters, name) for name in Counters.__slots__}
-    metadata = {'format': FORMAT, 'format_version': str(FORMAT_VERSION)}
-    metadata |= {'counters': json.dumps(values), 'extra': json.dumps(state.extra)}
-    return tensor_bytes(state.tensors, metadata)
-
-
 def read_counters(path: Path) -> Counters:
-    """Reads how far a run was when its state was written; its tensors stay untouched.
+    """Read only the progress of a run.
 
     Raises:
-        ValueError: If the file is no training state of this version, or damaged.
+        ValueError: If the file is not a training state of this version, or damaged.
     """
     return _described(path, read_tensors(path)[1])[0]
 
 
 def read_state(path: Path) -> TrainingState:
-    """Reads a training state.
+    """Read a training state.
 
     Raises:
-        ValueError: If the file is no training state of this version, or damaged.
+        ValueError: If the file is not a training state of this version, or damaged.
     """
     arrays, metadata = read_tensors(path)
     counters, extra = _described(path, metadata)
     tensors = {name: torch.tensor(values) for name, values in arrays.items()}
-    try:
-        require_finite(tensors)
-    except ValueError as error:
-        raise ValueError(f'{path} is damaged: {error}') from None
+    if name := first_not_finite(tensors):
+        raise ValueError(f'{path} is damaged: {name} has a value that is not finite')
     return TrainingState(tensors, counters, extra)
 
 
 def _described(path: Path, metadata: dict[str, str]) -> tuple[Counters, dict[str, Any]]:
     found = (metadata.get('format'), metadata.get('format_version'))
     if found != (FORMAT, str(FORMAT_VERSION)):
-        raise ValueError(f'{path} is no training state of version {FORMAT_VERSION}: {found}')
+        raise ValueError(f'{path} has format {found}; allowed: {FORMAT} {FORMAT_VERSION}')
     try:
-        known = asdict(Counters())
-        counters = Counters(**require_counters(json.loads(metadata['counters']), known))
+        counters = _counters(json.loads(metadata['counters']))
         extra = dict(json.loads(metadata['extra']))
-        objects = {'config': extra['config'], 'init_from': extra.get('init_from', {})}
-        for name, value in objects.items():
+        for name, value in (('config', extra['config']), ('init_from', extra.get('init_from', {}))):
             if not isinstance(value, dict):
-                raise TypeError(f'{name} is no object')
+                raise TypeError(f'{name} is not an object')
     except KeyError as error:
         raise ValueError(f'{path} lacks {error.args[0]!r} in its metadata') from None
     except (ValueError, TypeError, RecursionError) as error:
@@ -187,13 +179,40 @@ def _described(path: Path, metadata: dict[str, str]) -> tuple[Counters, dict[str
     return counters, extra
 
 
+def _counters(values: Any) -> Counters:
+    known = asdict(Counters())
+    # Version 1.1 also counted these.
+    values = {name: value for name, value in dict(values).items() if name != 'narrowing_steps'}
+    for name, value in values.items():
+        if isinstance(known.get(name), int):
+            is_valid = type(value) is int and 0 <= value <= _LARGEST_COUNT
+        else:
+            is_valid = is_finite(value)
+        if not is_valid:
+            raise ValueError(f'counter {name} is {value!r:.80}')
+    return Counters(**values)
+
+
+def is_finite(value: object) -> TypeGuard[int | float]:
+    """Return whether a value from a file is a finite number; booleans are not."""
+    return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)
+
+
+def first_not_finite(tensors: Mapping[str, Tensor]) -> str:
+    """Return the name of the first tensor with a value that is not finite, or ''."""
+    for name, value in tensors.items():
+        if value.is_floating_point() and not torch.isfinite(value).all():
+            return name
+    return ''
+
+
 def load_state(
     path: Path, learner: ActorCritic, statistics: dict[str, RunningStatistics]
 ) -> TrainingState:
-    """Fills learner and normalisers from a file and returns what it holds.
+    """Load a file into learner and normalisers, and return its contents.
 
     Raises:
-        ValueError: If the file is no training state or its tensors do not fit.
+        ValueError: If the file is not a training state or its tensors do not fit.
     """
     state = read_state(path)
     with fitting(path):
@@ -209,31 +228,26 @@ def load_state(
 
 @contextmanager
 def fitting(source: object) -> Iterator[None]:
-    """What is raised where tensors are loaded becomes one line that says where they are from.
-
-    Args:
-        source: A file, or what networks are called.
+    """Turn errors of loading tensors into one line that names their source.
 
     Raises:
-        ValueError: If they do not fit.
+        ValueError: If the tensors do not fit.
     """
     try:
         yield
     except (RuntimeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f'{source} does not fit this configuration: {_reason(error)}') from None
-
-
-def _reason(error: Exception) -> str:
-    """What was wrong, in one line; torch says on its first one only where."""
-    if isinstance(error, KeyError):
-        return f'{error.args[0]} is missing'
-    return ' '.join(line.strip() for line in str(error).splitlines()[:2])
+        if isinstance(error, KeyError):
+            reason = f'{error.args[0]} is missing'
+        else:
+            # The first line of torch names the module, the second the problem.
+            reason = ' '.join(line.strip() for line in str(error).splitlines()[:2])
+        raise ValueError(f'{source} does not fit this configuration: {reason}') from None
 
 
 def load_networks(
     tensors: dict[str, Tensor], learner: ActorCritic, statistics: dict[str, RunningStatistics]
 ) -> None:
-    """Fills networks and normalisers; without a critic the learner keeps its own.
+    """Load networks and normalisers; without a critic the learner keeps its own.
 
     Raises:
         RuntimeError: If sizes do not fit.
@@ -248,7 +262,7 @@ def load_networks(
 
 
 def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
-    """The tensors of one part, by their names in it."""
+    """Return the tensors of one part, by their names in it."""
     prefix = f'{part}.'
     return {
         name.removeprefix(prefix): value
@@ -258,7 +272,7 @@ def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
 
 
 def _with_copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Targets and average where a file has none: they start at actor and critic."""
+    """Add targets and average if they are missing, as copies of actor and critic."""
     sources = {
         'target_actor': 'actor.network',
         'average_actor': 'actor.network',
@@ -279,6 +293,15 @@ def _load_optimizer(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> 
     for key, value in tensors.items():
         index, name = key.split('.')
         state.setdefault(int(index), {})[name] = value
-    require_adam(optimizer, state)
+    parameters = optimizer.param_groups[0]['params']
+    for number, values in state.items():
+        if not 0 <= number < len(parameters) or values.keys() != _ADAM:
+            raise ValueError(f'parameter {number} has {sorted(values)}')
+        for name, value in values.items():
+            # Adam would write beyond the end of a smaller tensor.
+            needed = () if name == 'step' else tuple(parameters[number].shape)
+            if tuple(value.shape) != needed or not value.is_floating_point():
+                given = f'{tuple(value.shape)} {value.dtype}'
+                raise ValueError(f'{name} of parameter {number} is {given}, not {needed}')
     groups = optimizer.state_dict()['param_groups']
     optimizer.load_state_dict({'state': state, 'param_groups': groups})

@@ -313,7 +313,7 @@ def _make_folder(folder: Path, content: str) -> None:
 def _not_stored(jobs: Sequence[Job], options: argparse.Namespace) -> list[Job]:
     """Return the jobs whose runs neither the report nor the report of another study contains."""
     folder = _report_folder(options)
-    # A user who names a folder wants new runs.
+    # --output and --report ask for new runs.
     if options.output is None and options.report is None:
         take_from_other_studies(jobs, folder)
     runs = read_runs(folder)

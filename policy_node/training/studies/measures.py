@@ -1,4 +1,4 @@
-"""What a study measures of a run, and statistics over the seeds of a variant."""
+"""Measures of a run, and statistics over the seeds of a variant."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Curve:
 def measure_run(job: Job, command: str) -> dict[str, Any]:
     """Measure a trained job on fresh episodes and return its line of `runs.jsonl`.
 
-    `steps_to_0.9` is None where no evaluation reached 0.9: the run is censored at its budget.
+    `steps_to_0.9` is None if no evaluation reached 0.9: the run is censored at its budget.
     `parts` counts how often the run was started; a run with several parts differs from an
     uninterrupted one in its resets.
 
@@ -145,8 +145,8 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return medians and quartiles over the seeds of one variant: one row of `arms.csv`.
 
     Args:
-        runs: Stored runs with `area_in_time`, which is None where the baseline never ran on the
-            same machine. `timed` counts the others; measures of time are theirs alone.
+        runs: Stored runs with `area_in_time`. It is None if the baseline never ran on the same
+            machine. `timed` counts the other runs; only these have measures of time.
     """
     first, name_of_steps = runs[0], f'steps_to_{GOOD_SUCCESS}'
     timed = [run for run in runs if run['area_in_time'] is not None]

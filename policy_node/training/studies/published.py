@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from msgs_spec.tasks import TASKS
-from policy_node.training.runs.origins import steps_behind
+from policy_node.training.runs.read_networks import steps_behind
 
 EXACT = 'exact'
 """Read from a text, log, table or configuration file of the source."""
@@ -150,6 +150,6 @@ def _success(report: dict[str, Any]) -> str:
 
 
 def _in_reference(report: dict[str, Any]) -> str:
-    """What the reference's own environments counted, where they were asked."""
+    """Return the success rate in Gymnasium-Robotics, if it was measured."""
     reference = report.get('reference')
     return f'{reference["success"]:.3f} of {reference["episodes"]:,}' if reference else ''

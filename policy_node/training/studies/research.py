@@ -1,6 +1,6 @@
 """The studies, as data: nine answer the paper's requests for research, one is about the recipe.
 
-Settings are the `best` recipe, or another that they name, but for what stands here.
+Settings are those of the `best` recipe, or of another named one, except for the values here.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import Any
 
 from policy_node.training.studies.study import Arm, Study
 
-# FetchReach in cycles of 16 episodes, so that its first thousands of steps can be told apart.
+# FetchReach in cycles of 16 episodes, to resolve its first thousands of steps.
 _REACH = {
     'num_envs': 16,
     'updates_per_cycle': 40,

@@ -138,19 +138,19 @@ class Job:
 
     @property
     def has_checkpoint(self) -> bool:
-        """Whether there is a training to continue."""
+        """True if a training can continue."""
         return (self.folder / STATE_FILE).is_file()
 
     @property
     def is_trained(self) -> bool:
-        """Whether the budget is spent and saved. The log may be ahead of the saved state."""
+        """True if the saved state has all steps. The log may be ahead of it."""
         if not self.has_checkpoint:
             return False
         return read_counters(self.folder / STATE_FILE).env_steps >= self.config.run.total_steps
 
     @property
     def is_ready(self) -> bool:
-        """Whether the start networks exist."""
+        """True if the start networks exist."""
         return self.after is None or self.has_checkpoint or self.after.is_trained
 
     @property

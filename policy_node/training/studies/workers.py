@@ -48,7 +48,7 @@ class Outcome(Enum):
 
     @property
     def is_stopped(self) -> bool:
-        """Whether a signal stopped the job."""
+        """True if a signal stopped the job."""
         return self.value > 128
 
 

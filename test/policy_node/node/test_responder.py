@@ -1,4 +1,4 @@
-"""What the policy does with a robot's bytes, without ROS: joins, answers, refuses, keeps."""
+"""The responder of `policy_node`, its commands and reports, without ROS."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def resting():
 
 
 class Wire:
-    """Takes commands while it is connected."""
+    """A subscriber that can be disconnected."""
 
     def __init__(self):
         self.sent, self.is_connected = [], True
@@ -70,7 +70,7 @@ def moved(tick, name, stamp):
     return codec.encode(stamp, codec.decode(tick[name])[1])
 
 
-def test_each_tick_gets_one_command_whatever_the_order(case):
+def test_each_tick_gets_one_command_in_any_order(case):
     responder, wire, ticks = case
     for index, tick in enumerate(ticks):
         names = [source.name for source in responder.topics]
@@ -87,7 +87,7 @@ def test_each_tick_gets_one_command_whatever_the_order(case):
     assert stamps == [FIRST_STAMP_NS + 40_000_000 * number for number in range(len(ticks))]
 
 
-def test_a_command_nobody_hears_is_kept_and_sent_once(case):
+def test_a_command_without_a_subscriber_is_sent_once_later(case):
     responder, wire, ticks = case
     wire.is_connected = False
     feed(responder, ticks[0])
@@ -104,7 +104,7 @@ def test_state_that_is_not_finite_is_refused_and_the_next_tick_answered(case):
     bad = dict(ticks[0])
     stamp, vector = TopicCodec(source).decode(bad[source.name])
     bad[source.name] = TopicCodec(source).encode(stamp, [math.nan, *vector[1:]])
-    with pytest.raises(ValueError, match='end_effector_pose: not every value is finite'):
+    with pytest.raises(ValueError, match='end_effector_pose'):
         feed(responder, bad)
     feed(responder, ticks[1])
     assert (responder.unusable, len(wire.sent)) == (1, 1)
@@ -128,7 +128,7 @@ def test_clock_jumps(case):
     assert len(wire.sent) == 4
     feed(responder, at(5 * second - 40_000_000, ticks[0]))  # late, not a new beginning
     assert len(wire.sent) == 4
-    responder.forget()  # the robot says that it starts
+    responder.forget()  # the robot starts
     feed(responder, at(5 * second - 40_000_000, ticks[0]))
     assert len(wire.sent) == 5
 
@@ -170,13 +170,13 @@ def test_join_keeps_a_bounded_number_of_incomplete_stamps():
 
 
 def test_an_earlier_stamp_is_late_only_for_a_while():
-    """A robot that was started again begins a little before the last stamp, too."""
+    """A restarted robot can begin shortly before the last stamp."""
     now = [0.0]
     join = StampJoin(['a'], clock=lambda: now[0])
     assert join.add('a', 2_000_000_000, np.zeros(1)) is not None
     assert join.add('a', 1_960_000_000, np.zeros(1)) is None
     now[0] = 1.5
-    # Repeated for who comes late.
+    # Repeated for new subscribers.
     assert join.add('a', 2_000_000_000, np.zeros(1)) is None
     assert join.add('a', 1_000_000_000, np.zeros(1)) is not None
     assert join.add('a', 1_040_000_000, np.zeros(1)) is not None
@@ -196,21 +196,10 @@ def test_a_policy_of_another_rate_is_refused():
         Commander(load_policy('FetchReach'), 50.0)
 
 
-def test_a_command_that_is_not_finite_is_never_sent(case, episode):
-    class Lost:
-        def predict(self, observation, *, deterministic=True):
-            return np.array([0.0, math.nan, 0.0, 0.0]), None
-
-    _, wire, ticks = case
-    lost = Commander(LoadedPolicy(Lost(), 'FetchReach', 'actor lost.onnx'), 25.0)
-    responder = Responder(lost, episode[0], wire, lambda: 7.0)
-    with pytest.raises(ValueError, match=r'actor lost.onnx .*nan'):
-        feed(responder, ticks[0])
-    assert (wire.sent, responder.failed, responder.unusable) == ([], 1, 0)
-
-
-@pytest.mark.parametrize('answer', [None, [[0.0, 0.0, 0.0, 0.0]], ['left'], {'action': 0}])
-def test_an_answer_that_is_no_action_is_one_line(answer):
+@pytest.mark.parametrize(
+    'answer', [None, [[0.0] * 4], ['left'], {'action': 0}, [0.0, math.nan, 0.0, 0.0]]
+)
+def test_an_invalid_action_is_one_line(answer):
     class Strange:
         def predict(self, observation, *, deterministic=True):
             return answer, None
@@ -256,7 +245,7 @@ def test_a_policy_that_fails_once_answers_the_next_tick(case, episode):
     assert health.report(8.0, 1).level == Level.OK
 
 
-def test_of_ticks_that_wait_the_newest_is_answered(case):
+def test_only_the_newest_waiting_tick_is_answered(case):
     responder, wire, ticks = case
     for tick in ticks:
         for source in responder.topics:
@@ -269,7 +258,7 @@ def test_of_ticks_that_wait_the_newest_is_answered(case):
 
 
 @pytest.mark.parametrize('stamp', [0, 10**18])
-def test_a_stranger_on_a_topic_keeps_nobody_from_being_answered(case, stamp):
+def test_a_second_publisher_of_a_topic_does_not_stop_the_policy(case, stamp):
     """With a stamp of 0, as `ros2 topic pub` gives, or of wall time."""
     responder, wire, ticks = case
     second = 10**9
@@ -282,7 +271,7 @@ def test_a_stranger_on_a_topic_keeps_nobody_from_being_answered(case, stamp):
     assert len(wire.sent) == len(ticks)
 
 
-def test_many_stamps_of_the_future_do_not_silence_a_policy(case):
+def test_many_future_stamps_do_not_stop_the_policy(case):
     responder, wire, ticks = case
     for number in range(12):
         message = moved(ticks[0], 'desired_goal', 10**18 + number)
@@ -292,8 +281,8 @@ def test_many_stamps_of_the_future_do_not_silence_a_policy(case):
     assert len(wire.sent) == len(ticks)
 
 
-def test_what_the_observation_does_not_need_may_be_missing(case):
-    """As efforts of a robot that measures none; what it needs is named."""
+def test_values_that_no_observation_needs_may_be_missing(case):
+    """For example efforts. A missing position is an error."""
     responder, wire, ticks = case
     source = topic(REACH, 'joint_states')
     stamp, vector = TopicCodec(source).decode(ticks[0]['joint_states'])
@@ -316,14 +305,14 @@ def test_a_pose_in_another_frame_is_no_state(case):
         message.header.frame_id = frame
         data = serialize(source.type_name, message)
         if is_refused:
-            with pytest.raises(ValueError, match=r"frame_id 'base_link' given; allowed: 'world'"):
+            with pytest.raises(ValueError, match='base_link'):
                 responder.receive(source.name, data)
         else:
             responder.receive(source.name, data)
     assert responder.unusable == 1
 
 
-def test_a_second_source_of_a_topic_is_named():
+def test_a_second_source_of_a_topic_is_reported():
     health, publishers = Health('/policy_node'), {'/joint_states': 1, '/desired_goal': 2}
     health.report(5.0, 1)
     assert health.report(10.0, 1, publishers=publishers).level == Level.OK
@@ -331,7 +320,7 @@ def test_a_second_source_of_a_topic_is_named():
     assert report.message == 'several sources of state: 2 publishers of /desired_goal'
 
 
-def test_two_robots_that_publish_in_turn_are_named_within_two_seconds(case, episode):
+def test_two_robots_that_publish_in_turn_are_reported_within_two_seconds(case, episode):
     responder, _, ticks = case
     health, now = Health('/policy_node'), 1.0
     health.report(now, 1)
@@ -350,16 +339,13 @@ def test_two_robots_that_publish_in_turn_are_named_within_two_seconds(case, epis
     assert '2 robots publish here' in health.report(3.0, 2, publishers=publishers).message
 
 
-def test_a_machine_that_believes_it_is_later_than_2038_reports_all_the_same(monkeypatch):
+def test_a_clock_after_2038_does_not_stop_reports(monkeypatch):
     monkeypatch.setattr('node_runtime.diagnostics.time.time_ns', lambda: 2**31 * 10**9 + 5)
-    message = deserialize(
-        'diagnostic_msgs/msg/DiagnosticArray',
-        encode_reports(Report('/policy_node', '', {}, 'well')),
-    )
+    message = diagnostics(Report('/policy_node', '', {}, 'well'))
     assert message.header.stamp.sec == 2**31 - 1
 
 
-def test_report_says_what_is_wrong(case, episode):
+def test_the_report_names_the_problem(case, episode):
     responder, _, ticks = case
     health = Health('/policy_node')
     assert health.report(7.0, 0).message == 'waits for a robot'
@@ -381,10 +367,10 @@ def test_report_says_what_is_wrong(case, episode):
     assert 'no robot publishes episode_status' in health.report(15.0, 0).message
 
 
-def test_a_robot_that_was_killed_and_started_again_is_one_and_two_that_stay_are_two():
+def test_a_restarted_robot_counts_once_and_two_robots_count_twice():
     health = Health('/policy_node')
     health.report(5.0, 1)
-    # The graph remembers who was killed for up to 20 s.
+    # The graph lists a killed robot for up to 20 s.
     assert [health.report(5.0 + seconds, 2).level for seconds in range(1, 21)] == [Level.OK] * 20
     assert health.report(26.0, 1).level == Level.OK
     assert health.report(27.0, 2).level == Level.OK
@@ -392,7 +378,7 @@ def test_a_robot_that_was_killed_and_started_again_is_one_and_two_that_stay_are_
     assert '2 robots publish here' in Health('/policy_node').report(5.0, 2).message
 
 
-def test_a_robot_in_slow_motion_is_not_called_silent(episode):
+def test_a_robot_in_slow_motion_is_not_silent(episode):
     status, ticks = episode
     now = [0.0]
     responder, health = Responder(resting(), status, Wire(), lambda: now[0]), Health('/policy_node')
@@ -409,7 +395,7 @@ def diagnostics(*reports):
     return deserialize('diagnostic_msgs/msg/DiagnosticArray', encode_reports(*reports))
 
 
-def test_a_paused_robot_is_not_called_silent(case, episode):
+def test_a_paused_robot_is_not_silent(case, episode):
     responder, _, ticks = case
     health = Health('/arm/policy_node')
     health.start(responder, episode[0], 6.0)
@@ -433,7 +419,7 @@ def test_a_paused_robot_is_not_called_silent(case, episode):
         ({'rate asked (Hz)': '0.00'}, 0.0),
     ],
 )
-def test_slow_inference_is_that_at_the_pace_of_the_robot(case, episode, values, period):
+def test_inference_is_slow_relative_to_the_pace_of_the_robot(case, episode, values, period):
     responder, _, ticks = case
     health = Health('/policy_node')
     health.start(responder, episode[0], 6.0)
@@ -448,7 +434,7 @@ def test_slow_inference_is_that_at_the_pace_of_the_robot(case, episode, values, 
     assert (message == late) == (period == 0.01), message
 
 
-def test_robots_of_other_namespaces_are_named_where_there_is_none():
+def test_robots_of_other_namespaces_are_reported_without_a_robot_here():
     health = Health('/policy_node')
     report = health.report(5.0, 0, elsewhere=['/arm1', '/arm2'])
     assert report.message == (
@@ -458,8 +444,8 @@ def test_robots_of_other_namespaces_are_named_where_there_is_none():
 
 
 @pytest.mark.parametrize('status_first', [True, False])
-def test_a_policy_forgets_at_the_borders_of_episodes(status_first: bool) -> None:
-    """The memory after the first tick of an episode holds that tick alone, in any order."""
+def test_a_policy_is_reset_between_episodes(status_first: bool) -> None:
+    """After the first tick of an episode the memory contains only this tick."""
     runner = EpisodeRunner(Simulation('FetchReach', num_threads=1))
     encoder, commander = TickEncoder(REACH), Commander(load_policy('FetchReach_robust'), 25.0)
     responder = Responder(commander, runner.waiting_status(), Wire())

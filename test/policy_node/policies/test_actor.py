@@ -81,7 +81,7 @@ def test_layer_norm_changes_the_function_and_the_parameters() -> None:
     assert len(normalized.state_dict()) == len(plain.state_dict()) + 4
 
 
-def test_predict_refuses_what_does_not_fit() -> None:
+def test_predict_rejects_missing_parts_and_wrong_shapes() -> None:
     actor, observation = make_actor(), make_observation(2)
     with pytest.raises(ValueError, match="'desired_goal'"):
         actor.predict({k: v for k, v in observation.items() if k != 'desired_goal'})

@@ -12,7 +12,7 @@ from support import ROOT
 # Trained and shipped by version 0.1, as of revision 2ce2393; never to be written again.
 OLD = ROOT / 'test' / 'data' / 'actors_0_1' / 'FetchReach.safetensors'
 SHA256 = '09eb61122b4f452d09e80929eb26176ea204a80b3976a53faea874723777aa56'
-# What it did then, at the observations below: torch, float32, printed to six digits.
+# Its actions then, for the observations below: torch, float32, printed to six digits.
 ACTIONS = [
     [0.904434, -0.98054, -0.985772, 0.840785],
     [0.999993, 0.993948, -0.960085, 0.81581],

@@ -166,7 +166,7 @@ def test_onnx_that_computes_for_ever_is_refused(onnx_file, tmp_path):
     path = crafted_onnx(tmp_path / 'loop.onnx', nodes, metadata, numbers)
     with pytest.raises(ValueError, match=r'loop\.onnx .*400 MiB') as error:
         load_policy(path)
-    assert str(error.value).endswith(('was ended by SIGKILL', 'was ended by SIGXCPU'))
+    assert str(error.value).endswith(('(exit code -9)', '(exit code -24)'))
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_a_missing_library_is_named(library, suffix, line, onnx_file, tmp_path, 
         load_policy(path, 'FetchReach', trust=True)
 
 
-def test_export_says_what_is_missing(tmp_path, monkeypatch, capsys):
+def test_export_names_missing_libraries_and_actors(tmp_path, monkeypatch, capsys):
     with monkeypatch.context() as without:
         without.setitem(sys.modules, 'onnxscript', None)
         assert export_actor(['FetchReach', str(tmp_path / 'x.onnx')]) == 2

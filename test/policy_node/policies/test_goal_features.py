@@ -35,7 +35,7 @@ def _observation(task: str, achieved: np.ndarray) -> torch.Tensor:
 
 
 @pytest.mark.parametrize('task', list(TASKS))
-def test_the_achieved_goal_is_where_the_specification_says(task: str) -> None:
+def test_the_achieved_goal_is_at_its_specified_place(task: str) -> None:
     from fetch_hand_sim.simulation import Simulation
 
     simulation = Simulation(task, num_envs=2)
@@ -47,7 +47,7 @@ def test_the_achieved_goal_is_where_the_specification_says(task: str) -> None:
 
 @pytest.mark.parametrize('kind', ['plain', 'relative', 'symmetric'])
 @pytest.mark.parametrize('task', list(TASKS))
-def test_an_actor_has_as_many_inputs_as_it_says(task: str, kind: str) -> None:
+def test_the_number_of_inputs_matches_the_shape(task: str, kind: str) -> None:
     spec = task_spec(task)
     if kind == 'symmetric' and task not in POSE_TASKS:
         with pytest.raises(ValueError, match='no object pose'):
@@ -76,7 +76,7 @@ def test_rotation_is_goal_times_conjugate_with_its_sign() -> None:
         np.testing.assert_allclose(values[4:7], np.clip(10 * expected[1:], -5, 5), atol=1e-12)
 
 
-def test_position_counts_only_where_the_task_says_so() -> None:
+def test_position_counts_only_in_tasks_that_specify_it() -> None:
     achieved, goal = np.zeros(7), np.array([0.01, -0.02, 0.5, 1.0, 0.0, 0.0, 0.0])
     achieved[3] = 1.0
     for task in POSE_TASKS:

@@ -28,7 +28,7 @@ from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import (
     read_counters,
     read_state,
-    write_state,
+    state_bytes,
 )
 from policy_node.training.studies import published
 from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
@@ -271,7 +271,7 @@ def test_a_job_whose_end_was_not_saved_is_not_finished(tmp_path: Path) -> None:
     finished = read_state(state)
     assert is_finished(job, tmp_path)
     before = dataclasses.replace(finished.counters, env_steps=800, updates=8, episodes=16)
-    write_state(state, dataclasses.replace(finished, counters=before))
+    state.write_bytes(state_bytes(dataclasses.replace(finished, counters=before)))
     assert not is_finished(job, tmp_path)
     assert main(arguments) == 0
     assert is_finished(job, tmp_path) and read_counters(state).env_steps == 1200

@@ -18,10 +18,10 @@ from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
 from policy_node.training.configuration.flat import to_flat
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.runs.origins import steps_behind
+from policy_node.training.runs.read_networks import steps_behind
 from policy_node.training.runs.run import Ending
 from policy_node.training.runs.run_log import read_progress
-from policy_node.training.runs.training_state import Counters, TrainingState, write_state
+from policy_node.training.runs.training_state import Counters, TrainingState, state_bytes
 from policy_node.training.studies import command, workers
 from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.studies.paper import BEST_ORDER, STARTS_FROM, start_from
@@ -99,7 +99,7 @@ class Recorder:
         job.folder.mkdir(parents=True)
         counters = Counters(env_steps=job.config.run.total_steps)
         state = TrainingState({}, counters, {'config': {}})
-        write_state(job.folder / 'training_state.safetensors', state)
+        (job.folder / 'training_state.safetensors').write_bytes(state_bytes(state))
         task, arm, seed = job.key
         run = {'task': task, 'arm': arm, 'seed': seed, 'final_episodes': 0}
         add_run(self.report, {**run, 'config': to_settings(job.config)})

@@ -266,7 +266,7 @@ def test_threads_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 def options_of(*arguments: str) -> dict[str, object]:
     parser = CommandParser(prog='fetch_hand_sim train')
     add_field_options(parser, without=('task', 'recipe'))
-    return given_fields(parser.parse_args(arguments), without=('task', 'recipe'))
+    return given_fields(parser.parse_args(arguments))
 
 
 def test_task_and_recipe_may_be_set_like_any_field() -> None:

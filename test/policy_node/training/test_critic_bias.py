@@ -1,4 +1,4 @@
-"""What a critic promises beside what its actor gets."""
+"""Values of a critic beside the returns of its actor."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TINY = {'num_envs': 2, 'evaluation_episodes': 2, 'simulation_threads': 1, 'torch
 
 
 def saved_run(folder: Path, value: float, **changes: object) -> Path:
-    """A run of FetchReach whose critic says one value of everything."""
+    """A run of FetchReach whose critic is constant."""
     trainer = Trainer(recipe_config('FetchReach', 'best', **TINY, **changes), folder, Workers())
     critic = trainer.learner.critic
     with torch.no_grad():
@@ -40,26 +40,26 @@ def test_returns_go_on_as_the_last_ticks_were() -> None:
     np.testing.assert_allclose(returns[19, 1], -1.0 + 0.9**11 * following)
 
 
-def test_a_critic_that_promises_too_much_is_told(
+def test_a_critic_that_overestimates_is_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An actor that has learnt nothing fails all the time: its actions are worth -1/(1 - gamma)."""
+    """An untrained actor always fails: the return of its actions is -1/(1 - gamma)."""
     run = saved_run(tmp_path, value=-3.0)
-    promises = measure(run, episodes=4)
-    assert [promise.tick for promise in promises] == [0, 12, 25]
-    assert all(promise.value == pytest.approx(-3.0) for promise in promises)
-    gains = [promise.gain for promise in promises]
-    assert gains == pytest.approx([-50.0] * 3, abs=2.0)
-    assert np.isnan(promises[0].correlation)
+    found = measure(run, episodes=4)
+    assert [each.tick for each in found] == [0, 12, 25]
+    assert all(each.value == pytest.approx(-3.0) for each in found)
+    returns = [each.episode_return for each in found]
+    assert returns == pytest.approx([-50.0] * 3, abs=2.0)
+    assert np.isnan(found[0].correlation)
     assert main([str(run), '--episodes', '4']) == 0
-    assert 'value promised' in capsys.readouterr().out
+    assert 'correlation' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize('critics', [1, 2])
-def test_quantiles_promise_their_mean(tmp_path: Path, critics: int) -> None:
+def test_quantiles_have_the_value_of_their_mean(tmp_path: Path, critics: int) -> None:
     many = {'quantiles': 5, 'critics': critics, 'aggregate': 'truncated'}
     run = saved_run(tmp_path, value=-3.0, **many)
-    assert [promise.value for promise in measure(run, episodes=2)] == pytest.approx([-3.0] * 3)
+    assert [each.value for each in measure(run, episodes=2)] == pytest.approx([-3.0] * 3)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_quantiles_promise_their_mean(tmp_path: Path, critics: int) -> None:
         (None, 'is no file'),
     ],
 )
-def test_what_has_no_such_values_is_refused(
+def test_runs_without_values_of_actions_are_rejected(
     tmp_path: Path,
     changes: dict[str, object] | None,
     message: str,

@@ -21,9 +21,7 @@ from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.learners.network_shape import network_shape
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.runs.initial_networks import CRITIC_FIRST
-from policy_node.training.runs.mean_networks import mean_of
-from policy_node.training.runs.origins import steps_behind
-from policy_node.training.runs.read_networks import read_initial_networks
+from policy_node.training.runs.read_networks import mean_of, read_initial_networks, steps_behind
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.trainer import Trainer
@@ -130,12 +128,12 @@ def test_a_mean_is_evaluated_and_shipped_as_it_is(tmp_path: Path, block_run: Pat
 
 
 def test_no_mean_of_networks_that_differ_in_kind(block_run: Path) -> None:
-    with pytest.raises(ValueError, match=r'no mean of .*; goal_features relative and symmetric'):
+    with pytest.raises(ValueError, match='goal_features relative and symmetric'):
         read_initial_networks(f'{block_run},HandManipulateEggFull')
-    with pytest.raises(ValueError, match=r'no mean of .*BlockFull: hidden_sizes \(256, 256, 256\)'):
+    with pytest.raises(ValueError, match=r'BlockFull: hidden_sizes \(256, 256, 256\)'):
         read_initial_networks('HandManipulateBlockRotateZ,HandManipulateBlockFull')
     reach, push = 'FetchReach', 'FetchPush'
-    with pytest.raises(ValueError, match=f'{reach} and {push}: observation 10 and 25; inputs 13'):
+    with pytest.raises(ValueError, match=f'{reach} and {push}: observation 10 and 25'):
         read_initial_networks(f'{reach},{push}')
     blocks, eggs = 'HandManipulateBlockRotateXYZ', read_initial_networks('HandManipulateEggRotate')
     cubes = replace(eggs, origin=eggs.origin | {'task': blocks})
@@ -149,10 +147,10 @@ def test_no_mean_of_networks_that_differ_in_kind(block_run: Path) -> None:
 
 
 @pytest.mark.parametrize('features', ['relative', 'symmetric'])
-def test_a_position_that_begins_to_count_changes_nothing_at_first(
+def test_a_position_that_now_counts_has_no_effect_at_first(
     tmp_path: Path, block_run: Path, features: str
 ) -> None:
-    """EggFull from EggRotate: actor and critic say the same wherever the goal lies."""
+    """EggFull from EggRotate: actor and critic return the same for every goal position."""
     before = Trainer(tiny('HandManipulateEggRotate', goal_features=features), tmp_path, Workers())
     before.save()
     config = tiny('HandManipulateEggFull', goal_features=features)
@@ -180,10 +178,10 @@ def test_a_position_that_begins_to_count_changes_nothing_at_first(
 
 
 @pytest.mark.parametrize('condition', ['threshold', 'horizon'])
-def test_a_condition_is_new_to_networks_and_folded_when_others_start_from_them(
+def test_a_condition_starts_without_effect_and_is_fixed_for_other_runs(
     tmp_path: Path, block_run: Path, condition: str
 ) -> None:
-    """The same values at every condition to begin with; later those at which the actor acts."""
+    """First the values are equal for all conditions; others start with those for acting."""
     config = tiny('HandManipulateBlockFull', condition=condition, init_from=str(block_run))
     plain = read_initial_networks(str(block_run)).fitted(tiny('HandManipulateBlockFull'))
     run = Trainer(
@@ -211,9 +209,7 @@ def test_a_condition_is_new_to_networks_and_folded_when_others_start_from_them(
     torch.testing.assert_close(said(follower), said(run, acting))
 
 
-def test_a_second_critic_starts_from_nothing_and_both_go_on_or_one(
-    tmp_path: Path, block_run: Path
-) -> None:
+def test_a_second_critic_starts_from_random_weights(tmp_path: Path, block_run: Path) -> None:
     task, runs = 'HandManipulateBlockRotateXYZ', [tmp_path / 'two', tmp_path / 'mean']
     twins = ['--set=critics=2', '--set=aggregate=min', *SET]
     arguments = ['--task', task, '--steps', '200', *twins, '--init-from', str(block_run)]
@@ -245,7 +241,9 @@ def test_a_second_critic_starts_from_nothing_and_both_go_on_or_one(
     assert same(alone.critic.state_dict(), part_of(mean.tensors, 'critic.members.0'))
 
 
-def test_a_critic_with_another_norm_starts_from_nothing(tmp_path: Path, block_run: Path) -> None:
+def test_a_critic_with_another_norm_starts_from_random_weights(
+    tmp_path: Path, block_run: Path
+) -> None:
     task, run = 'HandManipulateBlockRotateXYZ', tmp_path / 'run'
     config = tiny(task, norm='layer')
     networks = read_initial_networks(str(block_run)).fitted(config)
@@ -273,8 +271,10 @@ def test_the_mean_of_batch_norms_counts_no_batches(tmp_path: Path) -> None:
         assert torch.equal(networks.tensors[name], parts[0].tensors[name])
 
 
-def test_without_targets_the_networks_themselves_go_on(tmp_path: Path, block_run: Path) -> None:
-    """Not their slow copies, which a file of a run with targets has beside them."""
+def test_without_targets_a_run_starts_from_the_networks_themselves(
+    tmp_path: Path, block_run: Path
+) -> None:
+    """Not from their slow copies, which the file also contains."""
     task = 'HandManipulateBlockRotateXYZ'
     networks = read_initial_networks(str(block_run))
     before = {part: part_of(networks.tensors, part) for part in ('actor', 'critic')}
@@ -324,9 +324,7 @@ def test_past_actions_that_become_inputs_change_no_action_at_first(
     torch.testing.assert_close(normalized, past, rtol=1e-3, atol=1e-3)
 
 
-def test_where_it_started_is_kept_through_resume_and_shipped(
-    tmp_path: Path, block_run: Path
-) -> None:
+def test_the_origin_is_kept_in_resumed_and_shipped_actors(tmp_path: Path, block_run: Path) -> None:
     run, actors = tmp_path / 'full', tmp_path / 'actors'
     arguments = ['--task', 'HandManipulateBlockFull', '--steps', '200', *SET]
     assert main([*arguments, '--init-from', str(block_run), '--output', str(run)]) == 0
@@ -350,7 +348,7 @@ def test_where_it_started_is_kept_through_resume_and_shipped(
         for name, value in best.state_dict().items()
     )
     shutil.copy(run / 'latest.safetensors', actors / 'HandManipulateBlockFull.safetensors')
-    with pytest.raises(ValueError, match='is the critic of another actor'):
+    with pytest.raises(ValueError, match='another actor'):
         read_initial_networks(str(actors / 'HandManipulateBlockFull.safetensors'))
 
 
@@ -370,7 +368,7 @@ def test_a_run_in_the_home_directory_is_found_there(
         ({'goal_features': 'plain'}, 'goal_features plain, not relative'),
     ],
 )
-def test_a_critic_beside_an_actor_is_that_actors(
+def test_the_critic_of_another_actor_is_rejected(
     tmp_path: Path, block_run: Path, source: dict[str, object], message: str
 ) -> None:
     """Critics of other tasks may be of the same sizes."""
@@ -379,7 +377,7 @@ def test_a_critic_beside_an_actor_is_that_actors(
     extra = json.loads(metadata['extra'])
     extra['config'] |= source
     write_tensors(run / STATE_FILE, tensors, metadata | {'extra': json.dumps(extra)})
-    with pytest.raises(ValueError, match=f'is the critic of another actor than .*: {message}'):
+    with pytest.raises(ValueError, match=message):
         read_initial_networks(str(run / 'best.safetensors'))
 
 
@@ -398,7 +396,7 @@ def test_networks_whose_tensors_do_not_fit_are_one_line(
     assert error.count('\n') == 1
 
 
-def test_normalisers_of_an_actor_go_on_from_what_it_has_seen(tmp_path: Path) -> None:
+def test_normalisers_of_an_actor_continue_with_its_statistics(tmp_path: Path) -> None:
     networks = read_initial_networks('FetchReach')
     trainer = Trainer(recipe_config('FetchReach', 'best'), tmp_path, Workers(), init_from=networks)
     before = {name: value.clone() for name, value in trainer.learner.actor.state_dict().items()}
@@ -422,7 +420,7 @@ def test_an_actor_alone_acts_from_the_first_cycle_while_its_critic_learns(
     arguments += ['--set', 'updates_per_cycle=5', '--set', 'batch_size=64']
     arguments += ['--set', 'evaluation_episodes=20', '--output', str(tmp_path / 'run')]
     assert main(arguments) == 0
-    assert 'has no critic for this run: a new one learns first' in capsys.readouterr().err
+    assert 'has no critic for this run' in capsys.readouterr().err
     evaluated = [
         row for row in read_progress(tmp_path / 'run/progress.csv') if 'eval_success' in row
     ]
@@ -432,52 +430,17 @@ def test_an_actor_alone_acts_from_the_first_cycle_while_its_critic_learns(
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'message'),
+    ('start', 'arguments', 'message'),
     [
-        (['--task', 'HandReach'], 'observation 10, now 63; goal 3, now 15; action 4, now 20'),
-        (
-            ['--task', 'FetchReach', '--set', 'hidden_sizes=9'],
-            'now (9,); allowed hidden_sizes: as many, each a',
-        ),
-        (
-            ['--task', 'FetchReach', '--set', 'goal_features=relative'],
-            'goal_features plain, now rel',
-        ),
+        ('FetchReach', ['--task', 'HandReach'], 'observation 10, now 63; goal 3, now 15'),
+        ('FetchReach', ['--set', 'hidden_sizes=9'], 'now (9,); allowed hidden_sizes'),
+        ('FetchReach', ['--set', 'goal_features=relative'], 'goal_features plain, now relative'),
+        ('Nobody', [], "'Nobody'"),
+        ('.', [], 'training_state.safetensors is no file'),
     ],
 )
-def test_networks_that_do_not_fit_are_refused_before_anything_is_written(
-    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    output = ['--init-from', 'FetchReach', '--output', str(tmp_path / 'run')]
-    assert main([*arguments, *output]) == 2
-    error = capsys.readouterr().err
-    assert 'cannot start from FetchReach (FetchReach): ' in error
-    assert message in error and error.count('\n') == 1
-    assert not (tmp_path / 'run').exists()
-
-
-@pytest.mark.parametrize('task', [name for name in TASKS if name.startswith('HandManipulate')])
-def test_a_recipe_goes_on_from_the_shipped_networks(task: str) -> None:
-    config = recipe_config(task, 'finetune')
-    networks = read_initial_networks(config.network.init_from)
-    networks.require_fit(config)
-    assert networks.origin['task'] == task and networks.has_critic
-    assert networks.fitted(config).shape == network_shape(config)
-
-
-def test_no_other_task_has_that_recipe() -> None:
-    with pytest.raises(ValueError, match='with an object in the hand, not HandReach'):
-        recipe_config('HandReach', 'finetune')
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'message'),
-    [
-        (['--init-from', 'Nobody'], "no actor 'Nobody'; shipped: "),
-        (['--init-from', '.'], 'training_state.safetensors is no file'),
-    ],
-)
-def test_a_start_that_is_not_there_is_one_line(
+def test_networks_that_do_not_fit_are_rejected_before_anything_is_written(
+    start: str,
     arguments: list[str],
     message: str,
     tmp_path: Path,
@@ -485,13 +448,28 @@ def test_a_start_that_is_not_there_is_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(['--task', 'FetchReach', *arguments]) == 2
+    assert main(['--task', 'FetchReach', '--init-from', start, *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('task', [name for name in TASKS if name.startswith('HandManipulate')])
+def test_finetune_starts_from_the_shipped_networks(task: str) -> None:
+    config = recipe_config(task, 'finetune')
+    networks = read_initial_networks(config.network.init_from)
+    networks.require_fit(config)
+    assert networks.origin['task'] == task and networks.has_critic
+    assert networks.fitted(config).shape == network_shape(config)
+
+
+def test_finetune_needs_an_object_in_the_hand() -> None:
+    with pytest.raises(ValueError, match='HandReach'):
+        recipe_config('HandReach', 'finetune')
 
 
 @pytest.mark.parametrize('changes', [{'reward_type': 'dense'}, {'control_hz': 250.0}])
-def test_a_critic_of_other_rewards_is_left_behind(
+def test_a_critic_of_other_rewards_is_left_out(
     changes: dict[str, object], tmp_path: Path, block_run: Path
 ) -> None:
     task = 'HandManipulateBlockRotateXYZ'

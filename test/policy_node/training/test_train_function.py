@@ -54,7 +54,7 @@ class RichReach(FetchTask):
         return Rich(self.spec, success_rule, reward_type)
 
 
-def test_rewards_that_values_cannot_say_are_named_once(tmp_path, capfd, monkeypatch):
+def test_a_warning_names_rewards_above_0(tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(registry, '_family', lambda spec: RichReach)
     train('FetchReach', tmp_path / 'run', total_steps=800, reward_type='dense', **SMALL)
     lines = capfd.readouterr().err.splitlines()
@@ -63,7 +63,7 @@ def test_rewards_that_values_cannot_say_are_named_once(tmp_path, capfd, monkeypa
     assert 'within -1 ... 0' in line
 
 
-def test_the_record_says_all_that_was_given(tmp_path):
+def test_the_record_contains_all_arguments(tmp_path):
     fields = {name: value for name, value in SMALL.items() if name != 'quiet'}
     train('FetchReach', tmp_path, recipe='best', total_steps=400, goals='future=.8', **SMALL)
     train('FetchReach', tmp_path, resume=True, gamma=np.float64(0.9), total_steps=800, quiet=True)
@@ -75,8 +75,8 @@ def test_the_record_says_all_that_was_given(tmp_path):
     ]
 
 
-def test_it_trains_what_the_command_trains(tmp_path):
-    """To the same bits: the function is no second trainer."""
+def test_the_function_trains_as_the_command(tmp_path):
+    """Bit for bit."""
     run = train('FetchReach', tmp_path / 'function', total_steps=800, overlap=False, **SMALL)
     options = [f'--set={name}={value}' for name, value in SMALL.items() if name != 'quiet']
     command = [sys.executable, '-m', 'policy_node.training.train_her', '--task', 'FetchReach']
@@ -109,7 +109,7 @@ def test_a_callback_sees_every_cycle_and_may_end_the_run(tmp_path):
 
     def on_cycle(row):
         rows.append(row)
-        return len(rows) < 2
+        return np.bool_(len(rows) < 2)
 
     run = train('FetchReach', tmp_path / 'run', total_steps=4_000, on_cycle=on_cycle, **SMALL)
     assert (run.env_steps, run.reason) == (800, 'stopped by on_cycle')
@@ -119,30 +119,17 @@ def test_a_callback_sees_every_cycle_and_may_end_the_run(tmp_path):
     assert resumed.config.collect.num_envs == 8
 
 
-def test_what_a_callback_raises_ends_the_run_and_frees_the_folder(tmp_path):
-    def fail(row):
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        train('FetchReach', tmp_path / 'run', total_steps=4_000, on_cycle=fail, **SMALL)
-    assert train('FetchReach', tmp_path / 'run', total_steps=400, **SMALL).env_steps == 400
-
-
-def test_no_of_numpy_ends_the_run_as_well(tmp_path):
-    settings = {'total_steps': 4_000, **SMALL}
-    run = train('FetchReach', tmp_path / 'run', on_cycle=lambda row: np.bool_(False), **settings)
-    assert run.env_steps == 400
-
-
-def test_an_error_of_the_system_in_a_callback_is_the_callers(tmp_path):
-    """And none of the run's, whose disk has not failed."""
+def test_an_exception_of_a_callback_is_raised_and_the_run_is_saved(tmp_path):
+    """An OSError of the callback is no disk error of the run."""
 
     def plot(row):
         Path('/nowhere/plot.png').write_bytes(b'')
 
     with pytest.raises(FileNotFoundError, match=r'/nowhere/plot\.png') as caught:
-        train('FetchReach', tmp_path / 'run', total_steps=400, on_cycle=plot, **SMALL)
+        train('FetchReach', tmp_path / 'run', total_steps=4_000, on_cycle=plot, **SMALL)
     assert 'plot' in [entry.name for entry in caught.traceback]
+    run = train('FetchReach', tmp_path / 'run', resume=True, total_steps=800, quiet=True)
+    assert run.env_steps == 800
 
 
 def test_runs_at_the_same_time_leave_the_programs_random_numbers(tmp_path):
@@ -170,7 +157,7 @@ def test_runs_at_the_same_time_leave_the_programs_random_numbers(tmp_path):
     assert torch.rand(1) == expected
 
 
-def test_who_interrupts_twice_does_not_wait_for_a_collection():
+def test_a_second_interrupt_does_not_wait_for_a_collection():
     going = threading.Event()
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt), _collecting_thread() as executor:
@@ -178,16 +165,6 @@ def test_who_interrupts_twice_does_not_wait_for_a_collection():
         raise KeyboardInterrupt
     assert time.monotonic() - began < 5.0
     going.set()
-
-
-def test_it_trains_in_a_thread_too(tmp_path):
-    runs = []
-    thread = threading.Thread(
-        target=lambda: runs.append(train('FetchReach', tmp_path, total_steps=400, **SMALL))
-    )
-    thread.start()
-    thread.join()
-    assert runs[0].env_steps == 400
 
 
 @pytest.mark.parametrize(
@@ -204,13 +181,13 @@ def test_it_trains_in_a_thread_too(tmp_path):
         ({'output': ''}, "output ''; allowed"),
         ({'recipe': ''}, "recipe ''; allowed: paper"),
         ({'resume': 'no'}, "resume 'no'; allowed: True or False"),
-        ({'resume': True}, 'is no folder of a run to go on with'),
+        ({'resume': True}, 'is not the folder of a run'),
         ({'resume': True, 'output': None}, 'resume=True needs output'),
         ({'output': '/proc/nothing'}, '/proc/nothing cannot hold a run'),
         ({'init_from': 'nothing'}, "no actor 'nothing'"),
     ],
 )
-def test_what_is_not_allowed_is_a_value_error_of_one_line(arguments, said, tmp_path):
+def test_an_invalid_argument_is_a_value_error_of_one_line(arguments, said, tmp_path):
     with pytest.raises(ValueError, match=said) as error:
         train(**{'task': 'FetchReach', 'output': tmp_path / 'run', 'quiet': True, **arguments})
     assert '\n' not in str(error.value)
@@ -219,11 +196,11 @@ def test_what_is_not_allowed_is_a_value_error_of_one_line(arguments, said, tmp_p
 def test_a_folder_that_holds_a_run_is_left_alone(tmp_path):
     train('FetchReach', tmp_path, total_steps=400, **SMALL)
     before = (tmp_path / 'training_state.safetensors').read_bytes()
-    with pytest.raises(ValueError, match='holds a run: resume=True goes on with it'):
+    with pytest.raises(ValueError, match='resume=True'):
         train('FetchReach', tmp_path, total_steps=400, **SMALL)
-    with pytest.raises(ValueError, match='is a run of FetchReach, not of FetchPush'):
+    with pytest.raises(ValueError, match='FetchReach, not of FetchPush'):
         train('FetchPush', tmp_path, resume=True, quiet=True)
-    with pytest.raises(ValueError, match="init_from '', which stay; not 'FetchReach'"):
+    with pytest.raises(ValueError, match="init_from ''"):
         train('FetchReach', tmp_path, resume=True, init_from='FetchReach', quiet=True)
     assert (tmp_path / 'training_state.safetensors').read_bytes() == before
 
@@ -292,9 +269,7 @@ def test_a_missing_extra_is_named(tmp_path):
     )
 
 
-def test_the_home_directory_is_called_as_in_a_shell(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tilde_is_the_home_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('HOME', str(tmp_path))
     with pytest.raises(ValueError, match=f'{tmp_path}/runs/none'):
         train('FetchReach', '~/runs/none', resume=True)

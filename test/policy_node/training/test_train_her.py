@@ -27,7 +27,6 @@ from policy_node.training.generate_episodes import main as generate_episodes
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.runs.finite_checks import TrainingError
 from policy_node.training.runs.run import train_run
-from policy_node.training.runs.run_folder import set_former_run_aside
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.trainer import Collected, Trainer
 from policy_node.training.runs.training_state import read_state
@@ -231,7 +230,7 @@ def test_logs_that_cannot_be_learnt_from_are_refused(
     output = ['--output', str(tmp_path / 'run')]
     small = ['--from-episodes', str(logged), '--set', 'replay_transitions=500', *output]
     assert main([*SMALL, *small]) == 2
-    assert 'holds 600 transitions, the replay 500; allow more with' in capsys.readouterr().err
+    assert '600 transitions, the replay 500' in capsys.readouterr().err
     assert main([*SMALL, '--from-episodes', str(tmp_path), *output]) == 2
     assert f'{tmp_path} holds no episode' in capsys.readouterr().err
     above = tmp_path / 'above'
@@ -291,7 +290,7 @@ def test_graded_rewards_are_shares_of_thresholds_met() -> None:
 
 
 def test_training_may_grade_its_rewards(tmp_path: Path) -> None:
-    """FetchReach succeeds within 0.05 m: within 0.1 m half of the grades 1 and 2 are met."""
+    """FetchReach succeeds within 0.05 m; within 0.1 m, half of the grades 1 and 2 are met."""
     trainer = Trainer(small_config(reward_grades='1,2', batch_size=512), tmp_path, Workers())
     trainer.experience.replay.add(trainer.collector.collect(trainer.learner.actor)[0])
     batch = trainer.experience.batch(env_steps=0)
@@ -316,14 +315,14 @@ def test_thresholds_of_training_narrow_from_the_first_to_those_of_the_task(tmp_p
         clear = np.abs(distance - threshold) > 1e-4
         np.testing.assert_array_equal(batch.reward[clear] == 0.0, distance[clear] < threshold)
         assert ((distance > 0.5 * threshold) & (distance < threshold)).any()
-    with pytest.raises(ValueError, match='first_rotation: goals of FetchReach have no rotation'):
+    with pytest.raises(ValueError, match='first_rotation'):
         small_config(first_rotation=2.0)
-    with pytest.raises(ValueError, match='it needs reward_type sparse'):
+    with pytest.raises(ValueError, match='reward_type sparse'):
         small_config(first_distance=2.0, reward_type='dense')
 
 
-def test_evaluation_sees_nothing_of_what_training_may_change(tmp_path: Path) -> None:
-    """The same actor gets the same evaluation, whatever the rewards and draws of training are."""
+def test_settings_of_training_do_not_change_evaluation(tmp_path: Path) -> None:
+    """The same actor gets the same evaluation with other rewards and goals of training."""
     task, small = 'HandManipulatePenFull', {'num_envs': 2, 'evaluation_episodes': 2}
     changes = {'reward_rotation': 20.0, 'reward_distance': 0.1, 'gamma': 0.5}
     changes |= {'first_distance': 9.0, 'first_rotation': 9.0}
@@ -347,10 +346,10 @@ def test_evaluation_sees_nothing_of_what_training_may_change(tmp_path: Path) -> 
 def test_an_unfitting_state_is_refused_in_one_line(tmp_path: Path) -> None:
     Trainer(small_config(), tmp_path, Workers()).save()
     wide = Trainer(small_config(hidden_sizes=(32,)), tmp_path, Workers())
-    with pytest.raises(ValueError, match='does not fit this configuration') as caught:
+    with pytest.raises(ValueError, match=r'training_state.safetensors') as caught:
         wide.resume(tmp_path / 'training_state.safetensors')
     assert '\n' not in str(caught.value)
-    with pytest.raises(ValueError, match='no training state of version 1'):
+    with pytest.raises(ValueError, match='fetch_hand_actor'):
         wide.resume(tmp_path / 'latest.safetensors')
 
 
@@ -367,7 +366,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(tmp_pa
         return update(batch)  # type: ignore[arg-type]
 
     trainer.learner.update = poisoned  # type: ignore[method-assign,assignment]
-    with pytest.raises(TrainingError, match='critic loss is nan in update 10, after 1200 env'):
+    with pytest.raises(TrainingError, match='critic loss is nan in update 10, after 1200'):
         trainer.train()
     kept = weights(tmp_path / 'training_state.safetensors')
     assert all(torch.isfinite(value.float()).all() for value in kept.values())
@@ -393,22 +392,18 @@ def test_weights_that_a_step_has_ruined_stop_the_run_before_they_act_or_are_save
         return losses
 
     trainer.learner.update = ruinous  # type: ignore[method-assign,assignment]
-    with pytest.raises(TrainingError, match=r'network\.output\.weight is not finite after update'):
+    with pytest.raises(TrainingError, match=r'network\.output\.weight'):
         trainer.train()
     kept = weights(tmp_path / 'training_state.safetensors')
     assert all(torch.isfinite(value.float()).all() for value in kept.values())
 
 
 def test_networks_whose_files_could_not_be_read_are_refused_at_once(tmp_path: Path) -> None:
-    for changes, said in (
-        ({'hidden_sizes': (4096, 4096)}, 'make an actor of 67,'),
-        ({'critics': 100, 'hidden_sizes': (16,) * 8}, 'the header of a training state of 1,'),
-    ):
-        with pytest.raises(ValueError, match=said):
-            Trainer(small_config(**changes), tmp_path, Workers())
+    with pytest.raises(ValueError, match='67,'):
+        Trainer(small_config(hidden_sizes=(4096, 4096)), tmp_path, Workers())
 
 
-def test_a_run_that_began_anew_has_one_part(tmp_path: Path) -> None:
+def test_a_restarted_run_has_one_part(tmp_path: Path) -> None:
     """One that was killed before it had saved anything does not count."""
     (tmp_path / 'command.txt').write_text('fetch_hand_sim train of before\n')
     train_run(small_config(total_steps=800), tmp_path, command='fetch_hand_sim train of now')
@@ -419,40 +414,21 @@ def test_a_run_that_began_anew_has_one_part(tmp_path: Path) -> None:
     assert (tmp_path / 'command.txt').read_text() == 'fetch_hand_sim train of now\nmore\n'
 
 
-def test_a_run_that_goes_on_says_that_its_log_is_lost(
+def test_a_new_run_sets_the_files_of_an_earlier_one_aside(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train_run(small_config(total_steps=800), tmp_path)
-    (tmp_path / 'progress.csv').unlink()
-    train_run(small_config(total_steps=1200), tmp_path, resume=True)
-    assert 'progress.csv has no rows from 0 to 800 steps' in capsys.readouterr().err
-
-
-def test_a_run_that_begins_anew_sets_the_one_before_aside(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Its best actor would be kept as this one's, of whatever task it is."""
-    board = tmp_path / 'tensorboard'
-    board.mkdir()
-    names = 'best.safetensors', '1.replay.safetensors', 'tensorboard/events.out.tfevents.1.host.2.0'
-    others = 'mine.replay.safetensors', 'tensorboard/mine', 'progress.csv', 'curve.png'
-    for name in (*names, *others):
-        (tmp_path / name).write_bytes(f'{name}\n\n'.encode())
-    train_run(small_config(total_steps=400, learning_starts=1000), tmp_path)
-    # It may be all that somebody has kept of a run.
-    kept = 'best.safetensors', 'progress.csv', 'curve.png'
-    for name in kept:
-        assert (tmp_path / f'former_{name}').read_bytes() == f'{name}\n\n'.encode()
-    assert f'{", ".join(kept)} of an earlier run in {tmp_path}: now' in capsys.readouterr().err
-    assert not [name for name in names if (tmp_path / name).exists()]
-    assert (tmp_path / 'mine.replay.safetensors').exists() and (board / 'mine').exists()
-    # Nor do two that were killed early take the place of what is kept.
-    for left in ('env_steps\n', 'env_steps\n400\n'):
-        (tmp_path / 'training_state.safetensors').unlink(missing_ok=True)
-        (tmp_path / 'progress.csv').write_text(left)
-        set_former_run_aside(tmp_path)
-    assert (tmp_path / 'former_progress.csv').read_bytes() == b'progress.csv\n\n'
-    assert (tmp_path / 'former3_progress.csv').read_text() == 'env_steps\n400\n'
+    """Otherwise the best actor of the earlier run would stay, even of another task."""
+    (tmp_path / 'tensorboard').mkdir()
+    names = 'best.safetensors', '1.replay.safetensors', 'tensorboard/events', 'progress.csv'
+    for part in ('former1', 'former2'):
+        for name in (*names, 'mine'):
+            (tmp_path / name).write_text(f'{part} {name}')
+        train_run(small_config(total_steps=400, learning_starts=1000), tmp_path)
+        assert f'an earlier run in {tmp_path}' in capsys.readouterr().err
+        for name in names:
+            assert (tmp_path / part / name).read_text() == f'{part} {name}'
+        assert (tmp_path / 'mine').exists() and not (tmp_path / '1.replay.safetensors').exists()
+        (tmp_path / 'training_state.safetensors').unlink()
 
 
 def test_an_observation_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
@@ -465,7 +441,7 @@ def test_an_observation_that_is_not_finite_stops_the_run(tmp_path: Path) -> None
         return episodes, success
 
     trainer.collector.collect = broken  # type: ignore[method-assign,assignment]
-    with pytest.raises(TrainingError, match='observation is not finite after 0 environment steps'):
+    with pytest.raises(TrainingError, match='observation is not finite after 0'):
         trainer.train()
 
 
@@ -515,43 +491,25 @@ def test_two_workers_train_together(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        ([], '--task is missing; allowed: FetchReach, '),
-        (
-            ['--task', 'FetchReach', '--set', 'gama=1'],
-            "'gama=1' is not name=value; did you mean 'gamma'?",
-        ),
-        (['--task', 'FetchReach', '--no-her', '--strategy', 'final'], '--no-her excludes'),
-        (['--task', 'FetchReach', '--no-her', '--set', 'strategy=final'], '--no-her excludes'),
-        (
-            [*'--task FetchReach --steps 1 --her --set strategy=none'.split()],
-            '--her excludes strategy none: give another --strategy',
-        ),
-        (['--task', 'FetchReach', '--set', 'gamma=nan'], 'gamma nan is no finite number'),
-        (
-            [*'--task FetchReach --steps 1 --set gamma=.9 --gamma .95'.split()],
-            '--gamma 0.95 excludes --set gamma=0.9',
-        ),
-        (
-            [*'--task FetchReach --replay-transitions 1000 --learning-starts 1001'.split()],
-            'learning_starts needs replay_transitions of 1001 or more',
-        ),
-        (
-            [*PPO, '--task', 'FetchReach', '--from-episodes', '.'],
-            'algorithm ppo excludes --from-episodes',
-        ),
-        (
-            ['--task', 'FetchReach', '--gamble', '--from-episodes', '.'],
-            'gamble excludes --from-episodes',
-        ),
-        (['--task', 'FetchReach', '--strategy', 'past'], "strategy 'past'; allowed: "),
-        (['--resume', 'nowhere'], 'nowhere is no folder of a run to go on with'),
+        ('', '--task is missing'),
+        ('--task FetchReach --set gama=1', "did you mean 'gamma'?"),
+        ('--task FetchReach --no-her --strategy final', '--no-her excludes'),
+        ('--task FetchReach --no-her --set strategy=final', '--no-her excludes'),
+        ('--task FetchReach --her --set strategy=none', '--her excludes strategy none'),
+        ('--task FetchReach --set gamma=nan', 'gamma nan'),
+        ('--task FetchReach --set gamma=.9 --gamma .95', '--gamma 0.95 excludes --set gamma=0.9'),
+        ('--task FetchReach --replay-transitions 1000 --learning-starts 1001', '1001 or more'),
+        (f'{" ".join(PPO)} --task FetchReach --from-episodes .', 'ppo excludes --from-episodes'),
+        ('--task FetchReach --gamble --from-episodes .', 'gamble excludes --from-episodes'),
+        ('--task FetchReach --strategy past', "strategy 'past'"),
+        ('--resume nowhere', 'nowhere is not the folder of a run'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    arguments: str, message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     output = [] if '--resume' in arguments else ['--output', str(tmp_path)]
-    assert main([*arguments, *output]) == 2
+    assert main([*arguments.split(), *output]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count('\n') == 1
 
@@ -563,14 +521,21 @@ def test_bad_usage_is_one_line_and_exit_status_2(
         (['--set', 'task=FetchSlide'], 'is a run of FetchReach, not of FetchSlide'),
         (['--recipe', 'paper'], 'is a run of best, not of paper'),
         (['--her'], '--her excludes strategy none: give another --strategy'),
-        (['--output', 'elsewhere'], '--output excludes --resume: the run goes on in '),
-        (['--set', 'init_from=FetchReach'], "networks of init_from '', which stay; not 'FetchR"),
-        (['--quantiles', '5'], 'has networks of quantiles 1, which stay; not 5'),
-        (['--condition', 'horizon'], "networks of condition 'none', which stay; not 'horizon'"),
-        (['--subgoal-every', '5'], 'has networks of subgoal_every 0, which stay; not 5'),
+        (['--output', 'elsewhere'], '--output excludes --resume'),
+        (['--set', 'init_from=FetchReach'], "init_from '', which cannot change to 'FetchReach'"),
+        (['--quantiles', '5'], 'quantiles 1, which cannot change to 5'),
+        (['--condition', 'horizon'], "condition 'none', which cannot change to 'horizon'"),
+        (['--subgoal-every', '5'], 'subgoal_every 0, which cannot change to 5'),
+        (['--longest-hold', '20'], 'longest_hold 1, which cannot change to 20'),
+        (['--hidden-sizes', '8,8'], 'hidden_sizes (256, 256, 256), which cannot change to (8, 8)'),
+        (['--seed', '9'], 'seed 0, which cannot change to 9'),
+        (['--critics', '2'], 'critics 1, which cannot change to 2'),
+        (['--goal-features', 'relative'], "goal_features 'plain', which cannot change"),
+        (['--control-hz', '50'], 'control_hz 25.0, which cannot change to 50.0'),
+        (['--reward-type', 'dense'], "reward_type 'sparse', which cannot change to 'dense'"),
     ],
 )
-def test_what_a_run_that_goes_on_cannot_change(
+def test_a_resumed_run_rejects_changed_networks_and_experience(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     Trainer(small_config(strategy='none'), tmp_path, Workers()).save()
@@ -579,20 +544,11 @@ def test_what_a_run_that_goes_on_cannot_change(
     assert message in error and error.count('\n') == 1
 
 
-def test_lengths_of_actions_mean_what_they_meant(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    """With a longer `longest_hold` what held for three ticks would be learnt from as for twenty."""
-    Trainer(small_config(longest_hold=3), tmp_path, Workers()).save()
-    assert main(['--resume', str(tmp_path), '--longest-hold', '20']) == 2
-    assert 'has networks of longest_hold 3, which stay; not 20' in capsys.readouterr().err
-
-
 def test_a_folder_with_a_run_is_not_overwritten(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Trainer(small_config(), tmp_path, Workers()).save()
     before = (tmp_path / 'training_state.safetensors').read_bytes()
     assert main([*SMALL, '--output', str(tmp_path)]) == 2
-    assert 'holds a run; continue it with --resume' in capsys.readouterr().err
+    assert 'contains a run. Use --resume' in capsys.readouterr().err
     assert (tmp_path / 'training_state.safetensors').read_bytes() == before
