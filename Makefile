@@ -17,7 +17,7 @@ STAMP := $(VENV)/.complete
 # not leak in. Some hundred processes share the bytecode.
 unexport PYTHONDONTWRITEBYTECODE PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo docs tables pictures test test-alone test-nodes test-others test-browser lint format twin bench-sim bench-view bench-camera bench-her bench-paper bench-lockstep bench-rate bench-episodes torture test-release clean distclean
+.PHONY: help env demo docs tables pictures test test-alone test-nodes test-others test-browser lint format twin bench-sim bench-view bench-camera bench-her bench-paper bench-lockstep bench-rate bench-real-time bench-episodes torture test-release clean distclean
 
 help:
 	@echo 'make demo [TASK=$(TASK)] [EPISODES=$(EPISODES)]  run the robot and its actor, log every episode'
@@ -36,6 +36,7 @@ help:
 	@echo 'make bench-her  training speed against Stable-Baselines3'
 	@echo 'make bench-paper [TASK=$(TASK)]  four variants x five seeds, as in the figures of the paper'
 	@echo 'make bench-lockstep  ticks per second of two nodes against the limit of the middleware'
+	@echo 'make bench-real-time  success in real time, with and without answer_wait, against lockstep'
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
 	@echo 'make torture    100,000 hostile messages per test, an hour of memory at 20x, 50 killed'
 	@echo '                robots, 10,000 damaged and 2,000 crafted episode files'
@@ -125,6 +126,9 @@ bench-paper: env
 
 bench-lockstep: env
 	$(BIN)/python bench/bench_lockstep.py
+
+bench-real-time: env
+	$(BIN)/python bench/bench_real_time.py
 
 bench-rate: env
 	$(BIN)/python bench/bench_rate.py --seconds $(SECONDS)

@@ -72,10 +72,12 @@ def row(task: str, label: str, played: list[EpisodeSummary]) -> str:
     """Return a line of the table."""
     successes = sum(episode.outcome.is_success is True for episode in played)
     steps = sum(episode.outcome.steps or 0 for episode in played)
-    late = sum(episode.outcome.late_commands or 0 for episode in played)
+    late = '-'
+    if played[0].outcome.late_commands is not None:
+        late = f'{sum(episode.outcome.late_commands or 0 for episode in played) / steps:.1%}'
     return (
-        f'| {task} | {label} | {successes} of {len(played)} | {late / steps:.1%} | '
-        f'{factor(played):.2f} | {os.getloadavg()[0]:.0f} |'
+        f'| {task} | {label} | {successes} of {len(played)} | {late} | {factor(played):.2f} | '
+        f'{os.getloadavg()[0]:.0f} |'
     )
 
 
@@ -84,14 +86,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--tasks', nargs='+', choices=tuple(TASKS), default=list(DEFAULT_TASKS))
     parser.add_argument('--episodes', type=int, default=50, help='2 or more; default: 50')
-    parser.add_argument('--answer-wait', type=float, default=20.0, help='ms; default: 20')
+    default = [0.0, 20.0]
+    parser.add_argument('--answer-wait', nargs='+', type=float, default=default, help='ms')
     options = parser.parse_args()
-    wait = options.answer_wait
-    variants: dict[str, dict[str, object]] = {
-        'lockstep': {'mode': 'lockstep'},
-        'real time': {},
-        f'real time, answer_wait {wait:g} ms': {'answer_wait': float(wait)},
-    }
+    variants: dict[str, dict[str, object]] = {'lockstep': {'mode': 'lockstep'}}
+    for wait in options.answer_wait:
+        variants[f'real time, answer_wait {wait:g}'] = {'answer_wait': wait}
     print(f'{processor()}, {os.cpu_count()} CPUs, seeds from {FIRST_SEED}\n')
     print('| task | mode | success | late commands | real-time factor | load average |')
     print('|---|---|---:|---:|---:|---:|')

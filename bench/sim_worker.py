@@ -110,6 +110,14 @@ def this_project(task: str, reference_id: str, num_envs: int, threads: int, path
     return VectorWorker(env, num_envs)
 
 
+def disturbed(task: str, reference_id: str, num_envs: int, threads: int, path: str) -> Any:
+    """Our vectorised environment with all groups of disturbances."""
+    import fetch_hand_sim
+
+    env = fetch_hand_sim.make_vec(task, num_envs, num_threads=threads, disturbances='hardware')
+    return VectorWorker(env, num_envs)
+
+
 def bare_physics(task: str, reference_id: str, num_envs: int, threads: int, path: str) -> Any:
     """MuJoCo's batch on the model as published; nothing of this project runs."""
     from mujoco.batch import Batch
@@ -159,7 +167,14 @@ def gymnasium_robotics(task: str, reference_id: str, num_envs: int, threads: int
 
 WORKERS: dict[str, Callable[..., Any]] = {
     worker.__name__: worker
-    for worker in (this_project, bare_physics, tuned_physics, envpool, gymnasium_robotics)
+    for worker in (
+        this_project,
+        disturbed,
+        bare_physics,
+        tuned_physics,
+        envpool,
+        gymnasium_robotics,
+    )
 }
 
 
