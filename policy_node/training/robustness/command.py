@@ -10,7 +10,12 @@ import argparse
 import csv
 import io
 import json
-from collections.abc import Sequence
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,6 +70,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         metavar='NAME',
         help='writes NAME.json, NAME.csv and NAME.png; default: <task>.robustness',
     )
+    add('--jobs', type=whole_number(1), default=1, metavar='N', help='points at once; default: 1')
     parser.set_defaults(reward_type='sparse', success_rule='gymnasium', disturbances='none')
     return parser.parse_args(arguments)
 
@@ -84,7 +90,7 @@ def _run(options: argparse.Namespace) -> int:
         require_writable(file)
     result = _start(options, loaded, simulation, files['json'])
     with policy_errors():
-        _measure(result, simulation, replace(loaded, is_bounded=True), files['json'])
+        _measure(result, options, simulation, loaded, files['json'])
     success = {key: point['success'] for key, point in result['points'].items()}
     result['sentence'] = sentence(task_spec(loaded.task), result['control_hz'], success)
     write_file(files['json'], to_json(result))
@@ -126,16 +132,72 @@ def _start(
     return {**result, 'points': earlier_points}
 
 
+class _Evaluation:
+    """Evaluates points with simulations of its own."""
+
+    def __init__(
+        self, options: argparse.Namespace, simulation: Simulation, loaded: LoadedPolicy
+    ) -> None:
+        self._options = options
+        self._simulation = simulation
+        self._policy = replace(loaded, is_bounded=True)
+
+    def measure(self, point: Point) -> dict[str, Any]:
+        """Return the result of a point."""
+        self._simulation.disturbances = point.disturbances
+        episodes, first_seed = self._options.episodes, self._options.first_seed
+        return _measured(point, evaluate(self._simulation, self._policy, episodes, first_seed))
+
+
+# The evaluation of this process, if it is a worker.
+_worker: list[_Evaluation] = []
+
+
+def _start_worker(options: argparse.Namespace) -> None:
+    # Ctrl-C ends the worker at once and without a traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    loaded = load_chosen_policy(options)
+    _worker.append(_Evaluation(options, make_chosen_simulation(options, loaded), loaded))
+
+
+def _measure_in_worker(point: Point) -> dict[str, Any]:
+    return _worker[0].measure(point)
+
+
+def _measured_in_workers(
+    options: argparse.Namespace, missing: Sequence[Point]
+) -> Iterator[dict[str, Any]]:
+    """Yield the results of points, in order, that several processes evaluate."""
+    jobs = min(options.jobs, len(missing))
+    threads = options.threads or max(1, len(os.sched_getaffinity(0)) // jobs)
+    own = argparse.Namespace(**{**vars(options), 'threads': threads})
+    context = multiprocessing.get_context('spawn')
+    pool = ProcessPoolExecutor(jobs, context, _start_worker, (own,))
+    try:
+        yield from pool.map(_measure_in_worker, missing)
+    except BrokenProcessPool:
+        raise CommandError('a process ended early, for example for lack of memory') from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
 def _measure(
-    result: dict[str, Any], simulation: Simulation, policy: LoadedPolicy, file: Path
+    result: dict[str, Any],
+    options: argparse.Namespace,
+    simulation: Simulation,
+    loaded: LoadedPolicy,
+    file: Path,
 ) -> None:
     """Evaluate the points that are missing; write the file after each."""
     missing = [each for each in points(simulation.spec) if each.key not in result['points']]
+    found: Iterator[dict[str, Any]]
+    if options.jobs > 1 and missing:
+        found = _measured_in_workers(options, missing)
+    else:
+        found = map(_Evaluation(options, simulation, loaded).measure, missing)
     with progress('points', len(missing)) as advance:
-        for point in missing:
-            simulation.disturbances = point.disturbances
-            outcomes = evaluate(simulation, policy, result['episodes'], result['first_seed'])
-            result['points'][point.key] = _measured(point, outcomes)
+        for point, measured in zip(missing, found, strict=True):
+            result['points'][point.key] = measured
             try:
                 write_file(file, to_json(result))
             except OSError as error:
