@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from msgs_spec.codecs import (
+    CommandCodec,
+    LayoutError,
     TopicCodec,
+    answered_stamp,
     build_message,
     build_status,
     decode,
@@ -40,6 +43,10 @@ def random_vector(spec, seed=0):
     return np.random.default_rng(seed).normal(size=spec.size)
 
 
+def rows(*messages):
+    return np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
+
+
 def ros_class(type_name):
     pytest.importorskip('rclpy')
     package, kind, name = type_name.split('/')
@@ -47,12 +54,23 @@ def ros_class(type_name):
 
 
 @every_topic
-def test_template_gives_the_bytes_of_the_serialiser(spec):
+def test_all_ways_to_write_and_read_give_the_same_bits(spec):
     codec = TopicCodec(spec)
-    for seed, stamp in enumerate((0, 1, 999_999_999, 1_000_000_000, STAMP)):
+    for seed, stamp in enumerate((-(2**31) * 10**9, -1, 0, 1, 999_999_999, 10**9, STAMP)):
         vector = random_vector(spec, seed)
-        expected = serialize(spec.type_name, build_message(spec, stamp, vector))
-        assert codec.encode(stamp, vector) == expected
+        if spec.type_name != 'std_msgs/msg/Bool':
+            vector *= 10.0 ** (100 * seed - 300)
+        data = serialize(spec.type_name, build_message(spec, stamp, vector))
+        assert codec.encode(stamp, vector) == data
+        message = deserialize(spec.type_name, data)
+        has_stamp = hasattr(message, 'header') or hasattr(message, 'clock')
+        expected = (stamp if has_stamp else 0, decode(spec, message).tobytes())
+        assert not has_stamp or message_stamp(message) == stamp
+        found_stamp, found = codec.decode(data)
+        assert (found_stamp, found.tobytes()) == expected
+        stamps, vectors = codec.decode_many(rows(data, data))
+        assert stamps.tolist() == [expected[0]] * 2
+        assert vectors.tobytes() == expected[1] * 2
 
 
 @every_topic
@@ -182,3 +200,50 @@ def test_status_round_trip_through_rclpy():
     assert received.status[0].name == 'episode'
     assert received.status[0].level == b'\x00'
     assert message_stamp(received) == STAMP
+
+
+def test_other_layouts_are_read_one_by_one_and_refused_in_bulk():
+    spec = topic(TASKS['FetchReach'], 'joint_states')
+    vector = np.arange(float(spec.size))
+    message = build_message(spec, -5, vector)
+    message.header.frame_id = 'somewhere'
+    message.name = message.name[::-1]
+    for part in ('position', 'velocity', 'effort'):
+        setattr(message, part, getattr(message, part)[::-1].copy())
+    data = serialize(spec.type_name, message)
+    stamp, found = TopicCodec(spec).decode(data)
+    assert (stamp, found.tolist()) == (-5, vector.tolist())
+    with pytest.raises(LayoutError, match='joint_states'):
+        TopicCodec(spec).decode_many(rows(data))
+
+
+@pytest.mark.parametrize('name', ['joint_states', 'desired_goal', 'commands', 'is_success'])
+def test_invalid_bytes_are_rejected_in_one_line(name):
+    codec = TopicCodec(topic(TASKS['FetchReach'], name))
+    good = codec.encode(1, np.zeros(codec.topic.size))
+    for data in (b'', good[:3], good[: codec.size - 1], b'\xff' * codec.size, good + b'\0' * 8):
+        with pytest.raises(ValueError) as error:
+            codec.decode(data)
+        assert '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize('task', ['FetchReach', 'HandReach'])
+@pytest.mark.parametrize('stamp', [0, 1_040_000_000, 2**62])
+def test_commands_name_the_observation_they_answer(task, stamp):
+    commands = topic(TASKS[task], 'commands')
+    values = np.linspace(-1.0, 1.0, commands.size)
+    data = CommandCodec(commands).encode(stamp, values)
+    message = deserialize(commands.type_name, data)
+    assert serialize(commands.type_name, message) == data
+    assert answered_stamp(message) == stamp
+    assert TopicCodec(commands).decode(data)[1].tolist() == values.tolist()
+    plain = deserialize(commands.type_name, TopicCodec(commands).encode(0, values))
+    assert answered_stamp(plain) is None
+
+
+@pytest.mark.parametrize('label', ['', 'answers', 'answers -5', f'answers {"9" * 20}', 'z'])
+def test_other_labels_name_no_observation(label):
+    commands = topic(TASKS['FetchReach'], 'commands')
+    message = deserialize(commands.type_name, CommandCodec(commands).encode(7, np.zeros(4)))
+    message.layout.dim[1].label = label
+    assert answered_stamp(message) is None

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from msgs_spec.codecs import decode, decode_status, message_stamp
-from msgs_spec.schemas import deserialize
+from msgs_spec.schemas import deserialize, serialize
 from msgs_spec.tasks import TASKS, GoalKind
-from msgs_spec.tick import EpisodeStatus, TickEncoder
-from msgs_spec.topics import topic, topics
+from msgs_spec.tick import EpisodeStatus, TickEncoder, join_messages, split_messages
+from msgs_spec.topics import LATEST_TICK, topic, topics
 from support.random_ticks import STAMP, episode_status, random_tick
 
 every_task = pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
@@ -170,3 +170,32 @@ def test_another_robot_is_one_whose_messages_mean_something_else(change, is_same
 def test_an_unknown_topic_is_rejected_by_name():
     with pytest.raises(ValueError, match="FetchReach has no topic 'tf'; allowed: /clock, joint"):
         topic(TASKS['FetchReach'], 'tf')
+
+
+# `latest_tick`
+
+
+def latched_messages():
+    task = TASKS['HandManipulateBlockFull']
+    return TickEncoder(task).encode(random_tick(task), latched=True)
+
+
+def test_messages_come_back_by_name_in_their_order():
+    messages = latched_messages()
+    parts = split_messages(join_messages(messages))
+    assert list(parts.items()) == [(spec.name, data) for spec, data in messages]
+    assert len(parts) > 8
+    assert split_messages(join_messages([])) == {}
+
+
+def test_bytes_that_are_no_tick_are_refused():
+    data = join_messages(latched_messages())
+    for size in range(0, len(data) - 1, 7):
+        with pytest.raises(ValueError, match=r'MultiArray|topic|left'):
+            split_messages(data[:size])
+    message = deserialize(LATEST_TICK.type_name, data)
+    last = message.layout.dim[-1]
+    for size, reason in ((last.size + 1, 'bytes left, not'), (last.size - 1, '1 bytes belong to')):
+        message.layout.dim[-1].size = size
+        with pytest.raises(ValueError, match=reason):
+            split_messages(serialize(LATEST_TICK.type_name, message))

@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -81,27 +80,6 @@ def lost_seconds(directory, factor, ticks):
     if not lost:
         return 0.0
     return min(lost[-1] - lost[0] + 0.04 / factor, len(lost) * 0.04 / factor)
-
-
-@pytest.fixture
-def mount():
-    """Makes small file systems; needs the right to mount."""
-    mounted = []
-
-    def make(*options):
-        path = Path(tempfile.mkdtemp(prefix='episodes_'))
-        command = ['mount', '-t', 'tmpfs', '-o', ','.join(options), 'tmpfs', path]
-        result = subprocess.run(command, capture_output=True, text=True)
-        if result.returncode:
-            path.rmdir()
-            pytest.skip(f'no right to mount a small disk: {result.stderr.strip()}')
-        mounted.append(path)
-        return path
-
-    yield make
-    for path in mounted:
-        subprocess.run(['umount', '-l', path], check=True)
-        path.rmdir()
 
 
 def error_lines(output):

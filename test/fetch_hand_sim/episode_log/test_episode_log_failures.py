@@ -29,6 +29,7 @@ from fetch_hand_sim.episode_log import (
     EpisodeWriter,
     LogSettings,
     files,
+    find_episodes,
     find_leftovers,
     load_episodes,
     read_episode,
@@ -81,13 +82,11 @@ def assert_one_line(error):
 
 
 @pytest.fixture(scope='module')
-def killed(tmp_path_factory, ros_environment_for_module):
+def killed(tmp_path_factory):
     """A directory with two finished episodes and one whose recorder was killed after 40 ticks."""
     directory = tmp_path_factory.mktemp('killed')
     command = [sys.executable, RECORDER_SCRIPT, directory, 'FetchReach', '2', '40']
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, env=ros_environment_for_module
-    )
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=script_environment())
     try:
         assert process.stdout.readline().strip() == str(directory)
         running = find_leftovers(directory)
@@ -96,11 +95,6 @@ def killed(tmp_path_factory, ros_environment_for_module):
         process.communicate()
     assert process.returncode == -signal.SIGKILL
     return directory, running
-
-
-@pytest.fixture(scope='module')
-def ros_environment_for_module():
-    return script_environment()
 
 
 def test_a_killed_recorder_leaves_finished_episodes_intact(killed):
@@ -383,22 +377,8 @@ def test_the_next_episode_is_logged_again(tmp_path, ticks):
     assert recorder.record(directory).name == 'FetchReach_000001_seed0'
 
 
-@pytest.fixture
-def small_disk():
-    """A file system of 2 MiB of its own; needs the right to mount."""
-    path = Path(tempfile.mkdtemp(prefix='episode_log_'))
-    mount = subprocess.run(
-        ['mount', '-t', 'tmpfs', '-o', 'size=2m', 'tmpfs', path], capture_output=True, text=True
-    )
-    if mount.returncode:
-        path.rmdir()
-        pytest.skip(f'no right to mount a small disk: {mount.stderr.strip()}')
-    yield path
-    subprocess.run(['umount', path], check=True)
-    path.rmdir()
-
-
-def test_a_full_disk(small_disk, recorder, ticks):
+def test_a_full_disk(mount, recorder, ticks):
+    small_disk = mount('size=2m')
     settings = LogSettings(minimum_free_bytes=1024 * 1024)
     directory = EpisodeDirectory(small_disk, settings)
     writer = directory.begin('FetchReach', 0, {})
@@ -439,24 +419,17 @@ def unprivileged():
         os.seteuid(0)
 
 
-def test_a_directory_without_permission_to_write():
+@pytest.mark.parametrize('mode', [0o555, 0o000])
+def test_a_directory_without_permission(mode):
     with tempfile.TemporaryDirectory() as directory:
-        os.chmod(directory, 0o555)
-        with unprivileged(), pytest.raises(EpisodeLogError, match='Permission denied') as caught:
-            EpisodeDirectory(Path(directory)).begin('FetchReach', 0, {})
-        assert_one_line(caught.value)
+        os.chmod(directory, mode)
+        calls = [lambda: EpisodeDirectory(Path(directory)).begin('FetchReach', 0, {})]
+        calls += [lambda: find_leftovers(Path(directory))] if not mode else []
+        for call in calls:
+            with unprivileged(), pytest.raises(EpisodeLogError, match='Permission denied') as error:
+                call()
+            assert_one_line(error.value)
         assert os.listdir(directory) == []
-
-
-def test_a_directory_without_permission_to_read():
-    with tempfile.TemporaryDirectory() as directory:
-        os.chmod(directory, 0o000)
-        with unprivileged(), pytest.raises(EpisodeLogError, match='Permission denied') as caught:
-            EpisodeDirectory(Path(directory)).begin('FetchReach', 0, {})
-        assert_one_line(caught.value)
-        with unprivileged(), pytest.raises(EpisodeLogError, match='Permission denied') as caught:
-            find_leftovers(Path(directory))
-        assert_one_line(caught.value)
 
 
 def test_a_directory_that_is_a_file(tmp_path):
@@ -489,24 +462,30 @@ def test_no_flipped_byte_goes_unnoticed(finished, tmp_path):
         assert_one_line(caught.value)
 
 
-def test_foreign_files_are_refused(tmp_path):
-    foreign, text, empty = tmp_path / 'foreign.mcap', tmp_path / 'text.mcap', tmp_path / 'empty'
+def test_files_that_are_no_episodes_are_rejected_by_all_readers(tmp_path):
+    foreign, text, folder = tmp_path / 'foreign.mcap', tmp_path / 'text.mcap', tmp_path / 'folder'
     with foreign.open('wb') as stream:
         writer = Writer(stream)
         writer.start(profile='ros2')
         writer.finish()
     text.write_text('no bag at all')
-    empty.mkdir()
+    folder.mkdir()
+    os.mkfifo(tmp_path / 'pipe.mcap')
+    (tmp_path / 'empty.mcap').touch()
     for path, reason in (
         (foreign, "no metadata record 'episode'"),
-        (text, 'truncated, damaged or no MCAP file'),
-        (empty, 'holds 0 MCAP files'),
+        (text, 'no MCAP file'),
+        (tmp_path / 'empty.mcap', 'no MCAP file'),
+        (tmp_path / 'pipe.mcap', 'no regular file'),
         (tmp_path / 'missing', 'No such file'),
+        (folder, 'holds 0 MCAP files'),
     ):
-        with pytest.raises(EpisodeReadError, match=reason) as caught:
-            read_episode(path)
-        assert str(path) in str(caught.value)
-        assert_one_line(caught.value)
+        for read in (read_episode, read_summary, load_episodes)[: 2 if path is folder else 3]:
+            with pytest.raises(EpisodeReadError, match=reason) as caught:
+                read(path)
+            assert str(path) in str(caught.value)
+            assert_one_line(caught.value)
+    assert find_episodes(tmp_path) == sorted(tmp_path.glob('*.mcap'))
 
 
 def test_writing_costs_little_of_a_tick(tmp_path, recorder, ticks):

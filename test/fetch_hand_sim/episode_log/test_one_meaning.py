@@ -251,6 +251,14 @@ def second_header(parts):
     return parts.file(record(Opcode.HEADER, text('') + text('')))
 
 
+def message_without_header(parts):
+    return parts.file(messages=[record(Opcode.MESSAGE, struct.pack('<H', 1))])
+
+
+def many_metadata_records(parts):
+    return parts.file(*(metadata(f'record {number}', {}) for number in range(1000)))
+
+
 AMBIGUOUS = {
     second_channel: "2 channels of topic '/reward'",
     redefined_channel: 'channel 1 is defined twice',
@@ -275,6 +283,8 @@ AMBIGUOUS = {
     other_encoding: "'json'",
     one_topic_in_a_namespace: 'several namespaces',
     second_header: 'header record before the end of the data',
+    message_without_header: 'a message is shorter than its header',
+    many_metadata_records: 'more than 16 metadata records',
 }
 
 

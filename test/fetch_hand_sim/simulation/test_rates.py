@@ -90,11 +90,6 @@ def test_a_pickled_simulation_keeps_its_timing():
     assert first['observation'].tobytes() == second['observation'].tobytes()
 
 
-def test_an_unknown_timing_is_refused():
-    with pytest.raises(ValueError, match="timing 'minutes' is unknown; allowed: seconds, ticks"):
-        Simulation('FetchReach', timing='minutes')
-
-
 def test_environments_are_truncated_after_the_seconds_of_an_episode():
     name = environment_id('FetchReach')
     for rate, ticks in ((25, 50), (250, 500)):
