@@ -1,7 +1,7 @@
 """Actor checkpoints: safetensors files with metadata, never pickle.
 
 The metadata must agree with the task and with the tensors before a network is built. A damaged or
-crafted file therefore costs no more memory than its size.
+crafted file never needs more memory than its size.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class Curve:
 def measure_run(job: Job, command: str) -> dict[str, Any]:
     """Measure a trained job on fresh episodes and return its line of `runs.jsonl`.
 
-    `steps_to_0.9` is None if no evaluation reached 0.9: the run is censored at its budget.
+    Without an evaluation of 0.9, `steps_to_0.9` is None: the run is censored at its budget.
     `parts` counts how often the run was started; a run with several parts differs from an
     uninterrupted one in its resets.
 
@@ -145,7 +145,7 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return medians and quartiles over the seeds of one variant: one row of `arms.csv`.
 
     Args:
-        runs: Stored runs with `area_in_time`. It is None if the baseline never ran on the same
+        runs: Stored runs with `area_in_time`. If it is None, the baseline has no run on the same
             machine. `timed` counts the other runs; only these have measures of time.
     """
     first, name_of_steps = runs[0], f'steps_to_{GOOD_SUCCESS}'

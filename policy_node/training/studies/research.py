@@ -20,14 +20,14 @@ _REACH = {
 }
 _EVALUATED = {'evaluate_every': 19_200, 'evaluation_episodes': 64}
 _PUSH = {'total_steps': 600_000, **_EVALUATED}
-# Long runs, which learn most of their time: with products in bfloat16 in half of it, and as
-# repeatable, on processors that have them.
+# Long runs learn most of their time. Products in bfloat16 halve it on processors that have them,
+# and stay repeatable.
 _LONG = {**_EVALUATED, 'precision': 'bfloat16'}
-# As studies found it: what `best` imagines since then is what one of them found.
+# Without imagined subgoals, which `best` has since one of these studies.
 _PICK = {**_LONG, 'total_steps': 800_000, 'subgoal_prior': 0.0}
-# From the shipped actor, which can push and has never gambled: from nothing an actor gambles by
-# accident before it has learnt to push. Random actions are rarer than in the recipe, or half of the
-# episodes would gamble.
+# From the shipped actor, which can push and has never gambled. An untrained actor would gamble by
+# accident before it learns to push. Random actions are rarer than in the recipe; otherwise half of
+# the episodes would gamble.
 _SKILLED_PUSH = {
     **_LONG,
     'total_steps': 320_000,
@@ -38,7 +38,7 @@ _SKILLED_PUSH = {
 _SLIDE = {**_LONG, 'total_steps': 2_000_000, 'evaluate_every': 64_000}
 HAND: dict[str, Any] = {**_LONG, 'total_steps': 1_000_000, 'evaluate_every': 64_000}
 _SCREENED = {'evaluate_every': 64_000, 'evaluation_episodes': 128}
-# Sparse, with settings that the dense recipe of the task does not have.
+# Sparse rewards; the recipe of the task has dense ones.
 _SPARSE_HAND_REACH = {
     **_LONG,
     'total_steps': 640_000,
@@ -47,7 +47,7 @@ _SPARSE_HAND_REACH = {
     'action_l2': 0.1,
     'gamma': 0.95,
 }
-# Every cycle's episodes about ten times; its own noise is the policy.
+# Learn from the episodes of a cycle about ten times; the policy has its own noise.
 _ON_POLICY = {
     'algorithm': 'ppo',
     'random_epsilon': 0.0,
@@ -61,9 +61,8 @@ _ON_POLICY = {
     'batch_size': 1024,
     'updates_per_cycle': 40,
 }
-# Pushes are rare: four times the episodes in a cycle, four times the goals, more noise, smaller
-# steps, the distance left as an input, a critic that does not take what is new for good, and an
-# actor that does not begin by leaving the table.
+# Pushes are rare. So there are four times the episodes and goals, more noise and smaller steps.
+# The remaining distance is an input. New states have low values; the first actions are small.
 _ON_POLICY_PUSH = {
     **_ON_POLICY,
     'num_envs': 256,
@@ -80,12 +79,12 @@ _ON_POLICY_PUSH = {
 
 
 def _arms(field: str, **labels: str) -> tuple[Arm, ...]:
-    """Arms named like the values of one field."""
+    """Return a variant for each value of one field."""
     return tuple(Arm(name, label, {field: name}) for name, label in labels.items())
 
 
 def _targets() -> tuple[Arm, ...]:
-    """Slow copies at four intervals, and none with three normalisations."""
+    """Return targets at four intervals, and no targets with three normalisations."""
     slow = [
         Arm(
             f'polyak{interval}',
@@ -107,7 +106,7 @@ def _targets() -> tuple[Arm, ...]:
 
 
 def _returns() -> tuple[Arm, ...]:
-    """One step, and longer returns with each correction."""
+    """Return one step, and longer returns with each correction."""
     longer = [
         Arm(
             f'{correction}{steps}',
@@ -121,7 +120,7 @@ def _returns() -> tuple[Arm, ...]:
 
 
 def _rates() -> tuple[Arm, ...]:
-    """As it is at 250, 125 and 25 Hz, and at 250 Hz what may help."""
+    """Return the recipe at 250, 125 and 25 Hz, and remedies at 250 Hz."""
     helps: dict[str, tuple[str, dict[str, Any]]] = {
         'discount': ('discount per 40 ms', {'discount': 'time'}),
         'noise': ('noise held for 40 ms', {'noise_seconds': 0.04}),
@@ -166,7 +165,7 @@ def _rates() -> tuple[Arm, ...]:
 
 
 def _ensembles() -> tuple[Arm, ...]:
-    """One critic, two or five with each way to be one, quantiles, and more updates per step."""
+    """Return one critic, several with each aggregation, quantiles, and more updates per step."""
     several = [
         Arm(
             f'{aggregate}{critics}',
@@ -193,7 +192,7 @@ def _ensembles() -> tuple[Arm, ...]:
         Arm(f'updates{times}', f'{times} times the updates', factors={'updates_per_cycle': times})
         for times in (2, 4)
     ]
-    # Targets move after so many updates: with more of these, they move faster too.
+    # With more updates, targets also move faster.
     slow = Arm(
         'updates4_slow',
         '4 times the updates, targets as slow as before',
@@ -285,7 +284,7 @@ STUDIES: dict[str, Study] = {
                     'and the success threshold, four times as wide',
                     {'condition': 'threshold', 'widest_threshold': 32.0},
                 ),
-                # Such thresholds without the input.
+                # The thresholds without the input.
                 Arm(
                     'graded',
                     'the goal alone, graded rewards',
@@ -353,7 +352,7 @@ STUDIES: dict[str, Study] = {
             'What keeps learning alive where actions are very frequent?',
             {
                 'FetchReach': {**_REACH, 'evaluation_episodes': 16},
-                # A replay that holds all ticks of a run at 250 Hz.
+                # A replay for all ticks of a run at 250 Hz.
                 'FetchPush': {**_LONG, 'total_steps': 600_000, 'replay_transitions': 6_000_000},
             },
             _rates(),

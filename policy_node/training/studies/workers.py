@@ -264,8 +264,8 @@ class Processes:
 
 def _work(job: Job, report: Path, command: str) -> None:
     """Run in a process of `Processes`."""
-    # A process group of its own, or Ctrl-C would arrive twice; the same session, because Linux
-    # shares out processors by session and `nice` would have no effect in another.
+    # In the group of the parent, Ctrl-C would arrive twice. The session stays the same: Linux
+    # schedules by session, so `nice` would have no effect in another.
     os.setpgid(0, 0)
     parent = multiprocessing.parent_process()
     if parent is not None and parent.pid is not None:
