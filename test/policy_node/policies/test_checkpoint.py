@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import pickle
 import time
@@ -114,9 +113,7 @@ def test_other_formats_and_versions_are_rejected(saved: Path) -> None:
     assert_refused(saved, 'something')
 
 
-def test_missing_or_broken_metadata_are_refused(saved: Path) -> None:
-    rewrite(saved, hidden_sizes='"wide"')
-    assert_refused(saved, 'unreadable metadata')
+def test_missing_metadata_are_rejected(saved: Path) -> None:
     tensors, metadata = read_tensors(saved)
     del metadata['seed']
     save_file(tensors, saved, metadata)
@@ -124,28 +121,22 @@ def test_missing_or_broken_metadata_are_refused(saved: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ('field', 'value', 'match'),
+    ('name', 'values', 'match'),
     [
-        ('goal_size', '7', 'has goal 7; FetchPush has 3'),
-        ('action_size', '20', 'has action 20; FetchPush has 4'),
-        ('observation_layout', '[["joints", 25]]', 'has observation .*joints.*; FetchPush has'),
-        ('task', '"FetchFly"', "was trained on unknown task 'FetchFly'"),
+        ('goal_normalizer.mean', np.zeros(5, np.float32), r'goal_normalizer.mean \(5,\)'),
+        ('goal_normalizer.mean', None, 'goal_normalizer.mean none'),
+        ('goal_normalizer.mean', np.zeros(3), 'float64'),
+        ('goal_normalizer.std', np.zeros(3, np.float32), 'goal_normalizer.std'),
+        ('extra', np.zeros(1, np.float32), r'extra \(1,\)'),
+        ('network.output.bias', np.float32([0, 0, np.nan, 0]), 'network.output.bias'),
+        ('network.output.bias', np.float32([np.inf, 0, 0, 0]), 'network.output.bias'),
     ],
 )
-def test_sizes_of_another_task_are_refused(saved: Path, field: str, value: str, match: str) -> None:
-    rewrite(saved, **{field: value})
+def test_invalid_tensors_are_rejected(
+    saved: Path, name: str, values: np.ndarray | None, match: str
+) -> None:
+    rewrite(saved, {name: values})
     assert_refused(saved, match)
-
-
-def test_tensors_that_do_not_fit_the_metadata_are_refused(saved: Path) -> None:
-    rewrite(saved, {'goal_normalizer.mean': np.zeros(5, np.float32)})
-    assert_refused(saved, r'goal_normalizer.mean \(5,\)')
-    rewrite(saved, {'goal_normalizer.mean': None})
-    assert_refused(saved, r'goal_normalizer.mean none')
-    rewrite(
-        saved, {'goal_normalizer.mean': np.zeros(3, np.float32), 'extra': np.zeros(1, np.float32)}
-    )
-    assert_refused(saved, r'extra \(1,\)')
 
 
 # Crafted files: each answers at once, in one line
@@ -166,6 +157,11 @@ def test_tensors_that_do_not_fit_the_metadata_are_refused(saved: Path) -> None:
         ('observation_layout', '[[["a"], 3]]', 'observation_layout'),
         ('observation_layout', '7', 'observation_layout'),
         ('goal_size', '"3"', "'3'"),
+        ('goal_size', '7', 'has goal 7'),
+        ('action_size', '20', 'has action 20'),
+        ('observation_layout', '[["joints", 25]]', 'has observation .*joints'),
+        ('task', '"FetchFly"', "'FetchFly'"),
+        ('hidden_sizes', '"wide"', 'wide'),
         ('layer_norm', '1', 'layer_norm: 1'),
         ('control_hz', 'NaN', 'control_hz'),
         ('control_hz', '1e999', 'control_hz'),
@@ -174,31 +170,13 @@ def test_tensors_that_do_not_fit_the_metadata_are_refused(saved: Path) -> None:
         ('goal_features', '"\\u001b[31m"', 'goal_features'),
     ],
 )
-def test_crafted_metadata_are_refused_at_once(
+def test_invalid_metadata_are_rejected_at_once(
     saved: Path, field: str, text: str, match: str
 ) -> None:
     rewrite(saved, **{field: text})
     began = time.process_time()
     assert_refused(saved, match)
     assert time.process_time() - began < 1.0
-
-
-@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
-def test_weights_that_are_not_finite_are_refused(saved: Path, value: float) -> None:
-    bias = np.zeros(4, np.float32)
-    bias[2] = value
-    rewrite(saved, {'network.output.bias': bias})
-    assert_refused(saved, r'network.output.bias')
-
-
-def test_a_normaliser_that_divides_by_zero_is_refused(saved: Path) -> None:
-    rewrite(saved, {'goal_normalizer.std': np.zeros(3, np.float32)})
-    assert_refused(saved, r'goal_normalizer.std')
-
-
-def test_weights_of_another_type_are_refused(saved: Path) -> None:
-    rewrite(saved, {'goal_normalizer.mean': np.zeros(3)})
-    assert_refused(saved, 'float64')
 
 
 def test_escape_characters_of_a_file_never_reach_the_terminal(saved: Path) -> None:
