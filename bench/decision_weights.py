@@ -22,8 +22,8 @@ from msgs_spec.arrays import Array
 from policy_node import load_actor
 from policy_node.policies.policy import Policy
 from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.rollouts import decision_weights, goals_in_hindsight
-from policy_node.training.learners.ppo import log_probability
+from policy_node.training.research.ppo import log_probability
+from policy_node.training.research.rollouts import decision_weights, goals_in_hindsight
 
 _TASK, _TICKS = 'FetchReach', (0, 4, 9, 24, 49)
 

@@ -21,15 +21,17 @@ from msgs_spec.tasks import task_spec
 from policy_node import load_policy
 from policy_node.policies.policy import RandomPolicy
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.collector import Collector
 from policy_node.training.experience.experience import Experience
-from policy_node.training.experience.gamble import is_over
-from policy_node.training.experience.sampling import make_sampler
-from policy_node.training.experience.simulations import make_simulation
 from policy_node.training.experience.transitions import Transitions
-from policy_node.training.learners.ddpg import DDPG
-from policy_node.training.learners.make_learner import make_learner
 from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.density_ratio import WeightedDDPG
+from policy_node.training.research.gamble import is_over
+from policy_node.training.research.registry import (
+    make_collector,
+    make_learner,
+    make_sampler,
+    make_simulation,
+)
 
 TASK = 'FetchPush'
 EPISODES = 600
@@ -53,7 +55,7 @@ def main() -> int:
     return 0
 
 
-def _learner_of(random: bool) -> tuple[DDPG, Experience]:
+def _learner_of(random: bool) -> tuple[WeightedDDPG, Experience]:
     """A learner with weights, and episodes with a gamble."""
     fields = {'goals': 'future=.4,actual=.4', 'importance': 'density', 'gamble': True}
     config = recipe_config(TASK, 'best', **fields, random_epsilon=0.1, num_envs=EPISODES)
@@ -62,11 +64,11 @@ def _learner_of(random: bool) -> tuple[DDPG, Experience]:
     sampler = make_sampler(config, simulation.metric)
     parts = config, spec, torch.device('cpu'), Workers(), sampler, generator
     learner, experience = make_learner(*parts)
-    assert isinstance(learner, DDPG)
+    assert isinstance(learner, WeightedDDPG)
     policy = RandomPolicy(spec.robot.action_size) if random else load_policy(TASK).policy
-    episodes, _ = Collector(simulation, list(range(EPISODES)), config).collect(policy)
+    episodes, _ = make_collector(simulation, list(range(EPISODES)), config).collect(policy)
     experience.replay.add(episodes)
-    experience.normalize(episodes, learner.actor, 0)
+    experience.normalize(episodes, learner.actor)
     return learner, experience
 
 

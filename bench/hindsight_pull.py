@@ -21,9 +21,8 @@ from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.arrays import Array
 from policy_node.policies.policy import RestingPolicy
-from policy_node.training.experience.outcomes import Outcomes
 from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.rollouts import advantages, goals_in_hindsight
+from policy_node.training.research.rollouts import Outcomes, advantages, goals_in_hindsight
 
 _TASK, _GAMMA = 'FetchPush', 0.98
 _SOURCES = {

@@ -8,7 +8,7 @@ import numpy as np
 
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.policy import Policy
-from policy_node.training.experience.exploration import ActionNoise
+from policy_node.training.experience.collector import ActionNoise
 from policy_node.training.experience.replay import Episodes
 
 

@@ -14,11 +14,13 @@ from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import DEFAULTS, changed, config_from_dict, to_flat
 from policy_node.training.evaluation.episodes import FIRST_SEED
 from policy_node.training.experience.hindsight import RewardFunction
-from policy_node.training.experience.sampling import make_sampler
-from policy_node.training.experience.simulations import make_simulation
 from policy_node.training.learners.actor_critic import ActorCritic
-from policy_node.training.learners.make_learner import make_learner
 from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.registry import (
+    make_learner,
+    make_sampler,
+    make_simulation,
+)
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.runs.training_state import load_state, read_state
 

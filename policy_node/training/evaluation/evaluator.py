@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
+from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Hierarchical
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, wilson_interval
-from policy_node.training.experience.subgoals import GuidedPolicy, Proposer
 
 # Seeds of evaluation episodes start here; those of training runs stay far below.
 EVALUATION_SEED = 1_000_000_000
@@ -22,13 +21,13 @@ class Evaluator:
     Training episodes therefore do not depend on whether there was an evaluation between them.
 
     Attributes:
-        proposer: High level that proposes subgoals, or None.
+        others: Policies to evaluate beside the actor, by column of `progress.csv`.
     """
 
     def __init__(self, simulation: Simulation, config: TrainConfig) -> None:
         self._simulation = simulation
         self._config = config
-        self.proposer: Proposer | None = None
+        self.others: dict[str, Policy] = {}
 
     def evaluate(self, actor: Actor, best_success: float) -> EpisodeOutcomes:
         """Runs the episodes, fewer once their success cannot reach `best_success` any more.
@@ -44,15 +43,14 @@ class Evaluator:
         episodes = self._config.run.evaluation_episodes
         return evaluate(self._simulation, actor, episodes, EVALUATION_SEED, hopeless)
 
-    def evaluate_guided(self, actor: Actor) -> EpisodeOutcomes | None:
-        """Runs the episodes with actor and high level as one; None without a high level."""
-        if self.proposer is None:
-            return None
-        config, simulation = self._config, self._simulation
-        ticks = simulation.spec.episode_ticks
-        assert isinstance(config.learner, Hierarchical)
-        both = GuidedPolicy(actor, self.proposer, config.learner.subgoal_every, ticks)
-        return evaluate(simulation, both, config.run.evaluation_episodes, EVALUATION_SEED)
+    def evaluate_others(self) -> dict[str, float]:
+        """Return the success rates of the other policies in all episodes, by column."""
+        episodes, rule = self._config.run.evaluation_episodes, self._config.collect.success_rule
+        found = {}
+        for column, policy in self.others.items():
+            outcomes = evaluate(self._simulation, policy, episodes, EVALUATION_SEED)
+            found[column] = success_rate(outcomes, rule)
+        return found
 
     def is_complete(self, outcomes: EpisodeOutcomes) -> bool:
         """Return whether an evaluation ran all its episodes, so that it may select the best."""

@@ -1,143 +1,169 @@
-"""Collects whole episodes from the batched simulation with exploration noise."""
+"""Collect whole episodes from the batched simulation, with exploration noise."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array32
 from policy_node.policies.policy import Policy, past_after
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Held, Hierarchical
-from policy_node.training.experience.exploration import ActionNoise, ParameterNoise
-from policy_node.training.experience.frame_skip import Holder
 from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.subgoals import Guide, Proposer, subgoal_columns
+
+Observations = Mapping[str, ArrayLike]
+
+
+class ActionNoise:
+    """Gaussian noise; with probability `epsilon` a uniformly random action instead.
+
+    Args:
+        generator: Random generator.
+        shape: (simulations, action size).
+        std: Standard deviation of the Gaussian noise.
+        epsilon: Probability of a random action.
+        ticks: Number of ticks for which noise and random actions hold.
+
+    Attributes:
+        share: Factor on `std` and `epsilon`, 0 ... 1.
+    """
+
+    def __init__(
+        self,
+        generator: np.random.Generator,
+        shape: tuple[int, int],
+        std: float,
+        epsilon: float,
+        ticks: int = 1,
+    ) -> None:
+        self._generator = generator
+        self._shape = shape
+        self._std, self._epsilon = std, epsilon
+        self._ticks = ticks
+        self.share = 1.0
+        self._uniform, self._noise = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self._replaced = np.zeros(shape[0], np.bool_)
+
+    def random(self, tick: int) -> Array32:
+        """Return uniformly random actions (N, action size) for a tick of an episode."""
+        if tick % self._ticks == 0:
+            self._uniform = self._generator.uniform(-1.0, 1.0, self._shape).astype(np.float32)
+        return self._uniform
+
+    def around(self, action: NDArray[Any], tick: int) -> Array32:
+        """Return actions (N, action size) with noise for a tick of an episode."""
+        share = self.share
+        if tick % self._ticks == 0:
+            self.random(tick)
+            self._noise = self._generator.standard_normal(self._shape, dtype=np.float32)
+            self._replaced = self._generator.random(self._shape[0]) < share * self._epsilon
+        noisy = action + np.float32(self._std * share) * self._noise
+        noisy = np.clip(noisy, -1.0, 1.0)
+        return np.where(self._replaced[:, None], self._uniform, noisy)
 
 
 class Collector:
     """Steps all simulations through one episode at a time.
 
-    It owns its generator and touches nothing of the learner, so it may run in another thread and
-    still gives the same episodes for the same policy.
+    It owns its random generator and uses nothing of the learner. So it can run in another thread
+    and returns the same episodes for the same policy.
 
     Args:
         simulation: The simulations.
         seeds: One seed per simulation for its resets; the first also seeds exploration.
-        config: Says how to explore. With `longest_hold` above 1 actions say how long they hold,
-            with `subgoal_every` above 0 subgoals follow them.
+        config: The configuration.
+        extra_actions: Values that follow the action in what the policy returns.
+        extra_columns: Values stored after the action that no policy returns.
 
     Attributes:
-        exploration: Share of `noise_std` and `random_epsilon` that is in force.
-        proposer: Who proposes subgoals; None lets the goal itself be pursued.
+        exploration: Factor on all noise, 0 ... 1.
     """
 
-    def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:
+    def __init__(
+        self,
+        simulation: Simulation,
+        seeds: list[int],
+        config: TrainConfig,
+        extra_actions: int = 0,
+        extra_columns: int = 0,
+    ) -> None:
         self.simulation = simulation
         self.exploration = 1.0
-        self.proposer: Proposer | None = None
-        generator = np.random.default_rng(seeds[0])
-        held, guided = config.find(Held), config.find(Hierarchical)
-        longest = held.longest_hold if held else 1
-        every = guided.subgoal_every if guided else 0
+        self._generator = np.random.default_rng(seeds[0])
         spec, noise = simulation.spec, config.learner.exploration
-        std, epsilon = noise.noise_std, noise.random_epsilon
-        size = spec.robot.action_size + (longest > 1)
-        self._past_size = config.network.past_actions * spec.robot.action_size
-        self._inputs = spec.observation_size + self._past_size
-        self._columns = size + subgoal_columns(every, spec.goal.size)
-        self._holder = Holder(longest) if longest > 1 else None
-        self._parameters = ParameterNoise(generator, std) if noise.parameter_noise else None
+        size = spec.robot.action_size
+        self._action_size = size
+        self._past_size = config.network.past_actions * size
+        self._columns = size + extra_actions + extra_columns
         self._noise = ActionNoise(
-            generator,
-            (simulation.num_envs, size),
-            0.0 if noise.parameter_noise else std,
-            epsilon,
+            self._generator,
+            (simulation.num_envs, size + extra_actions),
+            0.0 if noise.parameter_noise else noise.noise_std,
+            noise.random_epsilon,
             noise.noise_ticks(config.collect.control_hz),
         )
-        self._guide = Guide(every, generator, std, epsilon) if every else None
         self._seeds: list[int] | None = seeds
 
     def collect(self, policy: Policy, random: bool = False) -> tuple[Episodes, float]:
-        """Runs one episode in every simulation.
+        """Run one episode in every simulation.
 
         Args:
             policy: The policy to explore around.
             random: Act uniformly at random instead.
 
         Returns:
-            The episodes (those in which MuJoCo diverged left out) and the share of them that ended
-            in success, with the noise.
+            The episodes, without those whose simulation diverged, and their success rate.
         """
         simulation = self.simulation
         spec = simulation.spec
-        ticks, count = spec.episode_ticks, simulation.num_envs
+        ticks, count, inputs = spec.episode_ticks, simulation.num_envs, self._past_size
         observation = simulation.reset(seed=self._seeds)
         self._seeds = None
         episodes = Episodes(
-            observation=np.empty((count, ticks + 1, self._inputs), np.float32),
+            observation=np.empty((count, ticks + 1, spec.observation_size + inputs), np.float32),
             achieved_goal=np.empty((count, ticks + 1, spec.goal.size), np.float32),
             desired_goal=observation['desired_goal'].astype(np.float32),
             action=np.empty((count, ticks, self._columns), np.float32),
         )
         whole = np.ones(count, dtype=np.bool_)
         success = np.zeros(count, dtype=np.bool_)
-        acting = self._acting(policy)
+        acting = self._begin(policy)
         past = np.zeros((count, self._past_size), np.float32)
         for tick in range(ticks):
             episodes.observation[:, tick] = np.concatenate([observation['observation'], past], 1)
             episodes.achieved_goal[:, tick] = observation['achieved_goal']
             action = self._explore(acting, observation, past, random, tick)
-            if self._holder is not None:
-                action = self._holder.take(action, ticks - tick)
             episodes.action[:, tick] = action
-            result = simulation.step(action[:, : spec.robot.action_size])
+            result = simulation.step(action[:, : self._action_size])
             if self._past_size:
-                past = past_after(past, action[:, : spec.robot.action_size])
+                past = past_after(past, action[:, : self._action_size])
             observation, success = result.observation, result.success
             whole &= ~result.diverged
         episodes.observation[:, ticks] = np.concatenate([observation['observation'], past], 1)
         episodes.achieved_goal[:, ticks] = observation['achieved_goal']
         if not random:
-            self._adapt(policy, acting, episodes)
+            self._end(policy, acting, episodes)
         return episodes.select(whole), float(success[whole].mean()) if whole.any() else 0.0
 
-    def _acting(self, policy: Policy) -> Policy:
-        """What acts through the episodes: the policy, or copies of it with other weights."""
+    def _begin(self, policy: Policy) -> Policy:
+        """Prepare the noise; return the policy that acts in these episodes."""
         self._noise.share = self.exploration
-        if self._guide is not None:
-            self._guide.share = self.exploration
-        if self._parameters is None:
-            return policy
-        self._parameters.share = self.exploration
-        return self._parameters.perturb(policy)
+        return policy
 
-    def _adapt(self, policy: Policy, acting: Policy, episodes: Episodes) -> None:
-        if self._parameters is not None:
-            ticks = episodes.ticks
-            states = {
-                'observation': episodes.observation[:, :-1].reshape(len(episodes) * ticks, -1),
-                'desired_goal': np.repeat(episodes.desired_goal, ticks, axis=0),
-            }
-            self._parameters.adapt(policy, acting, states)
+    def _end(self, policy: Policy, acting: Policy, episodes: Episodes) -> None:
+        """Adapt the noise to the collected episodes."""
 
     def _explore(
-        self,
-        policy: Policy,
-        observation: Mapping[str, ArrayLike],
-        past: NDArray[np.float32],
-        random: bool,
-        tick: int,
-    ) -> NDArray[np.float32]:
-        guide = self._guide
-        if guide is not None:
-            observation = guide.lead(observation, None if random else self.proposer, tick)
+        self, policy: Policy, observation: Observations, past: Array32, random: bool, tick: int
+    ) -> Array32:
+        """Return the actions (N, columns) of a tick, with noise."""
         if random:
-            own = noisy = self._noise.random(tick)
-        else:
-            state = past if self._past_size else None
-            own = policy.predict(observation, state, deterministic=True)[0]
-            noisy = self._noise.around(own, tick)
-        return noisy if guide is None else guide.mark(noisy, own)
+            return self._noise.random(tick)
+        return self._noise.around(self._predict(policy, observation, past), tick)
+
+    def _predict(self, policy: Policy, observation: Observations, past: Array32) -> NDArray[Any]:
+        state = past if self._past_size else None
+        return policy.predict(observation, state, deterministic=True)[0]

@@ -1,12 +1,13 @@
-"""Hindsight experience replay: goals are exchanged when a batch is drawn, rewards recomputed.
+"""Hindsight experience replay: relabel goals when a batch is drawn; rewards are recomputed.
 
-Andrychowicz et al. 2017, "Hindsight Experience Replay" (arXiv 1707.01495); the futureactual
-mixture is from Pitis et al. 2020 (arXiv 2007.02832).
+Andrychowicz et al. 2017, "Hindsight Experience Replay" (arXiv 1707.01495). The `futureactual`
+mixture is from Pitis et al. 2020 (arXiv 2007.02832). A new source of goals is a function in
+`SOURCES` and a name in `configuration.config.SOURCES`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,23 +17,20 @@ from msgs_spec.arrays import Array32
 from msgs_spec.rotations import quaternion_conjugate, quaternion_multiply
 from msgs_spec.tasks import GoalKind
 from policy_node.training.configuration.config import STRATEGIES
-from policy_node.training.experience.subgoals import subgoals_of
 from policy_node.training.experience.transitions import Starts
 
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-
-OUTCOME = 'outcome'
+Source = Callable[[Starts, np.random.Generator], Array32]
+"""A function that returns goals (batch, goal_size) for transitions."""
 _NEAR_TICKS = 10
-# One more, where there is a high level: what it had the actor pursue.
-_SUBGOAL = 'subgoal'
 
 
 def goal_mixture(strategy: str, k: int = 4) -> dict[str, float]:
-    """Returns the probability of each goal source.
+    """Return the probability of each goal source.
 
     Args:
-        strategy: `none`, `final`, `future`, `episode`, `random`: k relabelled to 1 real goal;
-            `futureactual`: k/2 future, k/2 desired goals of other episodes, 1 real.
+        strategy: `none`, `final`, `future`, `episode`, `random`: k relabelled goals for each real
+            one. `futureactual`: k/2 future goals, k/2 desired goals of other episodes, 1 real goal.
         k: Relabelled goals for each real one.
 
     Raises:
@@ -57,19 +55,10 @@ def complete_mixture(goals: dict[str, float]) -> dict[str, float]:
     return {**goals, 'real': goals.get('real', 0.0) + left}
 
 
-def with_subgoals(mixture: dict[str, float]) -> dict[str, float]:
-    """The mixture with half of the goals that are not exchanged replaced by subgoals.
-
-    HAC would replace all, but its lowest level is never given the goal itself.
-    """
-    kept = mixture.get('real', 0.0) / 2
-    return mixture if kept == 0.0 else {**mixture, 'real': kept, _SUBGOAL: kept}
-
-
 def draw_sources(
     mixture: dict[str, float], count: int, generator: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Draws where goals come from: indices (count,) into the names of the mixture."""
+    """Draw goal sources: indices (count,) into the names of the mixture."""
     bounds = np.cumsum(list(mixture.values()))
     return np.searchsorted(bounds / bounds[-1], generator.random(count), side='right')
 
@@ -79,51 +68,72 @@ def goals_of(
     source: NDArray[np.intp],
     names: Sequence[str],
     generator: np.random.Generator,
+    sources: Mapping[str, Source] | None = None,
 ) -> Array32:
-    """Returns goals (batch, goal_size), each from the source `names[source]`.
+    """Return goals (batch, goal_size), each from the source `names[source]`.
 
-    A transition leads from state `tick` to state `tick + 1`; `future` takes any state from
-    `tick + 1` to the last, so the goal may be what this very step achieved.
+    Args:
+        starts: Where the transitions begin.
+        source: Index of the source of each goal, (batch,).
+        names: Names of the sources; `real` keeps the goal of the episode.
+        generator: Random generator.
+        sources: Functions by name, by default `SOURCES`.
     """
+    sources = SOURCES if sources is None else sources
     goal = starts.episodes.desired_goal.take(starts.row, axis=0)
     for index, name in enumerate(names):
         chosen = np.flatnonzero(source == index)
         if name != 'real' and len(chosen):
-            goal[chosen] = _goals(starts.select(chosen), name, generator)
+            goal[chosen] = sources[name](starts.select(chosen), generator)
     return goal
 
 
-def _goals(starts: Starts, source: str, generator: np.random.Generator) -> Array32:
-    episodes, count = starts.episodes, len(starts.row)
-    if source == 'actual':
-        return episodes.desired_goal.take(generator.integers(len(episodes), size=count), axis=0)
-    if source == _SUBGOAL:
-        return subgoals_of(starts)
-    if source == 'displaced':
-        return _displaced(starts, generator)
-    if source == 'random':
-        starts = replace(starts, row=generator.integers(len(episodes), size=count))
-    tick, last = starts.tick, starts.last
-    if source == 'future':
-        state = generator.integers(tick + 1, last + 1)
-    elif source == 'near':
-        state = generator.integers(tick + 1, np.minimum(tick + _NEAR_TICKS, last) + 1)
-    elif source == 'next':
-        state = tick + 1
-    elif source == 'final':
-        state = last
-    else:
-        state = generator.integers(1, last + 1)
-    achieved = flat(episodes.achieved_goal)
-    return achieved.take(starts.row * (episodes.ticks + 1) + state, axis=0)
+def _future(starts: Starts, generator: np.random.Generator) -> Array32:
+    """Achieved later in the episode. This includes the state that the transition leads to."""
+    return _achieved(starts, generator.integers(starts.tick + 1, starts.last + 1))
+
+
+def _near(starts: Starts, generator: np.random.Generator) -> Array32:
+    """Achieved within the next ten ticks."""
+    end = np.minimum(starts.tick + _NEAR_TICKS, starts.last)
+    return _achieved(starts, generator.integers(starts.tick + 1, end + 1))
+
+
+def _next(starts: Starts, generator: np.random.Generator) -> Array32:
+    """Achieved by the transition itself."""
+    del generator
+    return _achieved(starts, starts.tick + 1)
+
+
+def _final(starts: Starts, generator: np.random.Generator) -> Array32:
+    """Achieved at the end of the episode."""
+    del generator
+    return _achieved(starts, starts.last)
+
+
+def _episode(starts: Starts, generator: np.random.Generator) -> Array32:
+    """Achieved at any time in the episode."""
+    return _achieved(starts, generator.integers(1, starts.last + 1))
+
+
+def _random(starts: Starts, generator: np.random.Generator) -> Array32:
+    """Achieved at any time in any episode."""
+    row = generator.integers(len(starts.episodes), size=len(starts.row))
+    return _episode(replace(starts, row=row), generator)
+
+
+def _actual(starts: Starts, generator: np.random.Generator) -> Array32:
+    """Desired goals of any episodes."""
+    row = generator.integers(len(starts.episodes), size=len(starts.row))
+    return starts.episodes.desired_goal.take(row, axis=0)
 
 
 def _displaced(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Goals near the achieved ones, which know nothing of where the transitions lead.
+    """Goals near the achieved ones that do not depend on where the transitions lead.
 
-    A goal that is chosen because a step led there tells the critic that such steps lead there;
-    where contacts decide, that is half luck. Here the state's achieved goal moves as far as any
-    other did within ten ticks of its episode.
+    If a goal is chosen because a step led there, the critic learns that such steps lead there; with
+    contacts this is partly luck. Here the achieved goal moves as far as another one moved within
+    ten ticks of its episode.
     """
     episodes, count = starts.episodes, len(starts.row)
     row = generator.integers(len(episodes), size=count)
@@ -136,8 +146,20 @@ def _displaced(starts: Starts, generator: np.random.Generator) -> Array32:
     return displace(here, achieved[row, tick], achieved[row, tick + span])
 
 
+SOURCES: dict[str, Source] = {
+    'future': _future,
+    'near': _near,
+    'next': _next,
+    'final': _final,
+    'episode': _episode,
+    'random': _random,
+    'actual': _actual,
+    'displaced': _displaced,
+}
+
+
 def displace(here: Array32, before: Array32, after: Array32) -> Array32:
-    """Goals (batch, goal_size) as far from `here` as `after` is from `before`, poses turned too."""
+    """Return goals (batch, goal_size): `here` moved, and turned, as `before` moved to `after`."""
     moved: Array32 = here + (after - before)
     if moved.shape[-1] == GoalKind.POSE.size:
         turn = quaternion_multiply(after[:, 3:], quaternion_conjugate(before[:, 3:]))
@@ -145,6 +167,12 @@ def displace(here: Array32, before: Array32, after: Array32) -> Array32:
     return moved
 
 
+def _achieved(starts: Starts, state: NDArray[np.int64]) -> Array32:
+    """Return the goals (batch, goal_size) achieved in these states of the episodes."""
+    achieved = flat(starts.episodes.achieved_goal)
+    return achieved.take(starts.row * (starts.episodes.ticks + 1) + state, axis=0)
+
+
 def flat(values: Array32) -> Array32:
-    """Rows of all episodes, one after the other."""
+    """Return the rows of all episodes, one after the other."""
     return values.reshape(-1, values.shape[-1])

@@ -48,24 +48,28 @@ class Episodes:
         return Episodes(*(getattr(self, name)[rows] for name in Episodes.__slots__))
 
 
-class EpisodeReplay:
-    """Ring of the latest episodes in arrays allocated once.
+Weigh = Callable[[Episodes], NDArray[np.float64]]
+"""A function that returns the weight of each episode, (episodes,)."""
 
-    Its memory is touched as episodes arrive.
+
+class EpisodeReplay:
+    """Ring buffer of the newest episodes, in arrays allocated once.
+
+    Linux grants the memory as episodes arrive.
 
     Args:
-        capacity: Episodes.
+        capacity: Largest number of episodes.
         ticks: Steps per episode.
         observation_size: Length of an observation.
         goal_size: Length of a goal.
         action_size: Length of an action.
-        weigh: Weights of episodes for `draw`; None is 1 where the achieved goal has moved.
-        count_ticks: How many ticks of an episode, from its first, are worth drawing; None is
+        weigh: Weights of episodes for `draw`.
+        count_ticks: Number of ticks of each episode that may be drawn, from its first; None is
             all of them.
 
     Attributes:
-        capacity: How many episodes it holds at most.
-        last_added: How many came with the last `add`.
+        capacity: Largest number of episodes.
+        last_added: Number of episodes of the last `add`.
     """
 
     def __init__(
@@ -75,7 +79,7 @@ class EpisodeReplay:
         observation_size: int,
         goal_size: int,
         action_size: int,
-        weigh: Callable[[Episodes], NDArray[np.float64]] | None = None,
+        weigh: Weigh | None = None,
         count_ticks: Callable[[Episodes], NDArray[np.int64]] | None = None,
     ) -> None:
         if capacity < 1:
@@ -183,7 +187,8 @@ def draw_by(sums: Array, count: int, generator: np.random.Generator) -> NDArray[
     return np.asarray(np.minimum(row, last))
 
 
-def has_moved(episodes: Episodes) -> NDArray[np.bool_]:
-    """Whether the achieved goal of each episode has left its start, (episodes,)."""
+def has_moved(episodes: Episodes) -> NDArray[np.float64]:
+    """Return 1 where the achieved goal of an episode left its start, else 0, (episodes,)."""
     offset = episodes.achieved_goal - episodes.achieved_goal[:, :1]
-    return np.asarray(np.square(offset).sum(axis=-1).max(axis=-1) > MOVED_DISTANCE**2)
+    moved = np.square(offset).sum(axis=-1).max(axis=-1) > MOVED_DISTANCE**2
+    return np.asarray(moved, dtype=np.float64)

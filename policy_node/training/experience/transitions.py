@@ -51,8 +51,6 @@ class Transitions:
         action: (batch, action_size).
         reward: (batch,) for `goal`.
         discount: (batch,) of the value of the next state.
-        condition: (batch, 1) what values are conditioned on; None is nothing.
-        next_condition: (batch, 1) the same in the next state.
     """
 
     observation: Array32
@@ -61,5 +59,3 @@ class Transitions:
     action: Array32
     reward: Array32
     discount: Array32
-    condition: Array32 | None = None
-    next_condition: Array32 | None = None

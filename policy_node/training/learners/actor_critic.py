@@ -1,4 +1,4 @@
-"""What learners of an actor and a critic share: steps, averages, copies that act."""
+"""An actor, its critic and their optimizers: what all learners share."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from msgs_spec.tasks import task_spec
 from policy_node.policies.actor import MLP, Actor
+from policy_node.policies.goal_features import goal_features
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.experience.subgoals import Proposer
 from policy_node.training.experience.transitions import Transitions
 from policy_node.training.machine.distributed import Workers
-
-# What the names of its parts begin with, in a file that has both levels.
-HIGH_LEVEL = 'high_'
 
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """Scalars of one update, tensors on the device so that nothing waits for them."""
+    """Scalars of one update, as tensors on the device, so that no code waits for them."""
 
     critic: Tensor
     actor: Tensor
@@ -29,25 +29,23 @@ class Losses:
 
 
 class ActorCritic:
-    """What learns: an actor, its critic, and how both are improved.
-
-    Subclasses say how an update improves them.
+    """An actor, its critic and their optimizers; subclasses define an update.
 
     Args:
         actor: The actor.
-        critic: Whatever judges it.
+        critic: The critic.
         config: The configuration.
-        device: Where they live.
-        workers: With whom gradients are averaged.
+        device: Device of the networks.
+        workers: This worker among all; gradients are averaged over all.
 
     Attributes:
-        actor: Holds the normalisers of all inputs.
-        critic: Whatever judges it.
+        actor: Contains the normalizers of all inputs.
+        critic: The critic.
         average_actor: Network of the actor, averaged over cycles.
-        actor_parameters: Those that learn; normalisers do not.
-        critic_parameters: Those of the critic.
+        actor_parameters: Learned parameters of the actor, without normalizers.
+        critic_parameters: Learned parameters of the critic.
         updates: Updates so far.
-        critic_first: The actor learns after this many of them.
+        critic_first: Updates of the critic before the actor learns too.
     """
 
     def __init__(
@@ -76,13 +74,13 @@ class ActorCritic:
         return torch.optim.Adam(parameters, lr=self.config.learner.learning_rate, fused=True)
 
     def update(self, batch: Transitions) -> Losses:
-        """Improves the networks on a batch."""
+        """Improve the networks on a batch."""
         raise NotImplementedError
 
     def step(
         self, optimizer: torch.optim.Adam, loss: Tensor, parameters: Sequence[nn.Parameter]
     ) -> None:
-        """One step of an optimiser down the gradients of a loss, averaged over workers."""
+        """Take one optimizer step down the gradients of a loss, averaged over workers."""
         gradients = torch.autograd.grad(loss, parameters)
         self.workers.average_gradients(gradients)
         for parameter, gradient in zip(parameters, gradients, strict=True):
@@ -91,43 +89,42 @@ class ActorCritic:
 
     @torch.no_grad()
     def average(self) -> None:
-        """Moves the averaged actor towards the actor; the trainer calls it once per cycle."""
+        """Move the averaged actor towards the actor, once per cycle."""
         weight = 1.0 - self.config.learner.actor_average
         averaged: list[Tensor] = list(self.average_actor.parameters())
         torch._foreach_lerp_(averaged, [*self.actor_parameters], weight)
 
-    def acting_actor(self) -> Actor:
-        """A copy, on the CPU, of the actor that collects."""
+    def acting_policy(self) -> Policy:
+        """Return the policy that collects: a copy of the actor on the CPU."""
         return self.plain(self.actor.network)
 
-    def proposer(self, averaged: bool = False) -> Proposer | None:
-        """Who gives the actor subgoals; None where nobody does. Averaged as in evaluations."""
-        del averaged
-        return None
-
     def evaluation_actor(self) -> Actor:
-        """A copy, on the CPU, of the actor to evaluate: averaged weights, current normalisers."""
+        """Return the actor to evaluate, on the CPU: averaged weights, current normalizers."""
         return self.plain(self.average_actor)
 
+    def other_policies(self) -> dict[str, Policy]:
+        """Return policies to evaluate beside the actor, by column of `progress.csv`."""
+        return {}
+
     def plain(self, network: MLP) -> Actor:
-        """A copy of the actor, on the CPU, with this network."""
+        """Return a copy of the actor on the CPU with the weights of this network."""
         actor = copy.deepcopy(self.actor)
         actor.network.load_state_dict(network.state_dict())
         return actor.cpu().eval()
 
     def modules(self) -> dict[str, nn.Module]:
-        """What a training state holds, by name; an actor may come without what is no actor."""
+        """Return the modules that a training state contains, by name."""
         return {'actor': self.actor, 'critic': self.critic, 'average_actor': self.average_actor}
 
     def optimizers(self) -> dict[str, torch.optim.Adam]:
-        """The optimisers, by name, whose states a training state holds."""
+        """Return the optimizers whose states a training state contains, by name."""
         return {
             'actor_optimizer': self.actor_optimizer,
             'critic_optimizer': self.critic_optimizer,
         }
 
     def set_progress(self, progress: float) -> None:
-        """Sets the learning rate for a run of which the share `progress` is over."""
+        """Set the learning rate for this progress of the run, 0 ... 1."""
         config, share = self.config, min(max(progress, 0.0), 1.0)
         rate = config.learner.learning_rate * (
             1.0 - share * (1.0 - config.learner.final_learning_rate)
@@ -136,5 +133,24 @@ class ActorCritic:
             optimizer.param_groups[0]['lr'] = rate
 
     def tensor(self, values: object) -> Tensor:
-        """Values of a batch where the networks are."""
+        """Return values of a batch as a tensor on the device of the networks."""
         return torch.as_tensor(values).to(self.device, non_blocking=True)
+
+
+def network_shape(config: TrainConfig, extra_actions: int = 0) -> NetworkShape:
+    """Return the shape of actor and critic.
+
+    Args:
+        config: The configuration.
+        extra_actions: Outputs of the actor beside the action.
+    """
+    spec = task_spec(config.task)
+    return NetworkShape(
+        observation_size=spec.observation_size,
+        goal_size=spec.goal.size,
+        action_size=spec.robot.action_size + extra_actions,
+        hidden_sizes=config.network.hidden_sizes,
+        layer_norm=config.network.layer_norm,
+        goal_features=goal_features(config.network.goal_features, spec),
+        past_actions=config.network.past_actions,
+    )

@@ -21,10 +21,9 @@ from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
-from policy_node.training.experience.simulations import make_simulation
-from policy_node.training.learners.network_shape import network_shape
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.machine.host import split_threads
+from policy_node.training.research.registry import make_simulation, network_shape
 from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.run_folder import LATEST_FILE, NAME, RunFolder
 from policy_node.training.runs.run_log import RunLog, progress_row

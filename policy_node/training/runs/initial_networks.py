@@ -13,21 +13,21 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import to_flat
 from policy_node.training.configuration.groups import Critics
-from policy_node.training.experience.conditions import acting_input
-from policy_node.training.experience.widening import (
+from policy_node.training.learners.actor_critic import ActorCritic
+from policy_node.training.learners.widening import (
     can_widen,
     first_weights,
     widened,
     with_inputs,
 )
-from policy_node.training.learners.actor_critic import ActorCritic
-from policy_node.training.learners.critics import (
+from policy_node.training.research.registry import (
     Ensemble,
+    acting_input,
     count_critics,
     critic_tensors,
     is_ensemble,
+    network_shape,
 )
-from policy_node.training.learners.network_shape import network_shape
 from policy_node.training.runs.training_state import part_of
 
 # Updates of the critics alone if a random critic starts beside a trained actor: the gradient of an

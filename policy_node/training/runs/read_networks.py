@@ -17,8 +17,7 @@ from policy_node.policies.shipped import actor_path
 from policy_node.training.configuration.config import TrainConfig, unusual_networks
 from policy_node.training.configuration.flat import config_from_dict, to_flat
 from policy_node.training.configuration.groups import Critics
-from policy_node.training.experience.conditions import acting_input, without_input
-from policy_node.training.learners.network_shape import network_shape
+from policy_node.training.research.registry import acting_input, network_shape, without_input
 from policy_node.training.runs.initial_networks import VALUED_BY, InitialNetworks, described
 from policy_node.training.runs.run_folder import STATE_FILE, companion_file
 from policy_node.training.runs.training_state import part_of, read_state

@@ -18,10 +18,10 @@ from policy_node.training.configuration.flat import to_flat
 from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
 from policy_node.training.evaluation.evaluator import success_rate
 from policy_node.training.experience.experience import Experience
-from policy_node.training.experience.frame_skip import plain_actor
 from policy_node.training.experience.replay_file import save_replay
 from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.registry import plain_actor
 from policy_node.training.runs.training_state import Counters, is_finite, save_state
 
 NAME = 'fetch_hand_sim train'

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +15,23 @@ import torch
 
 from node_runtime.command_line import complain
 from policy_node.policies.actor import Actor
+from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Critics, Ppo
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
-from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator, success_rate
-from policy_node.training.experience.collector import Collector
+from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.replay_file import load_replay
-from policy_node.training.experience.sampling import make_sampler
-from policy_node.training.experience.simulations import make_simulation
 from policy_node.training.learners.actor_critic import Losses
-from policy_node.training.learners.make_learner import make_learner
 from policy_node.training.machine.devices import choose_device
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.machine.host import split_threads
+from policy_node.training.research.registry import (
+    make_collector,
+    make_learner,
+    make_sampler,
+    make_simulation,
+)
 from policy_node.training.runs.finite_checks import (
     require_finite_episodes,
     require_finite_losses,
@@ -60,7 +63,7 @@ class Collected:
     train_success: float
     evaluation: EpisodeOutcomes | None = None
     evaluated: Actor | None = None
-    guided: EpisodeOutcomes | None = None
+    others: dict[str, float] = field(default_factory=dict)
 
 
 class Trainer:
@@ -121,7 +124,7 @@ class Trainer:
         # Evaluation uses larger seeds, so its episodes are never trained on.
         resets = collector_seeds.generate_state(self.simulation.num_envs) >> 2
         starts = [int(seed) % EVALUATION_SEED for seed in resets]
-        self.collector = Collector(self.simulation, starts, config)
+        self.collector = make_collector(self.simulation, starts, config)
         return np.random.default_rng(sampler_seed)
 
     def _build_learner(self) -> None:
@@ -284,12 +287,11 @@ class Trainer:
             if self.workers.any(bool(self._stop_reason)):
                 return None
 
-    def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Actor, bool, Actor | None]:
-        """Prepare collection; return actor, whether actions are random, and actor to evaluate."""
+    def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Policy, bool, Actor | None]:
+        """Prepare collection; return policy, whether actions are random, and actor to evaluate."""
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
-        self.collector.proposer = self.learner.proposer()
-        actor, evaluated = self.learner.acting_actor(), None
+        actor, evaluated = self.learner.acting_policy(), None
         if may_evaluate and counters.updates > 0 and steps >= counters.next_evaluation:
             counters.next_evaluation = steps + self.config.run.evaluate_every
             evaluated = self._actor_to_evaluate()
@@ -299,18 +301,18 @@ class Trainer:
         """Return the actor to evaluate; None on all workers but the first."""
         if not self.workers.is_first:
             return None
-        self._evaluator.proposer = self.learner.proposer(averaged=True)
+        self._evaluator.others = self.learner.other_policies()
         return self.learner.evaluation_actor()
 
-    def _collect(self, actor: Actor, random: bool, evaluated: Actor | None) -> Collected:
-        return self._evaluate(Collected(*self.collector.collect(actor, random)), evaluated)
+    def _collect(self, policy: Policy, random: bool, evaluated: Actor | None) -> Collected:
+        return self._evaluate(Collected(*self.collector.collect(policy, random)), evaluated)
 
     def _evaluate(self, collected: Collected, actor: Actor | None) -> Collected:
         if actor is None:
             return collected
         outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
-        guided = self._evaluator.evaluate_guided(actor)
-        return replace(collected, evaluation=outcomes, evaluated=actor, guided=guided)
+        others = self._evaluator.evaluate_others()
+        return replace(collected, evaluation=outcomes, evaluated=actor, others=others)
 
     def _exploration(self) -> float:
         """Return the present share of exploration noise and random actions."""
@@ -399,9 +401,7 @@ class Trainer:
         steps = self.simulation.num_envs * self.spec.episode_ticks * workers
         row['steps_per_second'] = steps / seconds
         row['samples_per_second'] = len(losses) * self.experience.batch_size * workers / seconds
-        if collected.guided is not None:
-            row['eval_guided'] = success_rate(collected.guided, rule)
-        return row
+        return row | collected.others
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from policy_node.policies.files import (
     write_file,
 )
 from policy_node.training.experience.statistics import RunningStatistics
-from policy_node.training.learners.actor_critic import HIGH_LEVEL, ActorCritic
+from policy_node.training.learners.actor_critic import ActorCritic
 
 FORMAT = 'fetch_hand_training'
 FORMAT_VERSION = 1
@@ -253,7 +253,7 @@ def load_networks(
         RuntimeError: If sizes do not fit.
         KeyError: If a part is incomplete.
     """
-    tensors = _with_copies(tensors)
+    tensors = _with_copies(tensors, learner)
     for part, module in learner.modules().items():
         if part_of(tensors, part) or 'actor' in part:
             module.load_state_dict(part_of(tensors, part))
@@ -271,7 +271,7 @@ def part_of(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
     }
 
 
-def _with_copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def _with_copies(tensors: dict[str, Tensor], learner: ActorCritic) -> dict[str, Tensor]:
     """Add targets and average if they are missing, as copies of actor and critic."""
     sources = {
         'target_actor': 'actor.network',
@@ -279,11 +279,11 @@ def _with_copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         'target_critic': 'critic',
     }
     copies = {
-        f'{level}{part}.{name}': value
-        for level in ('', HIGH_LEVEL)
-        for part, source in sources.items()
-        if not part_of(tensors, f'{level}{part}')
-        for name, value in part_of(tensors, f'{level}{source}').items()
+        f'{part}.{name}': value
+        for part in learner.modules()
+        for ending, source in sources.items()
+        if part.endswith(ending) and not part_of(tensors, part)
+        for name, value in part_of(tensors, part.removesuffix(ending) + source).items()
     }
     return tensors | copies
 

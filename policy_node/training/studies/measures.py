@@ -15,8 +15,8 @@ from policy_node.policies import checkpoint
 from policy_node.training.configuration.recipes import ticks_of_40_ms
 from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate
 from policy_node.training.evaluation.evaluator import success_rate
-from policy_node.training.experience.simulations import make_simulation
 from policy_node.training.machine.host import processor
+from policy_node.training.research.registry import make_simulation
 from policy_node.training.runs.run_folder import COMMAND_FILE, LATEST_FILE, PROGRESS_FILE
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.studies.study import Job, to_settings

@@ -10,10 +10,11 @@ import torch
 
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.configuration.flat import from_flat
+from policy_node.training.configuration.groups import Critics
 from policy_node.training.experience.transitions import Transitions
-from policy_node.training.learners.critics import AGGREGATES, Ensemble, make_critic
 from policy_node.training.learners.ddpg import DDPG
+from policy_node.training.research.critics import AGGREGATES, Ensemble, critic_loss
+from policy_node.training.research.judged import Judge
 from support.learners import SHAPE, make_learner
 
 torch.set_num_threads(1)
@@ -29,7 +30,7 @@ def test_what_an_ensemble_says_as_one(name: str, expected: list[float]) -> None:
 
 
 def test_members_start_differently_and_have_an_axis_of_their_own() -> None:
-    critic = make_critic(from_flat({'task': 'FetchReach'}, critics=5), 3 - SHAPE.action_size, SHAPE)
+    critic = critic_loss(Critics(critics=5)).make(3 - SHAPE.action_size, SHAPE)
     assert isinstance(critic, Ensemble)
     values = critic(torch.randn(7, 2), torch.randn(7, 1))
     assert values.shape == (5, 7) and len(set(values[:, 0].tolist())) == 5
@@ -93,8 +94,9 @@ def test_disagreement_is_where_nothing_was_learnt() -> None:
     known = chain_batch(64, generator)
     elsewhere = np.full((64, 1), -40.0, np.float32)
     unknown = replace(known, goal=elsewhere)
-    assert learner.disagreement(known).mean() < 0.05 < learner.disagreement(unknown).mean()
-    assert learner.surprise(known).mean() < 0.05 and learner.surprise(known).shape == (64,)
+    judge = Judge(learner)
+    assert judge.uncertain(known).mean() < 0.05 < judge.uncertain(unknown).mean()
+    assert judge.bellman(known).mean() < 0.05 and judge.bellman(known).shape == (64,)
 
 
 # Of observation, goal and action: what the critics are, and what their slow copies are.
@@ -153,7 +155,7 @@ def test_surprise_is_how_far_a_value_is_from_its_clipped_target() -> None:
     value, following = values_by_hand(1, batch)
     target = np.clip(batch.reward + batch.discount * following[0], -2.0, 0.0)
     assert (target == -2.0).any() and (target == 0.0).any(), 'both limits matter'
-    found = linear_learner(1).surprise(batch)
+    found = Judge(linear_learner(1)).bellman(batch)
     np.testing.assert_allclose(found, np.abs(value[0] - target), atol=1e-5)
 
 
@@ -161,14 +163,14 @@ def test_surprise_of_several_critics_is_their_mean() -> None:
     batch = scattered()
     value, following = values_by_hand(3, batch)
     target = np.clip(batch.reward + batch.discount * following.min(axis=0), -2.0, 0.0)
-    found = linear_learner(3, aggregate='min').surprise(batch)
+    found = Judge(linear_learner(3, aggregate='min')).bellman(batch)
     np.testing.assert_allclose(found, np.abs(value - target).mean(axis=0), atol=1e-5)
 
 
 def test_disagreement_is_the_deviation_of_values_over_critics() -> None:
     batch = scattered()
     value, _ = values_by_hand(3, batch)
-    found = linear_learner(3).disagreement(batch)
+    found = Judge(linear_learner(3)).uncertain(batch)
     np.testing.assert_allclose(found, value.std(axis=0, ddof=1), atol=1e-5)
 
 
@@ -180,7 +182,7 @@ def test_all_critics_learn_from_one_target_of_what_their_copies_say(aggregate: s
     low, middle, high = np.sort(following, axis=0)
     together = {'mean': (low + middle + high) / 3, 'min': low, 'truncated': (low + middle) / 2}
     target = np.clip(batch.reward + batch.discount * together[aggregate], -2.0, 0.0)
-    known = learner._known(batch)
+    known = learner.tensors(batch)
     with torch.no_grad():
         found = learner.targets(known.reward, known.discount, known.next_features)
     np.testing.assert_allclose(found, target, atol=1e-5)

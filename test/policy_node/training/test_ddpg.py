@@ -15,6 +15,8 @@ from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.machine.devices import choose_device, uses_bfloat16
 from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.judged import Judge
+from policy_node.training.research.registry import make_ddpg
 
 # Small products: more threads only wait for each other, and on a busy machine for very long.
 torch.set_num_threads(1)
@@ -28,7 +30,7 @@ def make_learner(layer_norm: bool = False, **changes: object) -> DDPG:
     options = {'precision': 'float32', 'gamma': 0.9, **changes}
     config = recipe_config('FetchReach', 'paper', **options)
     shape = NetworkShape(3, 2, 2, (32, 32), layer_norm)
-    return DDPG(shape, config, CPU, Workers())
+    return make_ddpg(shape, config, CPU, Workers())
 
 
 def make_batch(count: int = 64, seed: int = 0, reward: float | None = None) -> Transitions:
@@ -176,13 +178,13 @@ def test_action_l2_keeps_actions_small() -> None:
 
 def test_the_averaged_actor_keeps_its_share_and_takes_the_rest_of_the_actor() -> None:
     config = recipe_config('FetchReach', 'paper', actor_average=0.9)
-    learner = DDPG(NetworkShape(3, 2, 4, (8,)), config, CPU, Workers())
+    learner = make_ddpg(NetworkShape(3, 2, 4, (8,)), config, CPU, Workers())
     old = copy.deepcopy(learner.actor.network.state_dict())
     with torch.no_grad():
         torch._foreach_add_(learner.actor_parameters, 1.0)
     for share in (0.1, 0.19):
         learner.average()
-        evaluated, acting = learner.evaluation_actor(), learner.acting_actor()
+        evaluated, acting = learner.evaluation_actor(), learner.acting_policy()
         for name, value in old.items():
             torch.testing.assert_close(evaluated.network.state_dict()[name], value + share)
             torch.testing.assert_close(acting.network.state_dict()[name], value + 1.0)
@@ -196,13 +198,13 @@ def test_learning_rates_fall_linearly_to_the_share_asked_for() -> None:
             assert optimizer.param_groups[0]['lr'] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize('name', ['surprise', 'disagreement'])
+@pytest.mark.parametrize('name', ['bellman', 'uncertain'])
 def test_goals_are_judged_as_precisely_as_values_are_learnt(name: str) -> None:
     """In bfloat16, where updates are: it takes half of the time."""
     judged = {}
     for precision in ('float32', 'bfloat16'):
         learner = make_learner(precision=precision, critics=2)
-        judged[precision] = getattr(learner, name)(make_batch())
+        judged[precision] = getattr(Judge(learner), name)(make_batch())
         assert judged[precision].dtype == np.float32
     assert not np.array_equal(judged['float32'], judged['bfloat16'])
     np.testing.assert_allclose(judged['bfloat16'], judged['float32'], atol=0.02)

@@ -7,16 +7,11 @@ import pytest
 
 from msgs_spec.tasks import GoalKind, task_spec
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.episode_weights import (
-    episode_energy,
-    episode_weights,
-    ticks_until_dropped,
-)
-from policy_node.training.experience.experience import Experience
+from policy_node.training.experience.experience import Experience, ticks_until_dropped
 from policy_node.training.experience.replay import EpisodeReplay, Episodes
-from policy_node.training.experience.returns import StepCounter
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.episode_weights import episode_energy, episode_weights
 
 PEN = task_spec('HandManipulatePenRotate')
 TICKS = 10
@@ -130,7 +125,9 @@ def test_a_batch_follows_the_configuration() -> None:
     episodes = pen_episodes(achieved)
     reward = lambda achieved, desired: -np.ones(len(achieved))  # noqa: E731
     sampler = TransitionSampler(reward, config.learner.gamma)
-    experience = Experience(config, PEN, Workers(), sampler, np.random.default_rng(0))
+    weigh = episode_weights('energy', PEN, 25.0)
+    parts = sampler, np.random.default_rng(0)
+    experience = Experience(config, PEN, Workers(), *parts, weigh=weigh)
     experience.replay.add(episodes)
     batch = experience.batch(env_steps=0)
     assert set(batch.observation[:, -7]) == {1.0}
@@ -160,8 +157,7 @@ def test_a_drop_that_is_lost_is_worth_minus_one_for_ever(n_step: int, source: st
     achieved[..., 1] = np.arange(PEN.episode_ticks + 1)
     episodes = pen_episodes(achieved)
     episodes.desired_goal[:, 1] = 5.0
-    steps = StepCounter(n_step) if n_step > 1 else None
-    sampler = TransitionSampler(sideways, 0.9, steps, lost_value=config.lowest_value)
+    sampler = TransitionSampler(sideways, 0.9, n_step, lost_value=config.lowest_value)
     valid = ticks_until_dropped(PEN, 1)(episodes)
     row = np.repeat([0, 1], 4000)
     generator = np.random.default_rng(0)

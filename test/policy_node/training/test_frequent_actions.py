@@ -12,21 +12,24 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import from_flat, to_flat
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.collector import Collector
-from policy_node.training.experience.exploration import ParameterNoise
-from policy_node.training.experience.frame_skip import (
-    HeldSteps,
+from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.transitions import Starts, Transitions
+from policy_node.training.learners.ddpg import DDPG
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.frequent_actions import (
     Holder,
+    HoldingSampler,
+    ParameterNoise,
     length_of,
     plain_actor,
     ticks_of,
 )
-from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.sampling import TransitionSampler, make_sampler
-from policy_node.training.experience.transitions import Starts, Transitions
-from policy_node.training.learners.ddpg import DDPG
-from policy_node.training.learners.network_shape import network_shape
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.registry import (
+    make_collector,
+    make_ddpg,
+    make_sampler,
+    network_shape,
+)
 
 torch.set_num_threads(1)
 
@@ -42,7 +45,7 @@ def config_at(control_hz: float, **changes: object) -> TrainConfig:
 
 def learner_of(config: TrainConfig) -> DDPG:
     torch.manual_seed(0)
-    return DDPG(NetworkShape(2, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
+    return make_ddpg(NetworkShape(2, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
 
 
 def batch_of(config: TrainConfig, action: np.ndarray, reward: np.ndarray) -> Transitions:
@@ -103,7 +106,7 @@ def collected(**options: object) -> Episodes:
     actor = Actor(NetworkShape(10, 3, 4, (8,))).eval()
     torch.nn.init.zeros_(actor.network.output.weight)
     config = config_at(250.0, noise_std=0.2, random_epsilon=0.0, **options)
-    return Collector(simulation, list(range(8)), config).collect(actor)[0]
+    return make_collector(simulation, list(range(8)), config).collect(actor)[0]
 
 
 def test_noise_that_holds_for_40_ms_moves_the_gripper_as_at_25_hz() -> None:
@@ -180,7 +183,7 @@ def test_what_is_recorded_of_held_actions_is_what_was_executed(noise: float) -> 
         {'task': 'FetchReach'}, longest_hold=6, noise_std=noise, random_epsilon=noise
     )
     simulation, again = (Simulation('FetchReach', num_envs=2, num_threads=1) for _ in range(2))
-    collector = Collector(simulation, [3, 4], config)
+    collector = make_collector(simulation, [3, 4], config)
     lengths: set[int] = set()
     for seeds in ([3, 4], None):
         episodes, _ = collector.collect(actor)
@@ -229,9 +232,7 @@ def test_held_actions_are_learnt_from_with_as_many_steps() -> None:
         desired_goal=np.full((1, 1), 6.0, np.float32),
         action=action[None],
     )
-    sampler = TransitionSampler(
-        lambda a, g: -(a != g).any(axis=-1).astype(float), 0.5, HeldSteps(4)
-    )
+    sampler = HoldingSampler(lambda a, g: -(a != g).any(axis=-1).astype(float), 0.5, most_steps=4)
     row = np.zeros(200, np.int64)
     batch = sampler.sample(episodes, row, {'real': 1.0}, np.random.default_rng(0))
     tick = batch.observation[:, 0].astype(int)
@@ -243,13 +244,13 @@ def test_held_actions_are_learnt_from_with_as_many_steps() -> None:
         expected = -sum(0.5**step * missed for step, missed in enumerate(reached))
         assert batch.reward[index] == pytest.approx(expected)
     starts = Starts(episodes, row[:1], np.array([5]), valid_ticks=np.array([6]))
-    assert HeldSteps(4).count(starts, row[:1], np.random.default_rng(0), None) == [1]
+    assert sampler.steps(starts, starts.episodes.desired_goal, np.random.default_rng(0)) == [1]
 
 
 def test_an_actor_with_lengths_is_saved_as_one_that_decides_at_every_tick() -> None:
     config = config_at(250.0, longest_hold=10)
-    learner = DDPG(network_shape(config), config, torch.device('cpu'), Workers())
-    collecting, plain = learner.acting_actor(), learner.evaluation_actor()
+    learner = make_ddpg(network_shape(config), config, torch.device('cpu'), Workers())
+    collecting, plain = learner.acting_policy(), learner.evaluation_actor()
     state = {'observation': np.ones((3, 10)), 'desired_goal': np.ones((3, 3))}
     assert collecting.predict(state)[0].shape == (3, 5)
     np.testing.assert_allclose(

@@ -11,12 +11,12 @@ import torch
 
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.episode_weights import episode_weights
-from policy_node.training.experience.gamble import GambleSimulation
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners.ddpg import DDPG
+from policy_node.training.research.episode_weights import episode_weights
+from policy_node.training.research.gamble import GambleSimulation
 from support.learners import make_learner
 
 torch.set_num_threads(1)
@@ -171,8 +171,6 @@ def test_weighted_gambles_succeed_as_often_as_gambles_do() -> None:
     lucky = gamble & np.concatenate([batch.reward == 0.0 for batch in batches])
     assert lucky.sum() / gamble.sum() == pytest.approx(0.6, abs=0.03)
     assert weight[lucky].sum() / weight[gamble].sum() == pytest.approx(0.2, abs=0.03)
-    with pytest.raises(ValueError, match='only importance density has weights'):
-        gambler('none', {'future': 1.0})[0].importance(draw())
 
 
 def test_a_landing_is_no_motion_of_the_robot() -> None:

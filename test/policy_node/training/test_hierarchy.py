@@ -14,14 +14,17 @@ from policy_node.policies.files import read_tensors
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.collector import Collector
-from policy_node.training.experience.hindsight_actions import HierarchicalExperience, SubgoalSampler
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.experience.subgoals import GuidedPolicy
 from policy_node.training.experience.transitions import Transitions
-from policy_node.training.learners.hierarchy import HierarchicalDDPG
 from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.hierarchy import (
+    LOW_SOURCES,
+    HierarchicalDDPG,
+    HierarchicalExperience,
+    SubgoalSampler,
+)
+from policy_node.training.research.subgoals import GuidedCollector, GuidedPolicy, subgoal_columns
 from policy_node.training.runs.run_log import RunLog, read_progress
 from policy_node.training.runs.trainer import Trainer
 
@@ -127,13 +130,14 @@ def test_both_levels_learn_a_line_together() -> None:
     changes |= {'noise_std': 0.2, 'random_epsilon': 0.3}
     config, line, generator = configured(**changes), Line(32), make_generator()
     learner = HierarchicalDDPG(SHAPE, config, CPU, Workers())
-    sampler = TransitionSampler(reached, config.tick_gamma)
-    experience = HierarchicalExperience(config, line.spec, Workers(), sampler, generator)
-    collector = Collector(line, [0] * 32, config)
+    sampler = TransitionSampler(reached, config.tick_gamma, sources=LOW_SOURCES)
+    parts = Workers(), sampler, generator, subgoal_columns(1)
+    experience = HierarchicalExperience(config, line.spec, *parts)
+    collector = GuidedCollector(line, [0] * 32, config, 10)
     for cycle in range(20):
-        collector.proposer = learner.proposer()
-        assert (collector.proposer is None) == (cycle == 0), 'nothing is proposed at first'
-        episodes, _ = collector.collect(learner.acting_actor())
+        policy = learner.acting_policy()
+        assert isinstance(policy, GuidedPolicy) == (cycle > 0), 'no proposals before learning'
+        episodes, _ = collector.collect(policy)
         experience.replay.add(episodes)
         experience.normalize(episodes, learner.actor)
         for _ in range(40):
@@ -141,7 +145,7 @@ def test_both_levels_learn_a_line_together() -> None:
             learner.update(batch)
         learner.average()
     assert batch.action.shape == batch.high.action.shape == (256, 1)
-    alone, proposer = learner.acting_actor(), learner.proposer(averaged=True)
+    alone, proposer = learner.evaluation_actor(), learner.high.proposer(averaged=True)
     for policy in (alone, GuidedPolicy(alone, proposer, 10, 30)):
         observation = line.reset()
         for _ in range(30):

@@ -18,8 +18,8 @@ from policy_node.policies.loading import load_actor
 from policy_node.policies.shipped import shipped_actors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.learners.network_shape import network_shape
 from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.registry import network_shape
 from policy_node.training.runs.initial_networks import CRITIC_FIRST
 from policy_node.training.runs.read_networks import mean_of, read_initial_networks, steps_behind
 from policy_node.training.runs.run_folder import STATE_FILE

@@ -9,13 +9,13 @@ import pytest
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import task_spec
-from policy_node.training.experience.conditions import Threshold
-from policy_node.training.experience.frame_skip import HeldSteps, length_of
-from policy_node.training.experience.hindsight_actions import SubgoalSampler
 from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.returns import StepCounter
 from policy_node.training.experience.sampling import TransitionSampler
 from policy_node.training.experience.transitions import Transitions
+from policy_node.training.research.conditions import ConditionedSampler, Threshold
+from policy_node.training.research.frequent_actions import HoldingSampler, length_of
+from policy_node.training.research.hierarchy import SubgoalSampler
+from policy_node.training.research.judged import CuttingSampler, LambdaSampler
 
 COUNT, TICKS, LONGEST = 5, 9, 4
 ROW = np.tile(np.arange(COUNT), 80)
@@ -76,35 +76,34 @@ class Judge:
 
 @pytest.mark.parametrize('valid', [None, VALID], ids=['all', 'valid'])
 @pytest.mark.parametrize(
-    'counter',
+    'sampler',
     [
-        StepCounter(2),
-        StepCounter(5),
-        StepCounter(100),
-        StepCounter(5, 'lambda', trace=0.6),
-        StepCounter(5, 'cut', cut_distance=0.8),
-        HeldSteps(LONGEST),
+        TransitionSampler(nearness, 0.9, 2),
+        TransitionSampler(nearness, 0.9, 5),
+        TransitionSampler(nearness, 0.9, 100),
+        LambdaSampler(nearness, 0.9, 5, trace=0.6),
+        CuttingSampler(nearness, 0.9, 5, cut_distance=0.8, judge=Judge()),
+        HoldingSampler(nearness, 0.9, LONGEST),
     ],
     ids=['2', '5', '100', 'lambda', 'cut', 'held'],
 )
 def test_every_step_of_a_return_is_rewarded_for_the_goal_of_its_row(
-    episodes: Episodes, counter: StepCounter | HeldSteps, valid: np.ndarray | None
+    episodes: Episodes, sampler: TransitionSampler, valid: np.ndarray | None
 ) -> None:
-    sampler = TransitionSampler(nearness, 0.9, counter)
     generator = np.random.default_rng(2)
-    batch = sampler.sample(episodes, ROW, MIXTURE, generator, valid, Judge())
+    batch = sampler.sample(episodes, ROW, MIXTURE, generator, valid)
     assert_rewards_are_those_of_a_loop(episodes, batch, lambda _, *goals: nearness(*goals))
     tick, steps = batch.observation[:, 1].astype(int), steps_of(batch)
     left = (TICKS if valid is None else valid[ROW]) - tick
     assert (steps >= 1).all() and (steps <= left).all() and len(set(steps)) > 1
-    if isinstance(counter, HeldSteps):
+    if isinstance(sampler, HoldingSampler):
         np.testing.assert_array_equal(steps, np.minimum(HELD[ROW, tick], left))
-    elif counter.correction == 'none':
-        np.testing.assert_array_equal(steps, np.minimum(counter.most, left))
+    elif type(sampler) is TransitionSampler:
+        np.testing.assert_array_equal(steps, np.minimum(sampler.most_steps, left))
 
 
 def test_a_reward_for_a_share_of_time_is_that_share_at_every_step(episodes: Episodes) -> None:
-    sampler = TransitionSampler(nearness, 0.9, StepCounter(3), reward_scale=0.1)
+    sampler = TransitionSampler(nearness, 0.9, 3, reward_scale=0.1)
     batch = sampler.sample(episodes, ROW, MIXTURE, np.random.default_rng(2))
     assert_rewards_are_those_of_a_loop(episodes, batch, lambda _, *goals: 0.1 * nearness(*goals))
 
@@ -126,7 +125,7 @@ def test_the_threshold_of_a_row_holds_at_every_step_of_its_return(
 ) -> None:
     spec = task_spec('FetchReach')
     condition = Threshold(GoalMetric(spec), widest=4.0)
-    sampler = TransitionSampler(nearness, 0.9, StepCounter(n_step), condition)
+    sampler = ConditionedSampler(nearness, 0.9, n_step, condition=condition)
     batch = sampler.sample(episodes, ROW, MIXTURE, np.random.default_rng(2))
     near = spec.distance_threshold * np.exp(batch.condition[:, 0].astype(float))
     assert 0.02 < near.min() < 0.03 and 0.15 < near.max() < 0.2

@@ -17,9 +17,15 @@ from msgs_spec.tasks import task_spec
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.outcomes import Outcomes
 from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.rollouts import (
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.experience.transitions import Transitions
+from policy_node.training.machine.distributed import Workers
+from policy_node.training.research import ppo
+from policy_node.training.research.ppo import PPO, log_probability
+from policy_node.training.research.registry import make_learner
+from policy_node.training.research.rollouts import (
+    Outcomes,
     RolloutMaker,
     Rollouts,
     RolloutTransitions,
@@ -27,12 +33,6 @@ from policy_node.training.experience.rollouts import (
     decision_weights,
     goals_in_hindsight,
 )
-from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.experience.transitions import Transitions
-from policy_node.training.learners import ppo
-from policy_node.training.learners.make_learner import make_learner
-from policy_node.training.learners.ppo import PPO, log_probability
-from policy_node.training.machine.distributed import Workers
 from policy_node.training.runs.trainer import Trainer
 
 torch.set_num_threads(1)
@@ -180,7 +180,7 @@ def one_step(
 ) -> Episodes:
     """An episode of one tick per goal, from where all is 0 to what the action achieves."""
     observation, goal = np.zeros((len(goal), 2, 1), np.float32), goal.astype(np.float32)
-    mean, _ = learner.acting_actor().predict(
+    mean, _ = learner.acting_policy().predict(
         {'observation': observation[:, 0], 'desired_goal': goal}
     )
     action = (mean + 0.3 * generator.standard_normal((len(goal), 1))).clip(-1, 1)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from policy_node.training.experience.transitions import Transitions
-from policy_node.training.learners.quantiles import levels, pooled, quantile_costs
+from policy_node.training.research.critics import levels, quantile_costs, sample_of
 from support.learners import make_learner
 
 torch.set_num_threads(1)
@@ -30,7 +30,7 @@ def test_the_quantiles_of_a_lottery_are_learnt_and_its_mean_with_them() -> None:
     one = torch.ones(1, 1)
     features = learner.actor.features(one, one)
     with torch.no_grad():
-        found = learner.critic.quantiles(features, one)[0]
+        found = learner.critic.outputs(features, one)[0]
         value = learner.critic(features, one)
     # Of five equal shares the lowest is -9 in half of its width: its middle lies on the step.
     torch.testing.assert_close(found[1:], torch.full((4,), -1.0), atol=0.3, rtol=0.0)
@@ -40,9 +40,9 @@ def test_the_quantiles_of_a_lottery_are_learnt_and_its_mean_with_them() -> None:
 
 def test_truncated_targets_leave_out_the_highest_of_all_critics_together() -> None:
     quantiles = torch.arange(50.0).reshape(2, 1, 25)
-    assert pooled(quantiles, truncated=False).shape == (1, 50)
-    assert pooled(quantiles, truncated=True)[0].tolist() == list(range(46))
-    assert pooled(torch.tensor([[3.0, 1.0, 2.0]]), truncated=True).tolist() == [[1.0, 2.0]]
+    assert sample_of(quantiles, truncated=False).shape == (1, 50)
+    assert sample_of(quantiles, truncated=True)[0].tolist() == list(range(46))
+    assert sample_of(torch.tensor([[3.0, 1.0, 2.0]]), truncated=True).tolist() == [[1.0, 2.0]]
 
 
 def test_the_cost_is_least_at_the_quantiles_of_the_target() -> None:

@@ -15,13 +15,13 @@ from msgs_spec.tasks import TaskSpec, task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.conditions import Horizon, Threshold, fold
 from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.returns import StepCounter
-from policy_node.training.experience.sampling import TransitionSampler, make_sampler
-from policy_node.training.experience.transitions import Transitions
-from policy_node.training.learners.ddpg import DDPG
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.experience.transitions import Starts, Transitions
 from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.conditions import ConditionedSampler, Horizon, Threshold, fold
+from policy_node.training.research.judged import ChoosingSampler, CuttingSampler, LambdaSampler
+from policy_node.training.research.registry import make_ddpg, make_sampler
 
 torch.set_num_threads(1)
 
@@ -46,7 +46,7 @@ def draw(
 ) -> Transitions:
     generator = np.random.default_rng(0)
     row = generator.integers(len(episodes), size=4_000)
-    return sampler.sample(episodes, row, mixture, generator, judge=Judge())
+    return sampler.sample(episodes, row, mixture, generator)
 
 
 class Judge:
@@ -55,15 +55,15 @@ class Judge:
     def act(self, observation: Array32, goal: Array32) -> Array32:
         return np.where(observation < 3.0, 1.0, -1.0).astype(np.float32)
 
-    def surprise(self, batch: Transitions) -> Array32:
+    def bellman(self, batch: Transitions) -> Array32:
         return -np.abs(batch.goal[:, 0] - 5.0)
 
-    def disagreement(self, batch: Transitions) -> Array32:
+    def uncertain(self, batch: Transitions) -> Array32:
         return batch.goal[:, 0]
 
 
 def test_a_return_sums_discounted_rewards_and_bootstraps_where_it_ends(walk: Episodes) -> None:
-    batch = draw(walk, TransitionSampler(at_goal, 0.5, StepCounter(3)))
+    batch = draw(walk, TransitionSampler(at_goal, 0.5, 3))
     first, last = batch.observation[:, 0], batch.next_observation[:, 0]
     assert (last == np.minimum(first + 3, TICKS)).all(), 'never beyond the episode'
     np.testing.assert_allclose(batch.discount, 0.5 ** (last - first))
@@ -73,14 +73,21 @@ def test_a_return_sums_discounted_rewards_and_bootstraps_where_it_ends(walk: Epi
 
 
 def test_several_steps_of_one_are_one_step(walk: Episodes) -> None:
-    plain = draw(walk, TransitionSampler(at_goal, 0.9))
-    counted = draw(walk, TransitionSampler(at_goal, 0.9, StepCounter(1)))
+    sampler = TransitionSampler(at_goal, 0.9)
+    starts = Starts(walk, np.repeat(np.arange(20), TICKS), np.tile(np.arange(TICKS), 20))
+    goal = walk.desired_goal[starts.row]
+    plain = sampler.single(starts, goal)
+
+    def reward(achieved: Array32, chosen: np.ndarray) -> np.ndarray:
+        return at_goal(achieved, goal[chosen])
+
+    counted = sampler.several(starts, np.ones_like(starts.row), goal, reward)
     for name in ('observation', 'next_observation', 'action', 'reward', 'discount', 'goal'):
         np.testing.assert_array_equal(getattr(plain, name), getattr(counted, name))
 
 
 def test_lambda_draws_the_weights_of_the_lambda_return(walk: Episodes) -> None:
-    batch = draw(walk, TransitionSampler(at_goal, 0.5, StepCounter(3, 'lambda', trace=0.6)))
+    batch = draw(walk, LambdaSampler(at_goal, 0.5, 3, trace=0.6))
     start = batch.observation[:, 0] == 0.0
     steps = (batch.next_observation - batch.observation)[start, 0]
     shares = [float((steps == n).mean()) for n in (1, 2, 3)]
@@ -88,7 +95,7 @@ def test_lambda_draws_the_weights_of_the_lambda_return(walk: Episodes) -> None:
 
 
 def test_cut_ends_a_return_before_an_action_the_actor_would_not_take(walk: Episodes) -> None:
-    batch = draw(walk, TransitionSampler(at_goal, 0.5, StepCounter(5, 'cut')))
+    batch = draw(walk, CuttingSampler(at_goal, 0.5, 5, judge=Judge()))
     first, last = batch.observation[:, 0], batch.next_observation[:, 0]
     # At places 3 and up it would turn round; the first action of a return is always its own.
     expected = np.where(first < 3, 3, first + 1)
@@ -101,7 +108,7 @@ def test_the_best_of_several_future_goals_is_taken(
 ) -> None:
     mixture = {'future': 0.5, 'real': 0.5}
     any_goal = draw(walk, TransitionSampler(at_goal, 0.9), mixture)
-    batch = draw(walk, TransitionSampler(at_goal, 0.9, goal_choice=choice), mixture)
+    batch = draw(walk, ChoosingSampler(at_goal, 0.9, choice=choice, judge=Judge()), mixture)
     early = batch.observation[:, 0] == 0.0
     wanted = 5.0 if choice == 'bellman' else 6.0
     share = (batch.goal[early, 0] == wanted).mean()
@@ -149,9 +156,9 @@ def test_hindsight_is_rewarded_by_a_metric_of_its_own_as_steps_are() -> None:
     [
         (
             {'reward_grades': '.5,1,2'},
-            'reward_grades .* is a reward in the place of that of ',
+            'reward_grades .* would replace the reward of ',
         ),
-        ({'condition': 'threshold'}, 'condition threshold has a reward in the place of that of '),
+        ({'condition': 'threshold'}, 'condition threshold would replace the reward of '),
     ],
 )
 def test_no_other_reward_takes_the_place_of_a_tasks_own(change: dict[str, str], line: str) -> None:
@@ -169,8 +176,8 @@ def test_values_count_the_rewards_of_the_steps_left(walk: Episodes) -> None:
     torch.manual_seed(0)
     options = {'precision': 'float32', 'gamma': 0.5, 'learning_rate': 3e-3, 'target': 'none'}
     config = recipe_config('FetchReach', 'paper', condition='horizon', **options)
-    learner = DDPG(NetworkShape(1, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
-    sampler = TransitionSampler(past_goal, 0.5, condition=Horizon(3, past_goal))
+    learner = make_ddpg(NetworkShape(1, 1, 1, (32, 32)), config, torch.device('cpu'), Workers())
+    sampler = ConditionedSampler(past_goal, 0.5, condition=Horizon(3, past_goal))
     generator = np.random.default_rng(0)
     # Whatever is done, a walk goes on: values of all actions are alike.
     walk.action[:] = generator.uniform(-1, 1, walk.action.shape)
@@ -190,8 +197,8 @@ def test_values_count_the_rewards_of_the_steps_left(walk: Episodes) -> None:
 def test_an_actor_at_one_condition_is_an_actor_like_any_other() -> None:
     options = {'precision': 'float32', 'condition': 'threshold'}
     config = recipe_config('FetchReach', 'paper', **options)
-    learner = DDPG(NetworkShape(4, 3, 2, (16, 16)), config, torch.device('cpu'), Workers())
-    plain = learner.acting_actor()
+    learner = make_ddpg(NetworkShape(4, 3, 2, (16, 16)), config, torch.device('cpu'), Workers())
+    plain = learner.acting_policy()
     assert isinstance(plain, Actor) and plain.network.hidden[0].in_features == 7
     observation, goal = np.random.default_rng(0).normal(size=(2, 5, 4))[0], np.ones((5, 3))
     action, _ = plain.predict({'observation': observation, 'desired_goal': goal})

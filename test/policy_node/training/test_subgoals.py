@@ -12,12 +12,11 @@ from fetch_hand_sim.simulation import Simulation
 from policy_node.policies.actor import Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.flat import from_flat
-from policy_node.training.experience.collector import Collector
-from policy_node.training.experience.hindsight import with_subgoals
-from policy_node.training.experience.hindsight_actions import SubgoalSampler
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.experience.subgoals import TESTED, GuidedPolicy, Proposer
+from policy_node.training.research.hierarchy import SubgoalSampler, with_subgoals
+from policy_node.training.research.registry import make_collector
+from policy_node.training.research.subgoals import TESTED, GuidedPolicy, Proposer
 from policy_node.training.train_her import main
 
 torch.set_num_threads(1)
@@ -42,9 +41,9 @@ def collected(proposer: Proposer | None, noise: tuple[float, float], actor: obje
     config = from_flat(
         {'task': 'FetchReach'}, noise_std=std, random_epsilon=epsilon, subgoal_every=20
     )
-    collector = Collector(simulation, list(range(80)), config)
-    collector.proposer = proposer
-    return collector.collect(actor)[0]
+    collector = make_collector(simulation, list(range(80)), config)
+    policy = GuidedPolicy(actor, proposer, 20, 50) if proposer else actor
+    return collector.collect(policy)[0]
 
 
 def test_subgoals_hold_follow_the_action_and_are_tested_without_noise() -> None:

@@ -20,9 +20,8 @@ from policy_node.policies.files import read_tensors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
-from policy_node.training.experience.graded import GradedReward
 from policy_node.training.experience.logged_episodes import read_experience
-from policy_node.training.experience.sampling import scale_thresholds
+from policy_node.training.experience.rewards import GradedReward, scale_thresholds
 from policy_node.training.generate_episodes import main as generate_episodes
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.runs.finite_checks import TrainingError

@@ -7,7 +7,7 @@ import torch
 
 from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.training.experience.widening import can_widen, widened
+from policy_node.training.learners.widening import can_widen, widened
 
 BEFORE, AFTER = (6, 4, 5), (12, 4, 15)
 

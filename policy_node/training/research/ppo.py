@@ -18,10 +18,10 @@ from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Ppo
-from policy_node.training.experience.rollouts import RolloutTransitions
 from policy_node.training.experience.transitions import Transitions
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
 from policy_node.training.machine.distributed import Workers
+from policy_node.training.research.rollouts import RolloutTransitions
 
 # How far an update may move the probability of an action (the paper's value).
 CLIP = 0.2

@@ -1,10 +1,10 @@
-"""Subgoals while episodes are collected: what proposes them, how long they hold, which are tested.
+"""Subgoals while episodes are collected: proposed, held for some ticks, sometimes tested.
 
-A high level says every so many ticks which goal the actor is to pursue until the next proposal.
-Now and then a proposal is tested (Levy et al. 2019, "Learning Multi-Level Hierarchies with
-Hindsight", arXiv 1712.00948): the actor then goes for it without noise, so that missing it says
-something about the proposal. What was pursued and whether it was a test follow the action in the
-arrays of an episode, tick by tick, so that replay, checkpoints and workers need not know of them.
+Every few ticks a high level proposes the goal that the actor pursues until the next proposal. Some
+proposals are tested (Levy et al. 2019, "Learning Multi-Level Hierarchies with Hindsight", arXiv
+1712.00948): the actor pursues them without noise, so a miss means that the proposal was too hard.
+The subgoal and whether it is a test are stored after the action of each tick, so that replay,
+checkpoints and workers need no code for them.
 """
 
 from __future__ import annotations
@@ -16,9 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array32
 from policy_node.policies.network_shape import NORMALIZED_CLIP
 from policy_node.policies.policy import Policy
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.experience.collector import Collector, Observations
 from policy_node.training.experience.transitions import Starts
 
 # Share of proposals that are tested (Levy et al. 2019).
@@ -26,33 +29,34 @@ TESTED = 0.3
 _SMALLEST_NORM = 1e-6
 
 
-def subgoal_columns(every: int, goal_size: int) -> int:
-    """Numbers that follow an action: the subgoal and whether it is tested; none without one."""
-    return goal_size + 1 if every else 0
+def subgoal_columns(goal_size: int) -> int:
+    """Return the number of values after an action: the subgoal and whether it is tested."""
+    return goal_size + 1
 
 
-def subgoals_of(starts: Starts) -> Array32:
-    """The subgoals (batch, goal_size) that were pursued where transitions begin."""
+def subgoals_of(starts: Starts, generator: np.random.Generator | None = None) -> Array32:
+    """Return the subgoals (batch, goal_size) that were pursued where transitions begin."""
+    del generator
     episodes = starts.episodes
     size = episodes.desired_goal.shape[-1]
     return episodes.action[starts.row, starts.tick, -size - 1 : -1]
 
 
 def tested(starts: Starts) -> NDArray[np.bool_]:
-    """Whether these were tests, (batch,)."""
+    """Return whether transitions begin in a test, (batch,)."""
     return np.asarray(starts.episodes.action[starts.row, starts.tick, -1] > 0.5)
 
 
 @dataclass(frozen=True, slots=True)
 class Proposer:
-    """A high level as it acts: its actions are goals.
+    """A high level that proposes goals.
 
     Attributes:
         policy: Its actions (N, goal size) in [-1, 1] span `NORMALIZED_CLIP` standard deviations of
-            goals, beyond which no network tells them apart.
+            goals, the range that the networks can distinguish.
         mean: Mean of goals, (goal size,).
-        std: Their standard deviation, likewise.
-        is_pose: Whether they end with a unit quaternion.
+        std: Standard deviation of goals, (goal size,).
+        is_pose: Whether goals end with a unit quaternion.
     """
 
     policy: Policy
@@ -61,12 +65,12 @@ class Proposer:
     is_pose: bool
 
     def normalized(self, observation: Mapping[str, ArrayLike]) -> Array32:
-        """What it proposes, (N, goal size), in standard deviations from the mean."""
+        """Return proposals (N, goal size) in standard deviations from the mean."""
         share: Array32 = self.policy.predict(observation, deterministic=True)[0]
         return NORMALIZED_CLIP * share
 
     def goals(self, normalized: Array32) -> Array32:
-        """Goals (N, goal size), float32, that lie so many standard deviations from the mean."""
+        """Return goals (N, goal size), float32, from standard deviations from the mean."""
         goals = self.mean + self.std * normalized
         if self.is_pose:
             norm = np.linalg.norm(goals[:, 3:], axis=-1, keepdims=True)
@@ -75,16 +79,17 @@ class Proposer:
 
 
 class Guide:
-    """Gives the actor subgoals instead of goals, in each of several simulations.
+    """Replaces the goals of the actor by subgoals, in each of several simulations.
 
     Args:
         every: Ticks for which a subgoal holds.
-        generator: Source of all randomness.
+        generator: Random generator.
         noise_std: Standard deviation of the noise on proposals, in standard deviations of goals.
-        random_epsilon: Probability of a goal drawn like those seen instead, each number by itself.
+        random_epsilon: Probability of a random goal instead, each value normal with the mean and
+            deviation of goals.
 
     Attributes:
-        share: Share of `noise_std` and `random_epsilon` that is in force.
+        share: Factor on `noise_std` and `random_epsilon`, 0 ... 1.
     """
 
     def __init__(
@@ -100,12 +105,12 @@ class Guide:
     def lead(
         self, observation: Mapping[str, ArrayLike], proposer: Proposer | None, tick: int
     ) -> dict[str, ArrayLike]:
-        """Returns the observation with the subgoal as the desired goal.
+        """Return the observation with the subgoal as the desired goal.
 
         Args:
             observation: Of all simulations.
-            proposer: Who proposes; without one the goal itself is pursued, and nothing tested.
-            tick: Of the episode.
+            proposer: The high level; with None the subgoal is the goal itself and never tested.
+            tick: Tick of the episode.
         """
         if tick % self._every == 0:
             self._subgoal = np.asarray(observation['desired_goal'], np.float32)
@@ -124,11 +129,11 @@ class Guide:
         self._tested = generator.random(count) < TESTED
 
     def mark(self, noisy: Array32, own: Array32) -> Array32:
-        """Actions (N, action size + goal size + 1): of tests the actor's own; then the subgoals.
+        """Return actions (N, action size + goal size + 1); tests use the actor's own action.
 
         Args:
             noisy: Actions with noise, (N, action size).
-            own: Those of the actor.
+            own: Actions of the actor, (N, action size).
         """
         tests = self._tested[:, None]
         taken = np.where(tests, own, noisy)
@@ -136,17 +141,21 @@ class Guide:
 
 
 class GuidedPolicy:
-    """Actor and high level as one policy, without noise, for whole episodes from their first tick.
+    """Actor and high level as one policy without noise, for whole episodes.
 
     Args:
-        actor: Pursues what is proposed.
-        proposer: Proposes.
+        actor: Pursues the subgoals.
+        proposer: Proposes subgoals.
         every: Ticks for which a subgoal holds.
         ticks: Steps of an episode.
+
+    Attributes:
+        actor: Pursues the subgoals.
+        proposer: Proposes subgoals.
     """
 
     def __init__(self, actor: Policy, proposer: Proposer, every: int, ticks: int) -> None:
-        self._actor, self._proposer = actor, proposer
+        self.actor, self.proposer = actor, proposer
         self._every, self._ticks = every, ticks
         self._tick = 0
         self._subgoal: Array32 = np.zeros((0, 0), np.float32)
@@ -159,10 +168,49 @@ class GuidedPolicy:
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], Any]:
         """Return actions (N, action size) for observations (N, ...) of the next tick."""
+        del episode_start
+        proposer = self.proposer
         if self._tick % self._every == 0:
-            proposer = self._proposer
             self._subgoal = proposer.goals(proposer.normalized(observation))
         self._tick = (self._tick + 1) % self._ticks
         pursued = {**observation, 'desired_goal': self._subgoal}
-        del episode_start
-        return self._actor.predict(pursued, state, deterministic=deterministic)
+        return self.actor.predict(pursued, state, deterministic=deterministic)
+
+
+class GuidedCollector(Collector):
+    """Collects with a `GuidedPolicy`; its proposals get noise, too.
+
+    Args:
+        simulation: The simulations.
+        seeds: As for `Collector`.
+        config: The configuration.
+        every: Ticks for which a subgoal holds.
+    """
+
+    def __init__(
+        self, simulation: Simulation, seeds: list[int], config: TrainConfig, every: int
+    ) -> None:
+        columns = subgoal_columns(simulation.spec.goal.size)
+        super().__init__(simulation, seeds, config, extra_columns=columns)
+        noise = config.learner.exploration
+        self._guide = Guide(every, self._generator, noise.noise_std, noise.random_epsilon)
+        self._proposer: Proposer | None = None
+
+    def _begin(self, policy: Policy) -> Policy:
+        self._guide.share = self.exploration
+        self._proposer = None
+        if isinstance(policy, GuidedPolicy):
+            self._proposer = policy.proposer
+            policy = policy.actor
+        return super()._begin(policy)
+
+    def _explore(
+        self, policy: Policy, observation: Observations, past: Array32, random: bool, tick: int
+    ) -> Array32:
+        observation = self._guide.lead(observation, None if random else self._proposer, tick)
+        if random:
+            own = noisy = self._noise.random(tick)
+        else:
+            own = self._predict(policy, observation, past)
+            noisy = self._noise.around(own, tick)
+        return self._guide.mark(noisy, own)

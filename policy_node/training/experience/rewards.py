@@ -1,0 +1,89 @@
+"""The reward of training: that of the task, with other thresholds or several of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Sparse
+from policy_node.training.experience.hindsight import RewardFunction
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class GradedReward:
+    """A reward from -1 to 0: the share of thresholds met by distance times rotation, minus 1.
+
+    The sparse reward does not show how nearly a goal was missed or how safely it was met. So an
+    actor holds an object no better than the threshold needs. With goals of position and rotation
+    it forgets one of them while it never meets both.
+
+    Attributes:
+        metric: Distances and thresholds of the task.
+        grades: Multiples of its thresholds; 1 alone is the sparse reward.
+    """
+
+    metric: GoalMetric
+    grades: tuple[float, ...]
+
+    def __call__(self, achieved_goal: Values, desired_goal: Values) -> Values:
+        """Return rewards (...,) of goals (..., goal size)."""
+        distance, rotation = self.metric.distances(achieved_goal, desired_goal)
+        near = self._share(distance, self.metric.spec.distance_threshold)
+        if self.metric.spec.rotation_threshold is None:
+            return near - 1.0
+        turned = self._share(rotation, self.metric.spec.rotation_threshold)
+        return near * turned - 1.0
+
+    def _share(self, error: Values, threshold: float) -> Values:
+        met = [error < threshold * grade for grade in self.grades]
+        return np.asarray(np.mean(met, axis=0))
+
+
+def reward_schedule(config: TrainConfig, metric: GoalMetric) -> Callable[[float], RewardFunction]:
+    """Return the function from progress, 0 ... 1, to the reward at that time of the run.
+
+    Raises:
+        ValueError: If the configuration replaces the own reward of a third-party task.
+    """
+    sparse = config.find(Sparse) or Sparse()
+    if metric.has_own_reward and sparse.reward_grades:
+        raise ValueError(
+            f'reward_grades {sparse.reward_grades} would replace {own_reward(metric)}; allowed: '
+            'none (--set reward_grades=)'
+        )
+
+    def reward_at(progress: float) -> RewardFunction:
+        then = narrowed(metric, sparse, progress)
+        return GradedReward(then, sparse.reward_grades) if sparse.reward_grades else then.reward
+
+    return reward_at
+
+
+def own_reward(metric: GoalMetric) -> str:
+    """Return the name of a task's own reward, for messages."""
+    return f'the reward of {metric.spec.name} itself ({type(metric).__name__})'
+
+
+def narrowed(metric: GoalMetric, reward: Sparse, progress: float) -> GoalMetric:
+    """Return the metric with the thresholds of a run's progress, 0 ... 1."""
+    left = max(1.0 - 1.5 * progress, 0.0)
+    return scale_thresholds(
+        metric,
+        reward.reward_distance * reward.first_distance**left,
+        reward.reward_rotation * reward.first_rotation**left,
+    )
+
+
+def scale_thresholds(metric: GoalMetric, distance: float, rotation: float) -> GoalMetric:
+    """Return a metric with these shares of the success distance and rotation of `metric`."""
+    spec = replace(metric.spec, distance_threshold=metric.spec.distance_threshold * distance)
+    if spec.rotation_threshold is not None:
+        spec = replace(spec, rotation_threshold=spec.rotation_threshold * rotation)
+    return metric.with_changes(spec=spec)

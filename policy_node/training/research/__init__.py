@@ -1,0 +1,1 @@
+"""What only studies use, chosen in `registry.py`; no other module imports the rest."""

@@ -1,0 +1,253 @@
+"""Values with one more input: the success threshold, or the number of steps left.
+
+Each transition is learned from with a random value of that input, as with a goal in hindsight. The
+actor acts at a fixed value of it. So the saved actor is an ordinary one: the input is a constant
+whose column is added to the bias of the first layer.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.arrays import Array32
+from policy_node.policies.actor import MLP, Actor
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.configuration import groups
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.experience.rewards import narrowed, own_reward
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.experience.transitions import Starts, Transitions
+from policy_node.training.learners.ddpg import DDPG, TensorBatch
+from policy_node.training.learners.widening import first_weights
+
+Goals = NDArray[np.float64]
+# Smallest threshold drawn, as a share of the threshold of training.
+SMALLEST_THRESHOLD = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """The success threshold as a multiple of that of training, drawn log-uniformly.
+
+    Coarse goals are reached often, and their value may generalize to fine ones. The widest
+    threshold should be wider than the distance at the start of an episode.
+
+    Attributes:
+        metric: Distances of the task, and the thresholds of training.
+        widest: Largest multiple.
+    """
+
+    metric: GoalMetric
+    widest: float
+
+    def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+        """Draw the multiples (count,) of transitions."""
+        low, high = np.log(SMALLEST_THRESHOLD), np.log(self.widest)
+        return np.asarray(np.exp(generator.uniform(low, high, count)))
+
+    def inputs(self, drawn: NDArray[np.float64]) -> Array32:
+        """Return the inputs of the networks, (count, 1): logarithms of the multiples."""
+        return np.log(drawn).astype(np.float32)[:, None]
+
+    def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
+        """Return rewards (count,): 0 within the drawn multiple of the threshold, else -1."""
+        distance, rotation = self.metric.distances(achieved, desired)
+        spec = self.metric.spec
+        reached = distance < drawn * spec.distance_threshold
+        if spec.rotation_threshold is not None:
+            reached &= rotation < drawn * spec.rotation_threshold
+        return reached.astype(np.float64) - 1.0
+
+    def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the multiples one step later: the same."""
+        return drawn
+
+    def continues(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether later rewards count, (count,): always."""
+        return np.ones(len(drawn), np.bool_)
+
+
+@dataclass(frozen=True, slots=True)
+class Horizon:
+    """The number of steps left; values are sums of that many rewards (TDM, arXiv 1802.09081).
+
+    Attributes:
+        ticks: Steps of an episode.
+        compute_reward: (achieved_goal, desired_goal) -> reward, batched.
+    """
+
+    ticks: int
+    compute_reward: Callable[[Goals, Goals], Goals]
+
+    def draw(self, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+        """Draw numbers of steps (count,) from 1 to the length of an episode."""
+        return generator.integers(1, self.ticks + 1, count).astype(np.float64)
+
+    def inputs(self, drawn: NDArray[np.float64]) -> Array32:
+        """Return the inputs of the networks, (count, 1): shares of an episode."""
+        return (drawn / self.ticks).astype(np.float32)[:, None]
+
+    def reward(self, achieved: Goals, desired: Goals, drawn: NDArray[np.float64]) -> Goals:
+        """Return the rewards (count,) of the task."""
+        del drawn
+        return self.compute_reward(achieved, desired)
+
+    def after(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the steps left one step later."""
+        return drawn - 1.0
+
+    def continues(self, drawn: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether a step is left after this one, (count,)."""
+        return drawn > 1.0
+
+
+Condition = Threshold | Horizon
+"""The input of values beside state, action and goal."""
+
+
+def acting_input(config: TrainConfig) -> float | None:
+    """Return the input at which the actor acts; None without a condition.
+
+    The threshold is that of training, the horizon a whole episode.
+    """
+    if config.find(groups.Threshold):
+        return 0.0
+    return 1.0 if config.find(groups.Horizon) else None
+
+
+def make_condition(config: TrainConfig, metric: GoalMetric) -> Condition:
+    """Return the condition of a run.
+
+    Raises:
+        ValueError: If it would replace the own reward of a third-party task.
+    """
+    metric = narrowed(metric, config.find(groups.Sparse) or groups.Sparse(), 1.0)
+    threshold = config.find(groups.Threshold)
+    if threshold is None:
+        return Horizon(metric.spec.episode_ticks, metric.reward)
+    if metric.has_own_reward:
+        raise ValueError(
+            f'condition threshold would replace {own_reward(metric)}; allowed: none, horizon'
+        )
+    return Threshold(metric, threshold.widest_threshold)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConditionedSampler(TransitionSampler):
+    """Draws a value of the condition for each transition.
+
+    Attributes:
+        condition: The condition.
+    """
+
+    condition: Condition
+
+    def transitions(
+        self,
+        starts: Starts,
+        steps: NDArray[np.int64],
+        goal: Array32,
+        generator: np.random.Generator,
+    ) -> Transitions:
+        """Return transitions with their conditions."""
+        condition = self.condition
+        drawn = condition.draw(len(starts.row), generator)
+
+        def reward_after(achieved: Array32, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
+            goals = achieved.astype(np.float64), goal[chosen].astype(np.float64)
+            return condition.reward(*goals, drawn[chosen])
+
+        batch = self.several(starts, steps, goal, reward_after)
+        values = {name: getattr(batch, name) for name in Transitions.__slots__}
+        values['discount'] = batch.discount * condition.continues(drawn)
+        return ConditionedTransitions(
+            **values,
+            condition=condition.inputs(drawn),
+            next_condition=condition.inputs(condition.after(drawn)),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConditionedTransitions(Transitions):
+    """A batch with conditions.
+
+    Attributes:
+        condition: Input of the networks, (batch, 1).
+        next_condition: The same for the next state.
+    """
+
+    condition: Array32
+    next_condition: Array32
+
+
+class ConditionedDDPG(DDPG):
+    """`DDPG` whose actor and critic have the condition as an input; arguments as `DDPG`."""
+
+    def _make_networks(self, shape: NetworkShape) -> tuple[Actor, nn.Module]:
+        actor, inputs = Actor(shape), shape.feature_size + 1
+        actor.network = MLP(inputs, shape.action_size, shape)
+        return actor, self.critic_loss.make(inputs, shape)
+
+    @property
+    def acting_input(self) -> float:
+        """The input at which the actor acts."""
+        value = acting_input(self.config)
+        assert value is not None
+        return value
+
+    def tensors(self, batch: Transitions) -> TensorBatch:
+        """As `DDPG`; the condition follows the features.
+
+        Raises:
+            TypeError: If the batch has no conditions.
+        """
+        if not isinstance(batch, ConditionedTransitions):
+            raise TypeError(f'ConditionedTransitions are needed, not {type(batch).__name__}')
+        tensors = super().tensors(batch)
+        features = torch.cat([tensors.features, self.tensor(batch.condition)], dim=-1)
+        next_condition = self.tensor(batch.next_condition)
+        next_features = torch.cat([tensors.next_features, next_condition], dim=-1)
+        return replace(tensors, features=features, next_features=next_features)
+
+    def plain(self, network: MLP) -> Actor:
+        """As `ActorCritic`, at the input at which the actor acts."""
+        actor = copy.deepcopy(self.actor)
+        actor.network = fold(network, actor.shape, self.acting_input)
+        return actor.cpu().eval()
+
+    def _actions(self, features: Tensor) -> Array32:
+        acting = features.new_full((len(features), 1), self.acting_input)
+        return super()._actions(torch.cat([features, acting], dim=-1))
+
+
+def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
+    """Return a network without its last input, which is `value` for good.
+
+    Args:
+        network: Its first layer has `shape.feature_size` + 1 inputs.
+        shape: Shape of the network to make.
+        value: That input.
+    """
+    # The new random weights are replaced, so the global generator must not move.
+    with torch.random.fork_rng(devices=[]):
+        folded = MLP(shape.feature_size, shape.action_size, shape)
+    folded.load_state_dict(without_input(network.state_dict(), shape.feature_size, value))
+    return folded
+
+
+def without_input(tensors: dict[str, Tensor], column: int, value: float) -> dict[str, Tensor]:
+    """Return the tensors of networks without the input at `column`, which is `value` for good."""
+    changed = {}
+    for name in first_weights(tensors):
+        weight, bias = tensors[name], name.removesuffix('weight') + 'bias'
+        changed[name] = torch.cat([weight[:, :column], weight[:, column + 1 :]], dim=1)
+        changed[bias] = tensors[bias] + value * weight[:, column]
+    return tensors | changed

@@ -1,0 +1,306 @@
+"""Other critics: ensembles, quantiles, batch normalization, advantages, no target networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from policy_node.policies.actor import MLP, Actor
+from policy_node.policies.network_shape import NetworkShape
+from policy_node.training.configuration.groups import Critics
+from policy_node.training.learners.ddpg import (
+    DDPG,
+    Critic,
+    CriticLoss,
+    TargetNetworks,
+    TensorBatch,
+)
+
+# Share of the running statistics that one batch replaces (CrossQ, arXiv 1902.05605: 0.01).
+_MOMENTUM = 0.01
+# TQC drops 2 of 25 quantiles for every critic (its table of hyperparameters, most tasks).
+_DROPPED_SHARE = 2 / 25
+# Prefix of the tensors of an `Ensemble`.
+_MEMBERS = 'members.'
+
+Aggregate = Callable[[Tensor], Tensor]
+
+
+def _truncated(values: Tensor) -> Tensor:
+    """Return the mean without the highest value, as TQC drops the highest atoms."""
+    return values.sort(dim=0).values[:-1].mean(dim=0)
+
+
+AGGREGATES: dict[str, Aggregate] = {
+    'mean': lambda values: values.mean(dim=0),
+    'min': lambda values: values.amin(dim=0),
+    'truncated': _truncated,
+}
+"""Functions from the values (critics, batch) of an ensemble to one value each, (batch,)."""
+
+
+class Ensemble(nn.Module):
+    """Two or more critics that start differently and learn the same."""
+
+    def __init__(self, members: list[Critic]) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(members)
+
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return values (critics, batch), float32."""
+        return torch.stack([member(features, action) for member in self.members])
+
+    def outputs(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return the outputs of all members, (critics, batch, outputs), float32."""
+        return torch.stack([member.outputs(features, action) for member in self._critics()])
+
+    def _critics(self) -> Iterator[Critic]:
+        for member in self.members:
+            assert isinstance(member, Critic)
+            yield member
+
+    def completed(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the tensors, with its own for the members that they lack."""
+        given = {_member_of(name) for name in tensors}
+        own = self.state_dict().items()
+        return {name: value for name, value in own if _member_of(name) not in given} | tensors
+
+
+def critic_tensors(tensors: dict[str, Tensor], critics: int) -> dict[str, Tensor]:
+    """Return the tensors of one critic or an ensemble as named for another number of critics.
+
+    Args:
+        tensors: Tensors of a `Critic` or an `Ensemble`.
+        critics: New number of critics; members beyond it are left out.
+    """
+    if not is_ensemble(tensors):
+        tensors = {f'{_MEMBERS}0.{name}': value for name, value in tensors.items()}
+    if critics == 1:
+        first = f'{_MEMBERS}0.'
+        return {n.removeprefix(first): v for n, v in tensors.items() if n.startswith(first)}
+    return {name: value for name, value in tensors.items() if _member_of(name) < critics}
+
+
+def is_ensemble(tensors: dict[str, Tensor]) -> bool:
+    """Return whether the names are those of an `Ensemble`, maybe of one member."""
+    return any(name.startswith(_MEMBERS) for name in tensors)
+
+
+def count_critics(tensors: dict[str, Tensor]) -> int:
+    """Return the number of critics with these tensors."""
+    if not is_ensemble(tensors):
+        return 1 if tensors else 0
+    return len({_member_of(name) for name in tensors})
+
+
+def _member_of(name: str) -> int:
+    """Return the index of the member of an `Ensemble` that has a tensor."""
+    return int(name.removeprefix(_MEMBERS).split('.')[0])
+
+
+class EnsembleLoss(CriticLoss):
+    """One or more critics, perhaps with a layer normalization, and their squared errors."""
+
+    def __init__(self, options: Critics) -> None:
+        self.options = options
+
+    def make(self, features: int, shape: NetworkShape) -> nn.Module:
+        """Return a critic, or an `Ensemble` if there are several."""
+        members = [self.make_one(features, shape) for _ in range(self.options.critics)]
+        return members[0] if len(members) == 1 else Ensemble(members)
+
+    def make_one(self, features: int, shape: NetworkShape) -> Critic:
+        """Return a new member."""
+        shape_here = hidden_layers(shape, self.options.norm)
+        return Critic(features + shape.action_size, shape_here, self.options.quantiles)
+
+    def pooled(self, values: Tensor) -> Tensor:
+        """Return the aggregate of all critics, (batch,)."""
+        return values if self.options.critics == 1 else AGGREGATES[self.options.aggregate](values)
+
+
+class QuantileLoss(EnsembleLoss):
+    """Quantile regression as in QR-DQN (Dabney et al. 2018, arXiv 1710.10044).
+
+    Targets with `truncated` drop the highest quantiles of all critics together, as TQC (Kuznetsov
+    et al. 2020, arXiv 2005.04269).
+    """
+
+    def costs(self, learner: DDPG, batch: TensorBatch) -> Tensor:
+        """Return the quantile Huber loss of each transition, (batch,) or (critics, batch)."""
+        critic, slow = learner.critic, learner.target_critic
+        assert isinstance(critic, Critic | Ensemble) and isinstance(slow, Critic | Ensemble)
+        with torch.no_grad():
+            next_action = learner.target_action(batch.next_features)
+            following = slow.outputs(batch.next_features, next_action)
+            following = sample_of(following, self.options.aggregate == 'truncated')
+            target = batch.reward[:, None] + batch.discount[:, None] * following
+        quantiles = critic.outputs(batch.features, batch.action)
+        return quantile_costs(quantiles, learner.clipped(target))
+
+
+def levels(count: int, like: Tensor) -> Tensor:
+    """Return the probabilities (count,) of the quantiles: the middles of equal shares.
+
+    Args:
+        count: Number of quantiles.
+        like: A tensor on the device to use.
+    """
+    return (torch.arange(count, dtype=torch.float32, device=like.device) + 0.5) / count
+
+
+def sample_of(quantiles: Tensor, truncated: bool) -> Tensor:
+    """Return the quantiles of all critics as one sample of the return, (batch, kept).
+
+    Args:
+        quantiles: (critics, batch, count), or (batch, count) of one critic.
+        truncated: Whether the highest are left out.
+    """
+    if quantiles.ndim == 2:
+        quantiles = quantiles[None]
+    together = quantiles.transpose(0, 1).flatten(1)
+    if not truncated:
+        return together
+    total = together.shape[1]
+    kept = total - max(round(total * _DROPPED_SHARE), 1)
+    return together.sort(dim=1).values[:, :kept]
+
+
+def quantile_costs(quantiles: Tensor, target: Tensor) -> Tensor:
+    """Return the quantile Huber loss of each transition, (batch,) or (critics, batch).
+
+    Args:
+        quantiles: (critics, batch, count), or (batch, count) of one critic.
+        target: (batch, kept), an equally weighted sample of the return.
+    """
+    error = target.unsqueeze(-2) - quantiles.unsqueeze(-1)
+    huber = nn.functional.huber_loss(error, torch.zeros_like(error), reduction='none')
+    level = levels(quantiles.shape[-1], quantiles)[:, None]
+    weight = (level - (error.detach() < 0.0).float()).abs()
+    cost: Tensor = (weight * huber).mean(dim=(-2, -1))
+    return cost
+
+
+class BatchNormLoss(EnsembleLoss):
+    """Critics with a batch normalization, as in CrossQ (arXiv 1902.05605).
+
+    States and next states go through the critic together. Otherwise the statistics would not
+    include the next actions.
+    """
+
+    def make_one(self, features: int, shape: NetworkShape) -> Critic:
+        """Return a new member with a batch normalization after every hidden linear layer."""
+        critic = super().make_one(features, shape)
+        _add_batch_norm(critic.network)
+        return critic
+
+    def errors(self, learner: DDPG, batch: TensorBatch) -> Tensor:
+        """Return values minus targets, (batch,) or (critics, batch)."""
+        with torch.no_grad():
+            next_action = learner.target_action(batch.next_features)
+        learner.critic.train()
+        both = learner.critic(
+            torch.cat([batch.features, batch.next_features]),
+            torch.cat([batch.action, next_action]),
+        )
+        learner.critic.eval()
+        value, next_value = both.chunk(2, dim=-1)
+        target = learner.bootstrap(batch.reward, batch.discount, next_value.detach())
+        error: Tensor = value - target
+        return error
+
+
+def _add_batch_norm(network: MLP) -> None:
+    layers: list[nn.Module] = []
+    for layer in network.hidden:
+        layers.append(layer)
+        if isinstance(layer, nn.Linear):
+            layers.append(nn.BatchNorm1d(layer.out_features, momentum=_MOMENTUM))
+    network.hidden = nn.Sequential(*layers)
+
+
+def hidden_layers(shape: NetworkShape, norm: str) -> NetworkShape:
+    """Return the shape of a critic's hidden layers; `layer` adds a LayerNorm."""
+    return replace(shape, layer_norm=True) if norm == 'layer' else shape
+
+
+def critic_loss(options: Critics) -> CriticLoss:
+    """Return the loss that the options select."""
+    if options == Critics():
+        return CriticLoss()
+    if options.quantiles > 1:
+        return QuantileLoss(options)
+    return BatchNormLoss(options) if options.norm == 'batch' else EnsembleLoss(options)
+
+
+class NoTargets(TargetNetworks):
+    """The learning networks instead of slow copies."""
+
+    def __init__(self, actor: MLP, critic: nn.Module) -> None:
+        self.actor, self.critic = actor, critic
+
+    def move(self, learner: DDPG) -> None:
+        """Do nothing: the networks have moved already."""
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Return nothing: the learner has these modules."""
+        return {}
+
+
+class AdvantageCritic(nn.Module):
+    """Value of a state and advantage of an action, two networks (DAU, arXiv 1901.09732).
+
+    The more frequent actions are, the less one of them matters. Action values become values of
+    states, and the gradient of the actor vanishes. Here Q(s, a) = V(s) + dt (A(s, a) -
+    A(s, pi(s))). A keeps its size at any dt, and the actor maximizes A.
+
+    Args:
+        features: Length of the features.
+        shape: Shape of the actor; the hidden layers are the same.
+        duration: Duration dt of a tick in units of 40 ms.
+    """
+
+    def __init__(self, features: int, shape: NetworkShape, duration: float) -> None:
+        super().__init__()
+        self._duration = duration
+        self.state_value = Critic(features, shape)
+        self.advantage = Critic(features + shape.action_size, shape)
+
+    def value(self, features: Tensor) -> Tensor:
+        """Return values (batch,) of states."""
+        nothing = features.new_zeros((len(features), 0))
+        value: Tensor = self.state_value(features, nothing)
+        return value
+
+    def forward(self, features: Tensor, action: Tensor, own: Tensor) -> Tensor:
+        """Return action values (batch,), given the actor's own actions `own`."""
+        gain: Tensor = self.advantage(features, action) - self.advantage(features, own)
+        return self.value(features) + self._duration * gain
+
+
+class AdvantageDDPG(DDPG):
+    """`DDPG` with an `AdvantageCritic`; arguments as `DDPG`."""
+
+    critic: AdvantageCritic
+
+    def _make_networks(self, shape: NetworkShape) -> tuple[Actor, nn.Module]:
+        actor = Actor(shape)
+        layers = hidden_layers(shape, self.options.critic.norm)
+        return actor, AdvantageCritic(shape.feature_size, layers, self.config.tick_share)
+
+    def _loss_of_critic(self, batch: TensorBatch) -> Tensor:
+        slow = self.target_critic
+        assert isinstance(slow, AdvantageCritic)
+        with torch.no_grad():
+            own = torch.tanh(self.actor.network(batch.features))
+            value = slow.value(batch.next_features)
+            target = self.bootstrap(batch.reward, batch.discount, value)
+        error: Tensor = self.critic(batch.features, batch.action, own) - target
+        return error.square().mean()
+
+    def _value(self, features: Tensor, action: Tensor) -> Tensor:
+        value: Tensor = self.critic.advantage(features, action).mean()
+        return value

@@ -1,0 +1,175 @@
+"""Importance weights that remove the bias of hindsight from the critic.
+
+A goal that was chosen because an action led to it does not show how often the action leads there.
+For a state s, an action a and a goal g the critic should see the next states s' of the environment,
+p(s'|s, a). With goals drawn from q(g|s, a, s') it sees p(s'|s, a) q(g|s, a, s') / q(g|s, a)
+instead, where q(g|s, a) is the mean over s'. The weight
+
+    w = q(g|s, a) / q(g|s, a, s')
+
+removes this factor (Schramm et al. 2022, "USHER", arXiv 2207.01115). USHER gets both densities from
+a critic of two goals. Here two classifiers learn them: each separates the goals of a batch from the
+same goals shuffled. At its optimum the logit is log q(g|...) / q(g) (noise-contrastive estimation,
+Gutmann & Hyvarinen 2010), so w is the exponential of the difference of two logits.
+
+A weight is finite only if goals that do not depend on s' are drawn as well: those of the episode
+itself or of other episodes (`actual`). q is the mixture of all sources, so no share has to be
+known. With `torchrun` each worker learns its own classifiers from its part of the batches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from msgs_spec.arrays import Array32
+from msgs_spec.tasks import task_spec
+from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.experience.transitions import Transitions
+from policy_node.training.learners.ddpg import DDPG, Parts, TensorBatch
+from policy_node.training.machine.distributed import Workers
+
+# Largest weight. Larger ones belong to goals that hindsight almost never chooses.
+MOST_WEIGHT = 10.0
+_WIDTH = 128
+_LEARNING_RATE = 1e-3
+# Per metre or unit of a quaternion: resolves differences of about a success threshold.
+_NEAR = 20.0
+_SMALLEST_DISTANCE = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class GoalView:
+    """A batch of transitions with certain goals, each tensor (batch, size).
+
+    Attributes:
+        features: Network inputs of state and goal.
+        next_features: Network inputs of next state and goal.
+        achieved: Achieved goal of the state.
+        next_achieved: Achieved goal of the next state.
+        goal: The goal.
+    """
+
+    features: Tensor
+    next_features: Tensor
+    achieved: Tensor
+    next_achieved: Tensor
+    goal: Tensor
+
+
+class DensityRatio(nn.Module):
+    """The two classifiers and their optimizer.
+
+    Args:
+        feature_size: Length of the features of a state and a goal.
+        goal_size: Length of a goal.
+        action_size: Length of an action.
+    """
+
+    def __init__(self, feature_size: int, goal_size: int, action_size: int) -> None:
+        super().__init__()
+        before = feature_size + action_size + goal_size + 1
+        self.before = _classifier(before)
+        self.after = _classifier(before + feature_size + goal_size + 1)
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=_LEARNING_RATE)
+
+    def update(self, chosen: GoalView, shuffled: GoalView, action: Tensor) -> Tensor:
+        """Improve the classifiers on a batch and return its weights (batch,), of mean 1.
+
+        Args:
+            chosen: The batch with its goals.
+            shuffled: The batch with goals of other transitions.
+            action: (batch, action_size).
+        """
+        logits = [self._logits(view, action) for view in (chosen, shuffled)]
+        labels = torch.stack([torch.ones(len(action)), torch.zeros(len(action))]).to(action)
+        loss = action.new_zeros(())
+        for pair in zip(*logits, strict=True):
+            loss = loss + nn.functional.binary_cross_entropy_with_logits(torch.stack(pair), labels)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        before, after = (logit.detach() for logit in logits[0])
+        weight = (before - after).exp().clamp(max=MOST_WEIGHT)
+        return weight / weight.mean()
+
+    def _logits(self, view: GoalView, action: Tensor) -> tuple[Tensor, Tensor]:
+        before = torch.cat([view.features, action, _difference(view.goal, view.achieved)], dim=-1)
+        led_to = torch.cat([view.next_features, _difference(view.goal, view.next_achieved)], dim=-1)
+        after = self.after(torch.cat([before, led_to], dim=-1))
+        return self.before(before).squeeze(-1), after.squeeze(-1)
+
+
+def _difference(goal: Tensor, achieved: Tensor) -> Tensor:
+    """Return the difference to the goal at a fine and at a coarse scale, (batch, goal_size + 1)."""
+    difference = goal - achieved
+    distance = difference.norm(dim=-1, keepdim=True)
+    near = (_NEAR * difference).clamp(-NORMALIZED_CLIP, NORMALIZED_CLIP)
+    return torch.cat([near, (distance + _SMALLEST_DISTANCE).log()], dim=-1)
+
+
+def _classifier(inputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(inputs, _WIDTH),
+        nn.ReLU(),
+        nn.Linear(_WIDTH, _WIDTH),
+        nn.ReLU(),
+        nn.Linear(_WIDTH, 1),
+    )
+
+
+class WeightedDDPG(DDPG):
+    """`DDPG` with importance weights in the loss of the critic; arguments as `DDPG`."""
+
+    def __init__(
+        self,
+        shape: NetworkShape,
+        config: TrainConfig,
+        device: torch.device,
+        workers: Workers,
+        parts: Parts | None = None,
+    ) -> None:
+        super().__init__(shape, config, device, workers, parts)
+        sizes = shape.feature_size, shape.goal_size, shape.action_size
+        self._ratio = DensityRatio(*sizes).to(device)
+        self._achieved_start = task_spec(config.task).achieved_goal_start
+
+    def _update_critic(self, batch: TensorBatch) -> Tensor:
+        self._weight = self._weights(batch)
+        return super()._update_critic(batch)
+
+    def _loss_of_critic(self, batch: TensorBatch) -> Tensor:
+        return (self._weight * self.critic_loss.costs(self, batch)).mean()
+
+    def _weights(self, batch: TensorBatch) -> Tensor:
+        """Improve the classifiers and return the weights (batch,) of transitions."""
+        observation, next_observation = batch.observation, batch.next_observation
+        achieved = slice(self._achieved_start, self._achieved_start + batch.goal.shape[-1])
+        chosen = GoalView(
+            batch.features,
+            batch.next_features,
+            observation[:, achieved],
+            next_observation[:, achieved],
+            batch.goal,
+        )
+        goal = batch.goal.roll(1, dims=0)
+        features = self.actor.features(observation, goal)
+        next_features = self.actor.features(next_observation, goal)
+        shuffled = replace(chosen, features=features, next_features=next_features, goal=goal)
+        return self._ratio.update(chosen, shuffled, batch.action)
+
+    def importance(self, batch: Transitions) -> Array32:
+        """Improve the classifiers on a batch and return its weights, (batch,)."""
+        weight: Array32 = self._weights(self.tensors(batch)).cpu().numpy()
+        return weight
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Return the modules that a training state contains, by name."""
+        return {**super().modules(), 'ratio': self._ratio}
+
+    def optimizers(self) -> dict[str, torch.optim.Adam]:
+        """Return the optimizers whose states a training state contains, by name."""
+        return {**super().optimizers(), 'ratio_optimizer': self._ratio.optimizer}

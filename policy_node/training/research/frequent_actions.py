@@ -1,0 +1,244 @@
+"""Learning with frequent actions: actions with a length, and noise on weights."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from fetch_hand_sim.simulation import Simulation
+from msgs_spec.arrays import Array32
+from msgs_spec.tasks import task_spec
+from policy_node.policies.actor import Actor
+from policy_node.policies.policy import Policy
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.experience.collector import Collector, Observations
+from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.experience.transitions import Starts
+from policy_node.training.learners.ddpg import DDPG, TensorBatch
+
+
+def ticks_of(length: Array32, most: int) -> NDArray[np.int64]:
+    """Return the ticks, 1 ... `most`, of lengths in [-1, 1], any shape."""
+    share = (np.asarray(length, np.float64) + 1.0) / 2.0
+    return 1 + np.rint(share * (most - 1)).astype(np.int64)
+
+
+def length_of(ticks: NDArray[np.int64], most: int) -> Array32:
+    """Return the lengths in [-1, 1] of numbers of ticks, float32."""
+    return (2.0 * (ticks - 1) / (most - 1) - 1.0).astype(np.float32)
+
+
+class HoldingCollector(Collector):
+    """Holds each action for its length: the last number of what the actor returns.
+
+    The paper's own idea for very frequent actions (after Sharma et al. 2017, FiGAR). The actor
+    decides rarely and learns how rarely, so exploration goes further and values cross many ticks at
+    once. An action that holds for n more ticks is equally good experience in the middle of its
+    time, so each tick is stored with the ticks that are left.
+
+    Args:
+        simulation: The simulations.
+        seeds: As for `Collector`.
+        config: The configuration.
+        most: Ticks of the longest action.
+    """
+
+    def __init__(
+        self, simulation: Simulation, seeds: list[int], config: TrainConfig, most: int
+    ) -> None:
+        super().__init__(simulation, seeds, config, extra_actions=1)
+        self._holder = Holder(most)
+
+    def _explore(
+        self, policy: Policy, observation: Observations, past: Array32, random: bool, tick: int
+    ) -> Array32:
+        action = super()._explore(policy, observation, past, random, tick)
+        return self._holder.take(action, self.simulation.spec.episode_ticks - tick)
+
+
+class Holder:
+    """Holds actions for their length, in each of several simulations.
+
+    Args:
+        most: Ticks of the longest action.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._left = np.zeros(0, np.int64)
+        self._held: Array32 = np.zeros((0, 0), np.float32)
+
+    def take(self, action: Array32, ticks_left: int) -> Array32:
+        """Return the actions that hold now, with the lengths that are left.
+
+        Args:
+            action: New actions (N, action size + 1), used where no action holds any longer.
+            ticks_left: Ticks to the end of the episode, with this one; no action holds longer.
+
+        Returns:
+            (N, action size + 1), float32.
+        """
+        if len(self._left) != len(action):
+            self._left, self._held = np.zeros(len(action), np.int64), action.copy()
+        free = self._left == 0
+        wanted = np.minimum(ticks_of(action[:, -1], self._most), ticks_left)
+        self._left = np.where(free, wanted, self._left)
+        held = np.where(free[:, None], action, self._held)
+        held[:, -1] = length_of(self._left, self._most)
+        self._left, self._held = self._left - 1, held
+        return held
+
+
+class HoldingSampler(TransitionSampler):
+    """Returns are as long as their action holds; `most_steps` is the longest."""
+
+    def steps(
+        self, starts: Starts, goal: Array32, generator: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """Return the steps (batch,) of each return."""
+        del goal, generator
+        length = starts.episodes.action[starts.row, starts.tick, -1]
+        left: NDArray[np.int64] = starts.last - starts.tick
+        return np.asarray(np.minimum(ticks_of(length, self.most_steps), left))
+
+
+class HoldingDDPG(DDPG):
+    """`DDPG` whose actions have a length; the evaluated actor decides at every tick."""
+
+    def _penalty(self, batch: TensorBatch, action: Tensor) -> Tensor:
+        # The length of an action costs nothing.
+        return super()._penalty(batch, action[..., :-1])
+
+    def evaluation_actor(self) -> Actor:
+        """As `ActorCritic`, without the length."""
+        return plain_actor(super().evaluation_actor(), self.config)
+
+
+def plain_actor(actor: Actor, config: TrainConfig) -> Actor:
+    """Return an actor without the length of its actions; any other actor unchanged."""
+    action_size = task_spec(config.task).robot.action_size
+    if actor.shape.action_size == action_size:
+        return actor
+    plain = Actor(replace(actor.shape, action_size=action_size))
+    state = actor.state_dict()
+    for name in ('network.output.weight', 'network.output.bias'):
+        state[name] = state[name][:action_size].clone()
+    plain.load_state_dict(state)
+    return plain.eval()
+
+
+# Perturbed copies that collect side by side, each in its share of the simulations.
+_COPIES = 8
+# States at which the distance of copies is measured.
+_MEASURED = 256
+_FIRST_SCALE = 0.05
+
+
+class ParameterNoise:
+    """Noise on the weights of the actor, constant within an episode (arXiv 1706.01905).
+
+    The scale adapts to the distance by which the noise moves actions. After every cycle it is
+    multiplied by wanted / measured distance, at most by 2 or 1/2. The paper takes steps of 1 %,
+    which is too slow for a few dozen cycles of long episodes.
+
+    Args:
+        generator: Random generator.
+        distance: Wanted root mean square of the change of actions.
+
+    Attributes:
+        share: Factor on `distance`, 0 ... 1.
+        scale: Standard deviation of the noise on weights.
+    """
+
+    def __init__(self, generator: np.random.Generator, distance: float) -> None:
+        self._generator = generator
+        self._distance = distance
+        self.share = 1.0
+        self.scale = _FIRST_SCALE
+
+    def perturb(self, actor: Policy) -> PerturbedActors:
+        """Return copies of an actor, each with other weights.
+
+        Raises:
+            TypeError: If the policy is not an `Actor`.
+        """
+        if not isinstance(actor, Actor):
+            raise TypeError(f'parameter noise needs an actor, not a {type(actor).__name__}')
+        return PerturbedActors([self._copy(actor) for _ in range(_COPIES)])
+
+    @torch.no_grad()
+    def _copy(self, actor: Actor) -> Actor:
+        perturbed = copy.deepcopy(actor)
+        for parameter in perturbed.network.parameters():
+            noise = self._generator.standard_normal(tuple(parameter.shape), dtype=np.float32)
+            parameter.add_(torch.from_numpy(noise), alpha=self.scale)
+        return perturbed
+
+    def adapt(self, actor: Policy, perturbed: Policy, states: Mapping[str, ArrayLike]) -> None:
+        """Adapt the scale to the distance between the actions of the copies and of the actor.
+
+        Args:
+            actor: The actor.
+            perturbed: Its copies.
+            states: Observations (states, ...) of the last cycle.
+        """
+        count = len(np.asarray(states['observation']))
+        chosen = self._generator.choice(count, min(count, _MEASURED), replace=False)
+        at = {name: np.asarray(values)[chosen] for name, values in states.items()}
+        moved = perturbed.predict(at)[0] - actor.predict(at)[0]
+        distance = float(np.sqrt(np.square(moved).mean()))
+        wanted = self.share * self._distance
+        self.scale *= float(np.clip(wanted / max(distance, 1e-6), 0.5, 2.0))
+
+
+class PerturbedActors:
+    """Actors that each act for their share of the rows."""
+
+    def __init__(self, actors: list[Actor]) -> None:
+        self._actors = actors
+
+    def predict(
+        self,
+        observation: Mapping[str, ArrayLike],
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], None]:
+        """Return actions (N, action size) for observations (N, ...)."""
+        del state, episode_start, deterministic
+        values = {name: np.asarray(rows) for name, rows in observation.items()}
+        parts = np.array_split(np.arange(len(values['observation'])), len(self._actors))
+        answers = [
+            actor.predict({name: rows[part] for name, rows in values.items()})[0]
+            for actor, part in zip(self._actors, parts, strict=True)
+            if len(part)
+        ]
+        return np.concatenate(answers), None
+
+
+class PerturbingCollector(Collector):
+    """Noise on weights instead of noise on actions; arguments as `Collector`."""
+
+    def __init__(self, simulation: Simulation, seeds: list[int], config: TrainConfig) -> None:
+        super().__init__(simulation, seeds, config)
+        self._parameters = ParameterNoise(self._generator, config.learner.exploration.noise_std)
+
+    def _begin(self, policy: Policy) -> Policy:
+        self._parameters.share = self.exploration
+        return self._parameters.perturb(super()._begin(policy))
+
+    def _end(self, policy: Policy, acting: Policy, episodes: Episodes) -> None:
+        ticks = episodes.ticks
+        states = {
+            'observation': episodes.observation[:, :-1].reshape(len(episodes) * ticks, -1),
+            'desired_goal': np.repeat(episodes.desired_goal, ticks, axis=0),
+        }
+        self._parameters.adapt(policy, acting, states)

@@ -1,0 +1,184 @@
+"""Batches that depend on the learner: chosen goals and corrected returns of several steps.
+
+A return of n steps carries rewards back n times as fast, but it is the return of the actions taken,
+not of the actor's. `correction=lambda` draws the number of steps from a geometric distribution cut
+at n. The mean target is then the truncated lambda-return (Sutton and Barto 2018, 12.3); the average
+of MHER(lambda) (arXiv 2102.12962) gives the longest return less weight. `correction=cut` ends a
+return before the first action that is far from the actor's for the same goal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from msgs_spec.arrays import Array32
+from policy_node.training.experience.experience import Experience
+from policy_node.training.experience.hindsight import draw_sources, goals_of
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.experience.transitions import Starts, Transitions
+from policy_node.training.learners.ddpg import DDPG, CriticLoss
+
+# Number of future goals to choose from.
+CANDIDATES = 8
+# Sources with a choice of goals.
+_LATER = ('future', 'near')
+
+
+class Judge:
+    """Scores transitions by the networks of a learner."""
+
+    def __init__(self, learner: DDPG) -> None:
+        self._learner = learner
+
+    def act(self, observation: Array32, goal: Array32) -> Array32:
+        """Return actions (batch, action_size) of the actor."""
+        return self._learner.act(observation, goal)
+
+    @torch.no_grad()
+    def bellman(self, batch: Transitions) -> Array32:
+        """Return the absolute error of each value, (batch,), averaged over critics."""
+        learner = self._learner
+        with learner.precision():
+            errors = CriticLoss.errors(learner.critic_loss, learner, learner.tensors(batch))
+        error = errors.abs().float()
+        found: Array32 = (error if error.ndim == 1 else error.mean(dim=0)).cpu().numpy()
+        return found
+
+    @torch.no_grad()
+    def uncertain(self, batch: Transitions) -> Array32:
+        """Return the standard deviation of each value over critics, (batch,)."""
+        learner, tensors = self._learner, self._learner.tensors(batch)
+        with learner.precision():
+            value = learner.critic(tensors.features, tensors.action).float()
+        spread: Array32 = value.std(dim=0).cpu().numpy()
+        return spread
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedSampler(TransitionSampler):
+    """A sampler that may ask a learner.
+
+    Attributes:
+        judge: Scores of the learner; without one the sampler is a `TransitionSampler`.
+    """
+
+    judge: Judge | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChoosingSampler(JudgedSampler):
+    """Takes the best of several future goals.
+
+    Attributes:
+        choice: `bellman` (largest error of the value) or `uncertain` (largest difference between
+            critics).
+    """
+
+    choice: str
+
+    def relabel(
+        self, starts: Starts, mixture: dict[str, float], generator: np.random.Generator
+    ) -> Array32:
+        """Draw goals and replace those from the future by better ones."""
+        source = draw_sources(mixture, len(starts.row), generator)
+        goal = goals_of(starts, source, list(mixture), generator)
+        if self.judge is None:
+            return goal
+        names = np.array(list(mixture))[source]
+        rows = np.flatnonzero(np.isin(names, _LATER))
+        if len(rows):
+            chosen = starts.select(rows)
+            goal[rows] = self._best(self.judge, chosen, names[rows], goal[rows], generator)
+        return goal
+
+    def _best(
+        self,
+        judge: Judge,
+        starts: Starts,
+        names: NDArray[np.str_],
+        first: Array32,
+        generator: np.random.Generator,
+    ) -> Array32:
+        """Return the best of several future goals of each transition, (batch, goal_size)."""
+        source = (names == _LATER[1]).astype(np.intp)
+        candidates = [first]
+        for _ in range(CANDIDATES - 1):
+            candidates.append(goals_of(starts, source, _LATER, generator))
+        repeated = starts.select(np.tile(np.arange(len(names)), CANDIDATES))
+        batch = self.single(repeated, np.concatenate(candidates))
+        score = judge.bellman(batch) if self.choice == 'bellman' else judge.uncertain(batch)
+        # The first of equals.
+        best: NDArray[np.intp] = score.reshape(CANDIDATES, -1).argmax(axis=0)
+        return np.stack(candidates)[best, np.arange(len(names))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LambdaSampler(TransitionSampler):
+    """Returns with a random number of steps, whose mean is the truncated lambda-return.
+
+    Attributes:
+        trace: Probability of going on after each step.
+    """
+
+    trace: float = 0.7
+
+    def steps(
+        self, starts: Starts, goal: Array32, generator: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """Draw the steps (batch,) of each return."""
+        most = super().steps(starts, goal, generator)
+        return np.minimum(generator.geometric(1.0 - self.trace, len(most)), most)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CuttingSampler(JudgedSampler):
+    """Returns that end before an action far from the actor's.
+
+    Attributes:
+        cut_distance: Largest distance from the actor's action, root mean square.
+    """
+
+    cut_distance: float = 0.3
+
+    def steps(
+        self, starts: Starts, goal: Array32, generator: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """Return the steps (batch,) of each return."""
+        most = super().steps(starts, goal, generator)
+        if self.judge is None:
+            return most
+        steps = np.ones_like(most)
+        episodes = starts.episodes
+        for step in range(1, self.most_steps):
+            going = np.flatnonzero((steps == step) & (most > step))
+            if not len(going):
+                break
+            place = starts.row[going], starts.tick[going] + step
+            taken = episodes.action[place]
+            own = self.judge.act(episodes.observation[place], goal[going])
+            distance = np.sqrt(np.square(taken - own).mean(axis=-1))
+            steps[going[distance <= self.cut_distance]] += 1
+        return steps
+
+
+class JudgedExperience(Experience):
+    """Batches from a `JudgedSampler`. Statistics are collected without the judge.
+
+    Attributes:
+        judge: Scores of the learner.
+    """
+
+    judge: Judge
+
+    def _draw(self, mixture: dict[str, float]) -> Transitions:
+        unjudged = self._sampler
+        assert isinstance(unjudged, JudgedSampler)
+        self._sampler = replace(unjudged, judge=self.judge)
+        try:
+            return super()._draw(mixture)
+        finally:
+            self._sampler = unjudged

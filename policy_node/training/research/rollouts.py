@@ -1,0 +1,401 @@
+"""Experience of PPO: rollouts of the current actor, also for goals in hindsight.
+
+An on-policy gradient needs the actions that the actor would take for the goal in question. An
+episode collected for a goal g and replayed for g' contains the actions for g. `importance=none`
+ignores this (as PPO-HER, arXiv 2410.22524). `decision` weights each transition of a replayed
+episode with
+
+    w_t = prod_{k <= t} pi(a_k | s_k, g') / pi(a_k | s_k, g),
+
+the per-decision weight of hindsight policy gradients (Rauber et al. 2019, arXiv 1711.06006),
+normalized tick by tick over the replayed episodes, as they propose. Later rewards depend on later
+actions, which were for g as well. So in an advantage each later error is weighted by the ratios of
+the actions between, cut as in V-trace (Espeholt et al. 2018, arXiv 1802.01561).
+
+An episode that is replayed for what it achieved itself always succeeds, so the gradient teaches the
+actor nothing about acting at all: leaving the block alone succeeds, too, and touching it delays
+success (`bench/hindsight_pull.py`). Hindsight policy gradients sum over goals that do not depend on
+the episode. The source `outcome` does the same: outcomes of other episodes, moved to the start of
+this one, without those that are already met there. Of a few the nearest to the desired goal is
+taken (as HGG, Ren et al. 2019, arXiv 1906.04279), so goals approach those of the task.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fetch_hand_sim.simulation.rewards import GoalMetric
+from msgs_spec.arrays import Array, Array32
+from msgs_spec.tasks import TaskSpec
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Ppo
+from policy_node.training.experience.experience import Experience
+from policy_node.training.experience.hindsight import (
+    RewardFunction,
+    displace,
+    draw_sources,
+    goals_of,
+)
+from policy_node.training.experience.replay import Episodes, Weigh, draw_by, has_moved
+from policy_node.training.experience.sampling import TransitionSampler
+from policy_node.training.experience.transitions import Starts, Transitions
+from policy_node.training.machine.distributed import Workers
+
+_OUTCOME = 'outcome'
+# Number of episodes whose outcomes are used, states of each, and outcomes to choose from.
+_EPISODES = 2000
+_STATES = 4
+_CANDIDATES = 8
+_SMALLEST_DEVIATION = 1e-6
+# Largest weight of an error by the ratio of its action, and by the ratios of the actions before it.
+# The second one only shortens traces.
+_LARGEST_RATIO, _LARGEST_TRACE = 10.0, 1.0
+
+
+class Critique(Protocol):
+    """Values of states and densities of actions, from a learner."""
+
+    def values(self, observation: Array32, goal: Array32) -> Array32:
+        """Return values (...,) of states (..., observation_size) for goals (..., goal_size)."""
+        ...
+
+    def log_probabilities(self, observation: Array32, goal: Array32, action: Array32) -> Array32:
+        """Return the logarithms (...,) of the densities of actions (..., action_size)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RolloutTransitions(Transitions):
+    """Transitions of the newest rollouts.
+
+    Attributes:
+        log_probability: (batch,) of the action, by the actor before the first update that uses the
+            rollouts. Its normalizers include the new episodes, which matters in the first cycles.
+        advantage: (batch,) of the action, with standard deviation 1.
+        value_target: (batch,) target value of the state.
+        weight: (batch,) weight of the transition in all losses.
+    """
+
+    log_probability: Array32
+    advantage: Array32
+    value_target: Array32
+    weight: Array32
+
+
+@dataclass(frozen=True, slots=True)
+class Rollouts:
+    """Episodes of T steps with their rewards and advantages.
+
+    Attributes:
+        episodes: The episodes.
+        reward: (episodes, T).
+        log_probability: (episodes, T) of the actions.
+        advantage: (episodes, T).
+        value_target: (episodes, T).
+        weight: (episodes, T).
+    """
+
+    episodes: Episodes
+    reward: Array32
+    log_probability: Array32
+    advantage: Array32
+    value_target: Array32
+    weight: Array32
+
+    def draw(
+        self, row: NDArray[np.int64], gamma: float, generator: np.random.Generator
+    ) -> RolloutTransitions:
+        """Draw a transition from each of these episodes, (batch,)."""
+        episodes, count = self.episodes, len(row)
+        tick = generator.integers(episodes.ticks, size=count)
+        return RolloutTransitions(
+            observation=episodes.observation[row, tick],
+            next_observation=episodes.observation[row, tick + 1],
+            goal=episodes.desired_goal[row],
+            action=episodes.action[row, tick],
+            reward=self.reward[row, tick],
+            discount=np.full(count, gamma, np.float32),
+            log_probability=self.log_probability[row, tick],
+            advantage=self.advantage[row, tick],
+            value_target=self.value_target[row, tick],
+            weight=self.weight[row, tick],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutMaker:
+    """Makes rollouts of episodes.
+
+    Attributes:
+        critique: The learner that collected the episodes.
+        compute_reward: (achieved_goal, desired_goal) -> reward, batched.
+        gamma: Discount of one step.
+        trace: Lambda of the advantages.
+        corrects: Whether replayed episodes get per-decision weights.
+    """
+
+    critique: Critique
+    compute_reward: RewardFunction
+    gamma: float
+    trace: float
+    corrects: bool
+
+    def make(self, episodes: Episodes, goals: Sequence[Array32]) -> Rollouts:
+        """Return rollouts of episodes with their own goals, and with each of `goals`.
+
+        Args:
+            episodes: The episodes as collected.
+            goals: Goals (episodes, goal_size) to replay them for.
+        """
+        own = self._under(episodes)
+        meant = own.log_probability if self.corrects else None
+        replayed = [self._under(replace(episodes, desired_goal=goal), meant) for goal in goals]
+        if self.corrects and replayed:
+            logs = [rollouts.log_probability - own.log_probability for rollouts in replayed]
+            weights = np.split(decision_weights(np.concatenate(logs)), len(logs))
+            replayed = [
+                replace(rollouts, weight=weight.astype(np.float32))
+                for rollouts, weight in zip(replayed, weights, strict=True)
+            ]
+        return _joined([own, *replayed])
+
+    def _under(self, episodes: Episodes, meant: Array32 | None = None) -> Rollouts:
+        """Return rollouts for the goals that the episodes have.
+
+        Args:
+            episodes: The episodes.
+            meant: Log probabilities (episodes, T) of the actions for their original goals; None
+                treats the goals of the episodes as the original ones.
+        """
+        count, ticks = len(episodes), episodes.ticks
+        goal = np.repeat(episodes.desired_goal[:, None], ticks + 1, axis=1)
+        achieved = episodes.achieved_goal[:, 1:].astype(np.float64)
+        reward = np.asarray(self.compute_reward(achieved, goal[:, 1:].astype(np.float64)))
+        value = self.critique.values(episodes.observation, goal).astype(np.float64)
+        states = episodes.observation[:, :-1], goal[:, :-1]
+        log_probability = self.critique.log_probabilities(*states, episodes.action)
+        log_ratio = None if meant is None else log_probability - meant
+        advantage = advantages(reward, value, self.gamma, self.trace, log_ratio)
+        return Rollouts(
+            episodes,
+            reward.astype(np.float32),
+            log_probability,
+            advantage.astype(np.float32),
+            (advantage + value[:, :-1]).astype(np.float32),
+            np.ones((count, ticks), np.float32),
+        )
+
+
+def advantages(
+    reward: Array,
+    value: Array,
+    gamma: float,
+    trace: float,
+    log_ratio: NDArray[np.floating] | None = None,
+) -> Array:
+    """Return generalized advantages (Schulman et al. 2016, arXiv 1506.02438), (episodes, T).
+
+    Args:
+        reward: (episodes, T).
+        value: (episodes, T + 1); episodes are cut, not terminated, so the last value counts.
+        gamma: Discount of one step.
+        trace: Lambda.
+        log_ratio: (episodes, T) log pi(a | s, g') - log pi(a | s, g) of actions for another goal g;
+            None if the actions were for this goal.
+    """
+    error = reward + gamma * value[:, 1:] - value[:, :-1]
+    ratio = np.ones_like(error)
+    if log_ratio is not None:
+        ratio = np.exp(np.minimum(log_ratio, np.log(_LARGEST_RATIO), dtype=np.float64))
+    found = np.zeros_like(error)
+    # Contribution of the ticks from here on to the value of their first state.
+    following = np.zeros(len(error))
+    for tick in reversed(range(error.shape[1])):
+        found[:, tick] = error[:, tick] + gamma * trace * following
+        cut = np.minimum(ratio[:, tick], _LARGEST_TRACE)
+        following = ratio[:, tick] * error[:, tick] + gamma * trace * cut * following
+    return found
+
+
+def decision_weights(log_ratio: NDArray[np.floating]) -> Array:
+    """Return per-decision weights (episodes, T) of mean 1 at each tick.
+
+    Args:
+        log_ratio: (episodes, T) log pi(a | s, g') - log pi(a | s, g).
+    """
+    logs = np.cumsum(log_ratio, axis=1, dtype=np.float64)
+    weight = np.exp(logs - logs.max(axis=0))
+    return np.asarray(weight / weight.mean(axis=0))
+
+
+def _joined(parts: Sequence[Rollouts]) -> Rollouts:
+    """Return all rollouts, with advantages of weighted mean 0 and deviation 1."""
+    episodes = Episodes(
+        *(
+            np.concatenate([getattr(part.episodes, name) for part in parts])
+            for name in Episodes.__slots__
+        )
+    )
+    reward, log_probability, advantage, target, weight = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in Rollouts.__slots__
+        if name != 'episodes'
+    )
+    mean = np.average(advantage, weights=weight)
+    deviation = np.sqrt(np.average(np.square(advantage - mean), weights=weight))
+    advantage = ((advantage - mean) / max(deviation, _SMALLEST_DEVIATION)).astype(np.float32)
+    return Rollouts(episodes, reward, log_probability, advantage, target, weight)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcomes:
+    """First achieved goals of episodes, and later ones that differ from them.
+
+    Attributes:
+        before: (count, goal_size) achieved in first states.
+        after: (count, goal_size) achieved in later states, each not met by `before`.
+        metric: Distances of the task.
+    """
+
+    before: Array32
+    after: Array32
+    metric: GoalMetric
+
+    @classmethod
+    def of(cls, episodes: Episodes, metric: GoalMetric, generator: np.random.Generator) -> Outcomes:
+        """Draw some states of each episode and keep those that changed enough."""
+        row = np.repeat(np.arange(len(episodes)), _STATES)
+        tick = generator.integers(1, episodes.ticks + 1, size=len(row))
+        before, after = episodes.achieved_goal[row, 0], episodes.achieved_goal[row, tick]
+        changed = np.flatnonzero(~metric.success(before, after))
+        return cls(before[changed], after[changed], metric)
+
+    def __len__(self) -> int:
+        return len(self.after)
+
+    def goals(self, episodes: Episodes, generator: np.random.Generator) -> Array32:
+        """Return a goal for each whole episode, (episodes, goal_size)."""
+        count = len(episodes)
+        drawn = generator.integers(len(self), size=_CANDIDATES * count)
+        start = np.tile(episodes.achieved_goal[:, 0], (_CANDIDATES, 1))
+        candidates = displace(start, self.before[drawn], self.after[drawn])
+        desired = np.tile(episodes.desired_goal, (_CANDIDATES, 1))
+        near = self.metric.with_changes(reward_type='dense').reward(candidates, desired)
+        best = near.reshape(_CANDIDATES, count).argmax(axis=0)
+        goals: Array32 = candidates[best * count + np.arange(count)]
+        return goals
+
+
+def goals_in_hindsight(
+    episodes: Episodes,
+    mixture: dict[str, float],
+    generator: np.random.Generator,
+    outcomes: Outcomes | None = None,
+) -> Array32:
+    """Return a goal for each whole episode, (episodes, goal_size), from the sources of a mixture.
+
+    Args:
+        episodes: The episodes.
+        mixture: Probability of each source.
+        generator: Random generator.
+        outcomes: Outcomes of other episodes for the source `outcome`; without any the goal stays.
+    """
+    count, names = len(episodes), list(mixture)
+    starts = Starts(episodes, np.arange(count), np.zeros(count, np.int64))
+    source = draw_sources(mixture, count, generator)
+    sources = ['real' if name == _OUTCOME else name for name in names]
+    goal = goals_of(starts, source, sources, generator)
+    if outcomes is None or not len(outcomes):
+        return goal
+    transferred = np.flatnonzero(np.array(names)[source] == _OUTCOME)
+    goal[transferred] = outcomes.goals(episodes, generator)[transferred]
+    return goal
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutSampler(TransitionSampler):
+    """A sampler with the metric of the task.
+
+    Attributes:
+        metric: Distances of the task.
+    """
+
+    metric: GoalMetric | None = None
+
+
+class OnPolicyExperience(Experience):
+    """Whole episodes of the newest cycle, with their own goals and `hindsight_k` others each.
+
+    Args:
+        config: The configuration; `trace` is the lambda of the advantages.
+        spec: The task.
+        workers: This worker among all.
+        sampler: Computes rewards, and makes transitions for the normalizers.
+        generator: Random generator.
+        critique: The learner.
+        weigh: Weights of episodes for `moved_share`.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        spec: TaskSpec,
+        workers: Workers,
+        sampler: TransitionSampler,
+        generator: np.random.Generator,
+        critique: Critique,
+        weigh: Weigh = has_moved,
+    ) -> None:
+        super().__init__(config, spec, workers, sampler, generator, weigh=weigh)
+        options = config.find(Ppo) or Ppo()
+        limits = options.gamma, options.trace, options.importance == 'decision'
+        self._maker = RolloutMaker(critique, sampler.compute_reward, *limits)
+        self._metric = sampler.metric if isinstance(sampler, RolloutSampler) else None
+        self._newest = workers.share(config.collect.num_envs)
+        self._rollouts: Rollouts | None = None
+        self._made_after = -1
+        self._weight_up_to = np.zeros(0)
+
+    def batch(self, env_steps: int) -> Transitions:
+        """Draw from the rollouts of the newest cycle; its first call makes them."""
+        if self._rollouts is None or env_steps != self._made_after:
+            self._rollouts, self._made_after = self._roll_out(), env_steps
+            self._weight_up_to = np.cumsum(self._weigh(self._rollouts.episodes))
+        return self._rollouts.draw(self._draw_rows(), self.config.learner.gamma, self.generator)
+
+    def _draw_rows(self) -> NDArray[np.int64]:
+        generator, count, share = self.generator, self.batch_size, self.config.replay.moved_share
+        row = generator.integers(len(self._weight_up_to), size=count)
+        if share > 0.0 and self._weight_up_to[-1] > 0.0:
+            chosen = np.flatnonzero(generator.random(count) < share)
+            row[chosen] = draw_by(self._weight_up_to, len(chosen), generator)
+        return row
+
+    def mixture(self) -> dict[str, float]:
+        """Return the probability of each goal source, for the statistics of goals.
+
+        These use single transitions, so goals of the episode replace outcomes; both spread alike.
+        """
+        found = dict(super().mixture())
+        if _OUTCOME in found:
+            found['episode'] = found.get('episode', 0.0) + found.pop(_OUTCOME)
+        return found
+
+    def _roll_out(self) -> Rollouts:
+        # Fewer episodes if a simulation diverged: older ones are of another actor.
+        episodes = self.replay.newest(min(self._newest, self.replay.last_added))
+        mixture = super().mixture()
+        mixture.pop('real', None)
+        copies, outcomes = self.config.goals.hindsight_k if mixture else 0, None
+        if _OUTCOME in mixture and self._metric is not None:
+            past = self.replay.newest(_EPISODES)
+            outcomes = Outcomes.of(past, self._metric, self.generator)
+        goals = [
+            goals_in_hindsight(episodes, mixture, self.generator, outcomes) for _ in range(copies)
+        ]
+        return self._maker.make(episodes, goals)
