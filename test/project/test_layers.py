@@ -301,6 +301,25 @@ def test_ros_in_a_node_is_found(node):
     assert any(ros_at_import(path.read_text(), _package(path)) for path in sources)
 
 
+RESEARCH = f'{TRAINING}.research'
+
+
+def research_imports(source: str, module: str, package: str) -> list[str]:
+    """Return the research modules, other than their registry, that a module of the core imports."""
+    names = (found.module for found in imports(source, package))
+    inside = (name for name in names if is_within(name, RESEARCH) and name != RESEARCH)
+    allowed = f'{RESEARCH}.registry'
+    return [f'{module} imports {name}' for name in inside if not is_within(name, allowed)]
+
+
+def test_the_core_of_the_training_imports_only_the_registry_of_the_research() -> None:
+    core = [path for path in SOURCES if not is_within(module_name(path), RESEARCH)]
+    found = (research_imports(p.read_text(), module_name(p), _package(p)) for p in core)
+    assert list(chain.from_iterable(found)) == []
+    assert research_imports(f'from {RESEARCH}.ppo import PPO', 'one', 'two')
+    assert not research_imports(f'from {RESEARCH}.registry import make_learner', 'one', 'two')
+
+
 @pytest.mark.parametrize(
     ('module', 'source'),
     [

@@ -99,7 +99,8 @@ class TargetNetworks:
     def move(self, learner: DDPG) -> None:
         """Move the copies towards the networks by the share 1 - `polyak`."""
         weight = 1.0 - learner.options.polyak
-        old: list[Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
+        copies = learner.target_actor, learner.target_critic
+        old: list[Tensor] = [each for network in copies for each in network.parameters()]
         new: list[Tensor] = [*learner.actor_parameters, *learner.critic_parameters]
         torch._foreach_lerp_(old, new, weight)
 

@@ -259,7 +259,6 @@ def test_batches_are_consistent_transitions_with_recomputed_rewards(episodes: Ep
     reached = (batch.goal == batch.next_observation[:, :2]).all(axis=1)
     assert 0.1 < reached.mean() < 0.5
     assert (batch.reward == np.where(reached, 0.0, -1.0)).all()
-    assert batch.condition is None and batch.next_condition is None
     for name in ('observation', 'next_observation', 'goal', 'action', 'reward', 'discount'):
         assert getattr(batch, name).dtype == np.float32
 
