@@ -24,18 +24,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation.arguments import (
     Seeds,
+    StartState,
     finite_goals,
     finite_numbers,
     generators,
     nearest_quaternions,
     numbers,
+    read_start,
     require_whole,
     selected_simulations,
 )
 from fetch_hand_sim.simulation.disturber import Disturber
 from fetch_hand_sim.simulation.engine import DivergenceWatch
 from fetch_hand_sim.simulation.models import asset_path
-from fetch_hand_sim.simulation.start_state import StartState, read_start
 from fetch_hand_sim.simulation.tasks import Task, make_task
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import Disturbances, read_disturbances
@@ -148,7 +149,7 @@ class Simulation:
         self._is_started = np.zeros(num_envs, dtype=np.bool_)
         self._process = os.getpid()
         self._disturber: Disturber | None = None
-        # What the episodes that begin now do not draw, by simulation.
+        # Values given by the user for the episodes that begin now, by simulation.
         self._given: dict[int, dict[str, float]] = {}
         self._starts: dict[int, StartState] = {}
         self.disturbances = disturbances
