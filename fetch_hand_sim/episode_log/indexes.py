@@ -110,8 +110,10 @@ def _fields(data: bytes, position: int, end: int) -> Fields:
 
 
 def _check_data_crc(data: bytes, position: int, end: int) -> None:
-    if _fields(data, position, end).number(4) not in (0, zlib.crc32(memoryview(data)[:position])):
+    fields = _fields(data, position, end)
+    if fields.number(4) not in (0, zlib.crc32(memoryview(data)[:position])):
         raise ValueError('damaged: the CRC of the data is wrong')
+    fields.end()
 
 
 def _check_footer(data: bytes, summary: Summary, summary_start: int) -> None:
@@ -122,6 +124,7 @@ def _check_footer(data: bytes, summary: Summary, summary_start: int) -> None:
     position, end = footers[0]
     fields = _fields(data, position, end)
     start, offsets_start, crc = fields.number(8), fields.number(8), fields.number(4)
+    fields.end()
     is_empty = position == summary_start
     if start != summary_start and not (is_empty and start == 0):
         raise ValueError('ambiguous: the footer does not point at the summary')
@@ -138,6 +141,7 @@ def _check_offsets(data: bytes, summary: Summary) -> None:
     for position, end in summary[Opcode.SUMMARY_OFFSET]:
         fields = _fields(data, position, end)
         opcode, start, length = fields.number(1), fields.number(8), fields.number(8)
+        fields.end()
         found = summary.get(opcode, [])
         expected = (found[0][0], sum(b - a for a, b in found)) if found else (start, 0)
         if (start, length) != expected:
@@ -150,6 +154,7 @@ def _check_record_indexes(data: bytes, summary: Summary, contents: Contents) -> 
     for position, end in summary[Opcode.METADATA_INDEX]:
         fields = _fields(data, position, end)
         indexed[fields.number(8), fields.number(8), fields.text()] += 1
+        fields.end()
     found = Counter((each.position, each.length, each.name) for each in contents.metadata)
     if indexed and indexed != found:
         raise ValueError('ambiguous: the index of the metadata disagrees with the metadata')
@@ -159,6 +164,8 @@ def _check_record_indexes(data: bytes, summary: Summary, contents: Contents) -> 
         where = fields.number(8), fields.number(8)
         fields.bytes(24)
         indexed[*where, fields.text()] += 1
+        fields.text()
+        fields.end()
     found = Counter((each.position, each.length, each.name) for each in contents.attachments)
     if indexed and indexed != found:
         raise ValueError('ambiguous: the index of the attachments disagrees with the attachments')
@@ -193,6 +200,7 @@ def _check_chunk_indexes(
             chunk.unpacked_bytes,
         ):
             raise ValueError('ambiguous: a chunk index disagrees with its chunk')
+        fields.end()
         if len(offsets) % _INDEX_OFFSET.size or sorted(where[number]) != sorted(
             _INDEX_OFFSET.iter_unpack(offsets)
         ):
@@ -244,6 +252,7 @@ def _check_statistics(
         fields = _fields(data, position, end)
         message_count, *counts, first, last, size = fields.numbers(_STATISTICS)
         per_channel = dict(_INDEX_OFFSET.iter_unpack(fields.bytes(size)))
+        fields.end()
         found = messages.headers['log_time']
         span = (int(found[0]), int(found[-1])) if found.size else (first, last)
         known = (

@@ -50,6 +50,7 @@ MESSAGE = np.dtype(
 # Plain numbers are faster to compare than members of an enumeration.
 _MESSAGE, _MESSAGE_INDEX = int(Opcode.MESSAGE), int(Opcode.MESSAGE_INDEX)
 _DEFINITIONS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL})
+_KNOWN = frozenset(Opcode)
 # Times of a chunk, its unpacked size and CRC; channel and size of a message index.
 _CHUNK_HEADER = struct.Struct('<QQQI')
 _INDEX_HEADER = struct.Struct('<HI')
@@ -89,6 +90,11 @@ class Fields:
     def is_at_end(self) -> bool:
         """True if all fields are read."""
         return self._position == len(self._data)
+
+    def end(self) -> None:
+        """Reject bytes after the last field: some readers skip them, others parse them."""
+        if not self.is_at_end:
+            raise ValueError(f'ambiguous: a {self._kind} record is longer than its fields')
 
     def number(self, size: int) -> int:
         """Read an unsigned number of `size` bytes."""
@@ -230,6 +236,8 @@ class Contents:
         self._runs: list[bytes] = []
         self._size = 0
         self._starts: list[int] = []
+        # Where the definition of each channel is in the unpacked data.
+        self._channel_starts: dict[int, int] = {}
 
     def take(self, opcode: int, data: bytes, position: int, end: int) -> None:
         """Take the record that begins at `position` and whose content ends at `end`."""
@@ -243,13 +251,21 @@ class Contents:
             self._require_room()
             self._take_run(data[position:end])
             self.messages_outside += opcode == Opcode.MESSAGE
+        elif opcode == Opcode.HEADER:
+            fields = Fields(data[start:end], 'header')
+            _ = fields.text(), fields.text()
+            fields.end()
         elif opcode == Opcode.METADATA:
             self._take_metadata(data[start:end], position, end - position)
         elif opcode == Opcode.ATTACHMENT:
             self._take_attachment(data[start:end], position, end - position)
 
-    def define(self, opcode: int, content: bytes) -> None:
-        """Take a schema or channel, which may be a repetition."""
+    def define(self, opcode: int, content: bytes, offset: int = 0) -> None:
+        """Take a schema or channel, which may be a repetition.
+
+        Args:
+            offset: Bytes from the start of its chunk.
+        """
         id = int.from_bytes(content[:2], 'little')
         known = self._definitions.get((opcode, id))
         if known == content:
@@ -266,10 +282,17 @@ class Contents:
         fields.number(2)
         if opcode == Opcode.SCHEMA:
             name, encoding = fields.text(), fields.text()
-            self.schemas[id] = Schema(name, encoding, fields.bytes(fields.number(4)))
+            schema = Schema(name, encoding, fields.bytes(fields.number(4)))
+            fields.end()
+            self.schemas[id] = schema
         else:
             schema_id, topic, encoding = fields.number(2), fields.text(), fields.text()
-            self.channels[id] = Channel(schema_id, topic, encoding, fields.strings())
+            channel = Channel(schema_id, topic, encoding, fields.strings())
+            fields.end()
+            if schema_id and schema_id not in self.schemas:
+                raise ValueError(f'damaged: channel {id} comes before its schema {schema_id}')
+            self.channels[id] = channel
+            self._channel_starts[id] = self._size + offset
 
     @property
     def message_count(self) -> int:
@@ -289,6 +312,9 @@ class Contents:
         undefined = set(np.unique(headers['channel']).tolist()) - self.channels.keys()
         if undefined:
             raise ValueError(f'messages of channel {min(undefined)}, which is not defined')
+        for id, first in zip(*np.unique(headers['channel'], return_index=True), strict=True):
+            if starts[first] < self._channel_starts[int(id)]:
+                raise ValueError(f'damaged: a message of channel {id} comes before the channel')
         if (times[1:] > times[:-1]).all():
             return Messages(unpacked, starts, headers)
         order = np.argsort(times, kind='stable')
@@ -312,6 +338,7 @@ class Contents:
         first, last, size, crc = fields.numbers(_CHUNK_HEADER)
         compression = fields.text()
         packed = fields.bytes(fields.number(8))
+        fields.end()
         if size > self._limits.chunk_bytes:
             raise ValueError(f'chunk of {size} bytes; allowed: up to {self._limits.chunk_bytes}')
         self._unpacked_bytes += size
@@ -346,7 +373,9 @@ class Contents:
                     raise ValueError('damaged: a message is shorter than its header')
                 starts.append(base + position)
             elif opcode in _DEFINITIONS:
-                self.define(opcode, data[position + RECORD.size : following])
+                self.define(opcode, data[position + RECORD.size : following], position)
+            elif opcode in _KNOWN:
+                raise ValueError(f'damaged: a record of kind {opcode} in a chunk')
             position = following
         if len(self._starts) + len(starts) > MAX_MESSAGES:
             raise ValueError(f'more than {MAX_MESSAGES} messages')
@@ -369,6 +398,7 @@ class Contents:
             raise ValueError(f'more than {MAX_METADATA_RECORDS} metadata records')
         fields = Fields(content, 'metadata')
         record = MetadataRecord(position, length, fields.text(), fields.strings())
+        fields.end()
         self.metadata.append(record)
 
     def _take_attachment(self, content: bytes, position: int, length: int) -> None:
@@ -380,6 +410,7 @@ class Contents:
         data = fields.bytes(fields.number(8))
         if fields.number(4) not in (0, zlib.crc32(memoryview(content)[:-4])):
             raise ValueError(f'damaged: the CRC of the attachment {shown(name)} is wrong')
+        fields.end()
         if sum(len(each.data) for each in self.attachments) + len(data) > MAX_ATTACHMENT_BYTES:
             raise ValueError(f'more than {MAX_ATTACHMENT_BYTES} bytes attached')
         self.attachments.append(AttachmentRecord(position, length, name, media_type, data))
