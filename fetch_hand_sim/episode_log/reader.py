@@ -255,7 +255,8 @@ def _defines(type_name: str, text: bytes) -> bool:
     expected = schema_text(type_name)
     if text == expected.encode():
         return True
-    lines = text.decode(errors='replace').splitlines()
+    # Not `splitlines`: other readers do not end a comment at a form feed or at U+2028.
+    lines = text.decode(errors='replace').split('\n')
     stripped = (line.partition('#')[0].strip() for line in lines)
     short = '\n'.join(line for line in stripped if line)
     if len(short) > _LONGEST_SCHEMA:

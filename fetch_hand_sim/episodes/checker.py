@@ -208,7 +208,7 @@ def _start_differences(
         elif given != value:
             yield _difference(0, stamp_ns, f'metadata {name}', given, value)
     model = episode.attachments.get('model.xml')
-    is_same = all(recorded.get(n) == here[n] for n in ('model_sha256', 'mujoco_version'))
+    is_same = all(recorded.get(n, here[n]) == here[n] for n in ('model_sha256', 'mujoco_version'))
     if model is not None and is_same and model != reference.mjcf:
         yield _difference(0, stamp_ns, 'attachment model.xml', 'another text', 'the model')
     yield from _topic_differences(episode, ticks)
@@ -254,6 +254,10 @@ def _compare(
             if logged is not ticks[-1]:
                 raise ValueError(f'no applied_command at tick {number}')
             result.unchecked = len(logged.published)
+            if episode.is_complete:
+                result.difference = _difference(
+                    number, logged.stamp_ns, 'topics', 'no applied_command', 'applied_command'
+                )
             return
         if number and runner.is_between_episodes:
             result.difference = _difference(

@@ -172,7 +172,7 @@ def two_episodes(parts):
 def a_key_twice(parts):
     pairs = text('return') + text('0.0')
     content = text('episode_result') + struct.pack('<I', 2 * len(pairs)) + 2 * pairs
-    return whole(parts.record, chunk(*parts.channels), record(Opcode.METADATA, content))
+    return whole(parts.record, chunk(), record(Opcode.METADATA, content))
 
 
 def index_of_a_decoy(parts):
@@ -247,6 +247,47 @@ def one_topic_in_a_namespace(parts):
     return parts.file(channels=[*parts.channels[: id - 1], changed, *parts.channels[id:]])
 
 
+def schema_with_more_bytes(parts):
+    return parts.file(
+        schemas=[record(Opcode.SCHEMA, each[9:] + bytes(4)) for each in parts.schemas]
+    )
+
+
+def channel_with_more_bytes(parts):
+    channels = [record(Opcode.CHANNEL, each[9:] + b'x') for each in parts.channels]
+    return parts.file(channels=channels)
+
+
+def result_with_more_bytes(parts):
+    content = chunk(*parts.schemas, *parts.channels, *parts.messages)
+    return whole(parts.record, content, record(Opcode.METADATA, parts.result[9:] + b'x'))
+
+
+def record_in_a_chunk(parts):
+    return parts.file(messages=[*parts.messages, parts.result])
+
+
+def message_before_its_channel(parts):
+    return parts.file(schemas=[*parts.schemas, parts.messages[0]], messages=parts.messages[1:])
+
+
+def channels_in_the_summary(parts):
+    content = chunk(*parts.schemas, *parts.messages)
+    return whole(parts.record, content, parts.result, summary=parts.channels)
+
+
+def channel_before_its_schema(parts):
+    return parts.file(schemas=parts.channels, channels=parts.schemas)
+
+
+def hidden_in_a_comment(parts):
+    comment = '# \x0c'
+    schemas = [
+        schema(id, name, comment + schema_text(name)) for name, id in parts.schema_ids.items()
+    ]
+    return parts.file(schemas=schemas)
+
+
 def second_header(parts):
     return parts.file(record(Opcode.HEADER, text('') + text('')))
 
@@ -282,6 +323,14 @@ AMBIGUOUS = {
     other_type: "no topic '/reward' of type 'std_msgs/msg/Bool'",
     other_encoding: "'json'",
     one_topic_in_a_namespace: 'several namespaces',
+    schema_with_more_bytes: 'a schema record is longer than its fields',
+    channel_with_more_bytes: 'a channel record is longer than its fields',
+    result_with_more_bytes: 'a metadata record is longer than its fields',
+    record_in_a_chunk: 'a record of kind 12 in a chunk',
+    message_before_its_channel: 'comes before the channel',
+    channels_in_the_summary: 'comes before the channel',
+    channel_before_its_schema: 'comes before its schema',
+    hidden_in_a_comment: 'another definition of',
     second_header: 'header record before the end of the data',
     message_without_header: 'a message is shorter than its header',
     many_metadata_records: 'more than 16 metadata records',
@@ -471,6 +520,12 @@ def lost_end(parts):
     return parts.file().replace(parts.result, metadata('episode_result', changed))
 
 
+def lost_last_command(parts):
+    id = parts.channel_ids['/applied_command']
+    last = max(index for index, row in enumerate(parts.rows) if row[1] == id)
+    return parts.file(messages=parts.messages[:last])
+
+
 def later_command(parts):
     index = next(i for i, row in enumerate(parts.rows) if row[1] == parts.channel_ids['/commands'])
     time, id, data = parts.rows[index]
@@ -484,6 +539,7 @@ def later_command(parts):
         (lost_key, 'metadata episode_ticks'),
         (renamed_key, 'episode_result retorn'),
         (lost_end, 'episode_result complete'),
+        (lost_last_command, 'topics'),
         (later_command, 'log time of commands'),
         (later_publish_time, 'publish time of'),
         (other_sequence, 'sequence number of'),
