@@ -12,6 +12,7 @@ and of one observation; a crafted graph can still cost more for other observatio
 from __future__ import annotations
 
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -33,8 +34,9 @@ from policy_node.policies.policy import (
 
 INPUTS = ('observation', 'desired_goal')
 OUTPUT = 'action'
-# Field `location` of a tensor with weights in another file, encoded by protobuf.
-_EXTERNAL = b'\n\x08location\x12'
+# Field `location` of a tensor with weights in another file, encoded by protobuf: tag, length, text.
+# The value may come before it, and tag and length may have more bytes than they need.
+_EXTERNAL = re.compile(rb'(\n|\x8a\x80*\x00)(\x08|\x88\x80*\x00)location')
 
 # Limits of the trial; onnxruntime itself needs 100 MiB and 0.1 s.
 _TRIAL_MEMORY = 400 * 2**20
@@ -92,7 +94,7 @@ def load_onnx(path: Path, task: str | None = None) -> LoadedPolicy:
         ValueError: If it is invalid, needs too much memory or time, or was trained on another task.
     """
     data = read_file(path)
-    if _EXTERNAL in data:
+    if _EXTERNAL.search(data):
         # onnxruntime would read them from the working directory; the SHA-256 would not cover them.
         raise ValueError(f'{path} keeps weights in other files; allowed: one file with all weights')
     _require_onnxruntime(path)
