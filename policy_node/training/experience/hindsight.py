@@ -132,7 +132,7 @@ def _displaced(starts: Starts, generator: np.random.Generator) -> Array32:
     """Goals near the achieved ones that do not depend on where the transitions lead.
 
     If a goal is chosen because a step led there, the critic learns that such steps lead there; with
-    contacts this is partly luck. Here the achieved goal moves as far as another one moved within
+    contacts this is partly luck. Here the achieved goal moves by the distance of another one within
     ten ticks of its episode.
     """
     episodes, count = starts.episodes, len(starts.row)

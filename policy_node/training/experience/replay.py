@@ -1,4 +1,4 @@
-"""Replay of whole episodes, because hindsight needs what came later in the same one."""
+"""Replay of whole episodes: hindsight needs the later states of an episode."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from msgs_spec.arrays import Array, Array32
 
-# An episode counts as moved when its achieved goal has left its start by this much: metres, and for
-# poses units of the quaternion, whose 0.01 is a rotation by 0.02 rad.
+# Smallest distance of the achieved goal from its start that counts as a motion: metres, and for
+# poses units of the quaternion (0.01 is a rotation by 0.02 rad).
 MOVED_DISTANCE = 0.01
 
 
@@ -22,7 +22,7 @@ class Episodes:
     Attributes:
         observation: (episodes, T + 1, observation_size).
         achieved_goal: (episodes, T + 1, goal_size).
-        desired_goal: (episodes, goal_size); a goal lasts an episode.
+        desired_goal: (episodes, goal_size); constant within an episode.
         action: (episodes, T, action_size).
     """
 
@@ -40,11 +40,11 @@ class Episodes:
         return int(self.action.shape[1])
 
     def last(self, count: int) -> Episodes:
-        """Returns the last `count` episodes, or all if there are fewer."""
+        """Return the last `count` episodes, or all if there are fewer."""
         return self.select(slice(-count, None))
 
     def select(self, rows: NDArray[np.bool_ | np.int64] | slice) -> Episodes:
-        """Returns the episodes at these rows, or those whose row is True; views of a slice."""
+        """Return the episodes at these rows or where a row is True; a slice returns views."""
         return Episodes(*(getattr(self, name)[rows] for name in Episodes.__slots__))
 
 
@@ -94,7 +94,7 @@ class EpisodeReplay:
         self._count_ticks = count_ticks
         self._weights = np.zeros(capacity)
         self._valid = np.full(capacity, ticks)
-        # Sums over the rows up to each: of valid ticks, and of weights times these.
+        # Cumulative sums over rows: valid ticks, and weights times valid ticks.
         self._ticks_up_to, self._weight_up_to = np.zeros(0), np.zeros(0)
         self.capacity = capacity
         self.last_added = 0
@@ -102,12 +102,12 @@ class EpisodeReplay:
         self._next = 0
 
     def __len__(self) -> int:
-        """Number of episodes held."""
+        """Number of stored episodes."""
         return self._size
 
     @property
     def episodes(self) -> Episodes:
-        """Views of the episodes held, in no particular order."""
+        """Views of the stored episodes, in no particular order."""
         return self._ring.select(slice(self._size))
 
     @property
@@ -116,20 +116,20 @@ class EpisodeReplay:
         return self._ring.ticks
 
     def bytes_of(self, count: int) -> int:
-        """Memory that so many episodes take, of which it holds `capacity` at most."""
+        """Return the memory in bytes of `count` episodes, at most of `capacity`."""
         whole = sum(getattr(self._ring, name).nbytes for name in Episodes.__slots__)
         return int(whole) * min(count, self.capacity) // self.capacity
 
     def newest(self, count: int) -> Episodes:
-        """Copies of the newest episodes, the newest last; all if there are fewer than `count`."""
+        """Return copies of the newest `count` episodes, or of all, the newest last."""
         number = min(count, self._size)
         return self._ring.select((self._next - number + np.arange(number)) % self.capacity)
 
     def add(self, episodes: Episodes) -> None:
-        """Adds episodes, the oldest ones making room.
+        """Add episodes in place of the oldest ones.
 
         Raises:
-            ValueError: If there are more than the replay holds, or of other sizes.
+            ValueError: If they exceed the capacity or have other sizes.
         """
         for name in Episodes.__slots__:
             given, held = getattr(episodes, name).shape[1:], getattr(self._ring, name).shape[1:]
@@ -152,19 +152,19 @@ class EpisodeReplay:
 
     @property
     def valid_ticks(self) -> NDArray[np.int64] | None:
-        """Ticks of each episode that are worth drawing; None if all are."""
+        """Number of ticks of each episode that may be drawn; None if all."""
         return None if self._count_ticks is None else self._valid[: self._size]
 
     def draw(
         self, count: int, weighted_share: float, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draws episodes with replacement, in proportion to their valid ticks.
+        """Draw episodes with replacement, in proportion to their valid ticks.
 
         Args:
-            count: How many.
-            weighted_share: Share drawn in proportion to weights as well. Where all weights are 0 it
-                has no effect.
-            generator: Source of randomness.
+            count: Number of episodes.
+            weighted_share: Share drawn in proportion to weights as well; without effect if all
+                weights are 0.
+            generator: Random generator.
 
         Returns:
             Rows of `episodes`, (count,).
@@ -180,8 +180,8 @@ class EpisodeReplay:
 
 
 def draw_by(sums: Array, count: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Draws rows in proportion to what each adds to `sums`."""
-    # A draw may round up to the last sum: the last row that adds something is meant.
+    """Draw rows; `sums` are the cumulative sums of their unnormalized probabilities."""
+    # A draw may round up to the last sum: it means the last row with a weight above 0.
     last = np.searchsorted(sums, sums[-1])
     row = np.searchsorted(sums, sums[-1] * generator.random(count), 'right')
     return np.asarray(np.minimum(row, last))

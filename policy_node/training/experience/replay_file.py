@@ -1,4 +1,4 @@
-"""The newest episodes of a replay in a file, so that a resumed run learns at once."""
+"""The newest episodes of a replay in a file. With them a resumed run learns at once."""
 
 from __future__ import annotations
 
@@ -13,12 +13,10 @@ from policy_node.training.experience.replay import EpisodeReplay, Episodes
 
 
 def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:
-    """Writes the newest episodes of a replay, as many as hold `transitions`.
-
-    The file is complete or not there.
+    """Write the newest episodes of a replay, at least `transitions` transitions.
 
     Raises:
-        OSError: If it cannot be written; no part of it is left.
+        OSError: If the file cannot be written; no partial file is left.
     """
     newest = replay.newest(-(-transitions // replay.ticks))
     tensors = {name: getattr(newest, name) for name in Episodes.__slots__}
@@ -28,7 +26,7 @@ def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:
         partial.touch()
         mode = partial.stat().st_mode
         save_file(tensors, partial)
-        # That library makes files for their owner alone; the others of a run are as umask says.
+        # safetensors lets only the owner read its files; the other files of a run follow umask.
         partial.chmod(mode)
         os.replace(partial, path)
     except (OSError, SafetensorError) as error:
@@ -37,7 +35,7 @@ def save_replay(path: Path, replay: EpisodeReplay, transitions: int) -> None:
 
 
 def load_replay(path: Path, replay: EpisodeReplay) -> None:
-    """Puts the episodes of a file into a replay.
+    """Add the episodes of a file to a replay.
 
     Raises:
         ValueError: If the file cannot be read or does not fit.
@@ -52,10 +50,10 @@ def load_replay(path: Path, replay: EpisodeReplay) -> None:
 
 
 def _require_whole(episodes: Episodes) -> None:
-    """Refuses what would be learnt from wrongly, or end every part of the run.
+    """Reject damaged episodes.
 
     Raises:
-        ValueError: If a value is no finite float32, or an array has other episodes than the rest.
+        ValueError: If a value is no finite float32 or the arrays have different lengths.
     """
     for name in Episodes.__slots__:
         array = getattr(episodes, name)

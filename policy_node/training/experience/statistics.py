@@ -16,7 +16,7 @@ SMALLEST_STD = 0.01
 
 
 class RunningStatistics:
-    """Sums of everything seen; `write` turns them into the mean and std of a `Normalizer`."""
+    """Sums over all inputs; `write` sets the mean and deviation of a `Normalizer` from them."""
 
     def __init__(self, size: int) -> None:
         self.count = torch.zeros(1, dtype=torch.float64)
@@ -24,9 +24,9 @@ class RunningStatistics:
         self.total_square = torch.zeros(size, dtype=torch.float64)
 
     def update(self, values: ArrayLike, workers: Workers) -> None:
-        """Adds the rows of `values` (..., size), of all workers, clipped as the network sees them.
+        """Add the rows of `values` (..., size) of all workers, clipped as inputs of networks are.
 
-        Every worker must call this together.
+        All workers must call this together.
         """
         array = np.asarray(values, dtype=np.float64)
         rows = np.clip(array.reshape(-1, array.shape[-1]), -INPUT_CLIP, INPUT_CLIP)
@@ -38,7 +38,7 @@ class RunningStatistics:
         self.total_square += added[1 + size :]
 
     def write(self, normalizer: Normalizer) -> None:
-        """Sets the normaliser to these statistics; before the first update it changes nothing."""
+        """Set the normalizer to these statistics; without any it stays unchanged."""
         if not self.count:
             return
         mean = self.total / self.count
@@ -47,15 +47,15 @@ class RunningStatistics:
         normalizer.std.copy_(variance.clamp(min=SMALLEST_STD**2).sqrt())
 
     def state(self) -> dict[str, Tensor]:
-        """The sums, for a checkpoint."""
+        """Return the sums, for a checkpoint."""
         return {'count': self.count, 'total': self.total, 'total_square': self.total_square}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continues from sums that `state` returned.
+        """Continue from sums that `state` returned.
 
         Raises:
             KeyError: If one is missing.
-            ValueError: If one has another size; nothing may be stretched to fit.
+            ValueError: If one has another size.
         """
         for name, value in self.state().items():
             given = state[name]

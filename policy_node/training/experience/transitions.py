@@ -1,4 +1,4 @@
-"""What one update learns from, and where in the replay it begins."""
+"""Batches of transitions, and the states in the replay where they begin."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from policy_node.training.experience.replay import Episodes
 
 @dataclass(frozen=True, slots=True)
 class Starts:
-    """Where the transitions of a batch begin.
+    """The states in which the transitions of a batch begin.
 
     Attributes:
-        episodes: What they are drawn from.
-        row: Episode of each, (batch,).
-        tick: State that each leads from, (batch,).
-        valid_ticks: Ticks of each episode, from its first, that transitions and achieved goals are
-            drawn from, (episodes,); None is all.
+        episodes: The episodes.
+        row: Episode of each transition, (batch,).
+        tick: Tick of its first state, (batch,).
+        valid_ticks: Number of ticks of each episode that count, from its first, (episodes,); None
+            is all.
     """
 
     episodes: Episodes
@@ -30,27 +30,27 @@ class Starts:
 
     @property
     def last(self) -> NDArray[np.int64]:
-        """Last state of each episode that counts, (batch,)."""
+        """Last valid state of each episode, (batch,)."""
         if self.valid_ticks is None:
             return np.full(len(self.row), self.episodes.ticks)
         return self.valid_ticks.take(self.row)
 
     def select(self, chosen: NDArray[np.intp]) -> Starts:
-        """The transitions at these indices."""
+        """Return the transitions at these indices."""
         return Starts(self.episodes, self.row[chosen], self.tick[chosen], self.valid_ticks)
 
 
 @dataclass(frozen=True, slots=True)
 class Transitions:
-    """A batch for one update, float32; the target of a value is reward + discount * next value.
+    """A batch for one update, float32. A target is reward + discount * next value.
 
     Attributes:
         observation: (batch, observation_size).
-        next_observation: (batch, observation_size); several steps later where returns are longer.
+        next_observation: (batch, observation_size), at the end of the return.
         goal: (batch, goal_size), after relabelling.
         action: (batch, action_size).
         reward: (batch,) for `goal`.
-        discount: (batch,) of the value of the next state.
+        discount: (batch,) factor on the value of the next state.
     """
 
     observation: Array32

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-# Smallest share of a unit that one of two copies is given.
+# Smallest share of a unit that one of two copies gets.
 _LEAST_SHARE = 0.3
 _HIDDEN, _OUTPUT = 'hidden.', 'output.weight'
 
@@ -34,18 +34,19 @@ def first_weights(tensors: dict[str, Tensor]) -> list[str]:
 
 
 def can_widen(before: Sequence[int], after: Sequence[int]) -> bool:
-    """Whether layers of these widths can become those: as many, each a multiple."""
+    """Return whether layers of widths `before` can get the widths `after`, each a multiple."""
     if len(before) != len(after):
         return False
     return all(new % old == 0 for old, new in zip(before, after, strict=True))
 
 
 def widened(tensors: dict[str, Tensor], after: Sequence[int]) -> dict[str, Tensor]:
-    """Networks, by name, with hidden layers of other widths; other tensors stay.
+    """Return networks with wider hidden layers; other tensors stay.
 
     Args:
-        tensors: As in a training state: `<network>hidden.<n>.<name>`, `<network>output.<name>`.
-        after: Widths of the hidden layers, see `can_widen`.
+        tensors: Named as in a training state: `<network>hidden.<n>.<name>` and
+            `<network>output.<name>`.
+        after: New widths, see `can_widen`.
     """
     changed: dict[str, Tensor] = {}
     for name in tensors:
@@ -58,10 +59,10 @@ def widened(tensors: dict[str, Tensor], after: Sequence[int]) -> dict[str, Tenso
 def _widened_network(
     tensors: dict[str, Tensor], prefix: str, after: Sequence[int]
 ) -> dict[str, Tensor]:
-    # The same shares in a network and its slow copy.
+    # A network and its slow copy get the same shares.
     generator = torch.Generator().manual_seed(0)
     widths = iter(after)
-    # Which unit each of the layer before is a copy of, and its share; None for the inputs.
+    # For each unit of the layer before: its original unit and its share; None for inputs.
     unit: Tensor | None = None
     share = torch.ones(1)
     changed: dict[str, Tensor] = {}
@@ -76,7 +77,7 @@ def _widened_network(
             share = _shares(units, width // units, generator)
         for name in (name for name in tensors if name.startswith(layer)):
             values = weight if name.endswith('.weight') else tensors[name]
-            # Of a normalisation there may be a count beside what it has of each unit.
+            # A normalization may have a count beside its values per unit.
             changed[name] = values[unit] if values.ndim else values
     output = prefix + _OUTPUT
     changed[output] = tensors[output][:, unit] * share
@@ -84,14 +85,14 @@ def _widened_network(
 
 
 def _numbers(tensors: dict[str, Tensor], prefix: str) -> list[int]:
-    """Numbers of the hidden layers and norms of a network, rising."""
+    """Return the numbers of the hidden layers and norms of a network, sorted."""
     start = prefix + _HIDDEN
     found = {int(n.removeprefix(start).split('.')[0]) for n in tensors if n.startswith(start)}
     return sorted(found)
 
 
 def _shares(units: int, copies: int, generator: torch.Generator) -> Tensor:
-    """Shares (copies * units,) of each unit that add up to 1 over its copies."""
+    """Return shares (copies * units,) that add up to 1 over the copies of each unit."""
     drawn = _LEAST_SHARE + (1.0 - 2.0 * _LEAST_SHARE) * torch.rand(
         (copies, units), generator=generator
     )

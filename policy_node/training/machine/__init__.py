@@ -1,1 +1,1 @@
-"""What a run has: processors, devices, memory, other workers."""
+"""The machine of a run: processor, device, memory, other workers."""

@@ -1,4 +1,4 @@
-"""Where tensors live, and how precise their products are."""
+"""Device of the networks and precision of their matrix products."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 
 def uses_bfloat16(precision: str, device: torch.device) -> bool:
-    """Whether matrix products run in bfloat16; `auto` asks the processor."""
+    """Return whether matrix products run in bfloat16; with `auto` if the device supports it."""
     if precision != 'auto':
         return precision == 'bfloat16'
     if device.type == 'cuda':
@@ -17,13 +17,13 @@ def uses_bfloat16(precision: str, device: torch.device) -> bool:
 
 
 def choose_device(name: str) -> torch.device:
-    """Returns the device called `auto`, `cpu` or `cuda`; `auto` takes a GPU where torch sees one.
+    """Return the device `cpu` or `cuda`; `auto` is a GPU if torch has one.
 
     Raises:
-        ValueError: If `cuda` is asked for and torch sees none.
+        ValueError: If `name` is `cuda` and torch has no GPU.
     """
     if name == 'cuda' and not torch.cuda.is_available():
-        raise ValueError('device cuda: torch sees no GPU; allowed: auto, cpu')
+        raise ValueError('device cuda: torch has no GPU; allowed: auto, cpu')
     if name == 'cpu' or not torch.cuda.is_available():
         return torch.device('cpu')
     return torch.device('cuda', int(os.environ.get('LOCAL_RANK', '0')))

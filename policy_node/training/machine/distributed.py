@@ -1,6 +1,6 @@
 """Synchronous workers under `torchrun`: averaged gradients and summed statistics.
 
-Without `torchrun` there is one worker and nothing is sent anywhere.
+Without `torchrun` there is one worker and no communication.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Workers:
     Attributes:
         rank: Index of this worker; worker 0 writes logs and checkpoints.
         world_size: Number of workers.
-        device: Where messages travel: the GPU with nccl, else the CPU.
+        device: Device of messages: the GPU with nccl, else the CPU.
     """
 
     rank: int = 0
@@ -29,15 +29,15 @@ class Workers:
 
     @property
     def is_first(self) -> bool:
-        """Whether this worker speaks for all."""
+        """Return whether this is worker 0."""
         return self.rank == 0
 
     def share(self, total: int) -> int:
-        """This worker's part of a total, rounded up so that no worker is left without."""
+        """Return this worker's part of a total, rounded up."""
         return -(-total // self.world_size)
 
     def sum(self, values: Tensor) -> Tensor:
-        """Returns the sum of `values` over all workers, on the device of `values`."""
+        """Return the sum of `values` over all workers, on the device of `values`."""
         if self.world_size == 1:
             return values
         message = values.to(self.device, copy=True)
@@ -45,7 +45,7 @@ class Workers:
         return message.to(values.device)
 
     def average_gradients(self, gradients: Sequence[Tensor]) -> None:
-        """Replaces each gradient by its mean over all workers, in one message."""
+        """Replace each gradient by its mean over all workers, in one message."""
         if self.world_size == 1:
             return
         flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
@@ -55,7 +55,7 @@ class Workers:
             gradient.copy_(part.view_as(gradient))
 
     def broadcast(self, tensors: Sequence[Tensor]) -> None:
-        """Gives every worker the values of worker 0."""
+        """Copy the values of worker 0 to every worker."""
         if self.world_size == 1:
             return
         for tensor in tensors:
@@ -64,17 +64,17 @@ class Workers:
             tensor.detach().copy_(message)
 
     def any(self, flag: bool) -> bool:
-        """Whether the flag is set on any worker; all must call this together."""
+        """Return whether the flag is set on any worker; all must call this together."""
         return bool(self.sum(torch.tensor([float(flag)])).item() > 0)
 
 
 def is_first_worker() -> bool:
-    """Whether this process will be worker 0; known before the workers have joined."""
+    """Return whether this process will be worker 0, before the workers have joined."""
     return os.environ.get('RANK', '0') == '0'
 
 
 def join_workers(device: torch.device) -> Workers:
-    """Joins the workers that `torchrun` started; a single process is alone."""
+    """Join the workers that `torchrun` started, or return a single worker."""
     world_size = int(os.environ.get('WORLD_SIZE', '1'))
     if world_size == 1:
         return Workers()
@@ -86,6 +86,6 @@ def join_workers(device: torch.device) -> Workers:
 
 
 def leave_workers(workers: Workers) -> None:
-    """Ends the connection to the other workers."""
+    """Close the connection to the other workers."""
     if workers.world_size > 1:
         distributed.destroy_process_group()

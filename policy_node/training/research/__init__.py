@@ -1,1 +1,1 @@
-"""What only studies use, chosen in `registry.py`; no other module imports the rest."""
+"""Code that only studies use; other folders import only `registry.py`, which chooses it."""

@@ -1,8 +1,8 @@
 """Importance weights that remove the bias of hindsight from the critic.
 
 A goal that was chosen because an action led to it does not show how often the action leads there.
-For a state s, an action a and a goal g the critic should see the next states s' of the environment,
-p(s'|s, a). With goals drawn from q(g|s, a, s') it sees p(s'|s, a) q(g|s, a, s') / q(g|s, a)
+For a state s, an action a and a goal g the critic should get the next states s' of the environment,
+p(s'|s, a). With goals drawn from q(g|s, a, s') it gets p(s'|s, a) q(g|s, a, s') / q(g|s, a)
 instead, where q(g|s, a) is the mean over s'. The weight
 
     w = q(g|s, a) / q(g|s, a, s')

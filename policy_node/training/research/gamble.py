@@ -1,9 +1,9 @@
-"""A task with a gamble: a random landing that only hindsight takes for a sure thing.
+"""A task with a gamble: a random landing that looks certain in hindsight.
 
 Plappert et al. 2018, request 2: "Consider an environment with a special action which takes the
 agent to a uniformly random state and ends the episode. Such an action would seem to be perfect in
 hindsight if we replay with the goal achieved by the agent in the future." Two Fetch tasks ignore
-their gripper action, so it can be that special one and everything else stays as it is.
+their gripper action, so here it is the special action, and everything else stays as it is.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from msgs_spec.arrays import Array
 from msgs_spec.tasks import TaskSpec
 from policy_node.training.experience.replay import Episodes
 
-# The idle part of the action, and the value above which it is the gamble.
+# Index of the unused value of the action, and the value above which it is the gamble.
 GRIPPER_ACTION = 3
 GAMBLE_ABOVE = 0.9
-# The locked fingers, at 0 m otherwise, tell that an episode is over: without it the state of a
-# landing would look like one that the robot may still leave, and would be no Markov state.
+# Position of the locked fingers after a gamble, otherwise 0 m. Without it the state would not be
+# Markov: a landing would look like a state that the robot can leave.
 _OVER = 1.0
 _OWN_STATE = ('_over', '_landing', '_frozen')
 
 
 class GambleSimulation(Simulation):
-    """Copies of a task in which gambling moves the achieved goal at random and ends the motion.
+    """Simulations in which a gamble moves the achieved goal at random and ends the motion.
 
-    The landing is drawn as goals are, by the generator of the episode, whatever the goal of the
-    episode is. From the gamble to the end of the episode the observation stays as it is then: the
-    achieved goal at the landing, no velocities, fingers at 1 m. Physics go on beneath, unseen.
+    The landing is drawn like a goal by the generator of the episode, independent of its goal. From
+    the gamble to the end of the episode the observation stays constant: the achieved goal at the
+    landing, no velocities, fingers at 1 m. The hidden physics continue.
 
     Args:
         task: One of `config.GAMBLE_TASKS`.
@@ -56,12 +56,12 @@ class GambleSimulation(Simulation):
         self._parts = _parts(self.spec)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state of `Simulation`, and which episodes are over and how they look."""
+        """Return the state of `Simulation` and of the gambles."""
         own = {name: getattr(self, name).copy() for name in _OWN_STATE}
         return {**super().__getstate__(), 'gamble': own}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Goes on from the state, to the same bits."""
+        """Restore the state; the simulation continues bit for bit."""
         super().__setstate__(state)
         self._prepare()
         for name, values in state['gamble'].items():
@@ -80,9 +80,9 @@ class GambleSimulation(Simulation):
             self._landing[index] = self._task.sample_goal(index, self.generator(index))
 
     def step(self, actions: ArrayLike) -> StepResult:
-        """Advances every simulation by one tick, as `Simulation.step`; gambles end the motion."""
+        """Step as `Simulation.step` does; a gamble ends the motion of its episode."""
         result = super().step(actions)
-        # Where MuJoCo gave up, the action was for an episode that is no more.
+        # If a simulation diverged, the action belonged to the episode before.
         may_gamble = ~(self._over | result.diverged)
         gambles = may_gamble & (np.asarray(actions)[:, GRIPPER_ACTION] > GAMBLE_ABOVE)
         self._freeze(np.flatnonzero(gambles), result.observation['observation'])
@@ -92,7 +92,7 @@ class GambleSimulation(Simulation):
         return StepResult(observation, reward, success, result.diverged)
 
     def _freeze(self, ids: NDArray[np.intp], observation: Array) -> None:
-        """Remembers what is seen of simulations that have just gambled."""
+        """Store the observations of simulations that have just gambled."""
         frozen, parts = observation[ids], self._parts
         frozen[:, parts[self.spec.achieved_goal]] = self._landing[ids]
         if self.spec.has_object:
@@ -112,15 +112,14 @@ class GambleSimulation(Simulation):
 
 
 def is_over(observation: NDArray[np.floating], spec: TaskSpec) -> NDArray[np.bool_]:
-    """Whether a gamble has ended the episode, (...,), from observations (..., size)."""
+    """Return whether a gamble has ended the episode, (...,), from observations (..., size)."""
     return np.asarray(observation[..., _parts(spec)['gripper_state'].start] == _OVER)
 
 
 def without_landings(episodes: Episodes, spec: TaskSpec) -> Episodes:
-    """The episodes with what was achieved by a gamble taken back to what was before it.
+    """Return the episodes with the achieved goals before the gamble in place of the landing.
 
-    A landing is no motion of the robot's: which episodes have moved something, and how much, is
-    decided by what comes before it.
+    A landing is no motion of the robot. Only earlier motions count as such.
     """
     over = is_over(episodes.observation, spec)
     # Once over, an episode stays so; at its start it is not.
@@ -132,7 +131,7 @@ def without_landings(episodes: Episodes, spec: TaskSpec) -> Episodes:
 
 
 def _parts(spec: TaskSpec) -> dict[str, slice]:
-    """Where the parts of an observation lie, by name."""
+    """Return the slices of the parts of an observation, by name."""
     starts = np.cumsum([0, *(part.size for part in spec.observation)]).tolist()
     return {
         part.name: slice(start, start + part.size)

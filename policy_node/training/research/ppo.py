@@ -1,9 +1,9 @@
 """Proximal policy optimisation (Schulman et al. 2017, arXiv 1707.06347) for goals.
 
-The policy is the actor with Gaussian noise of `noise_std`, clipped to the range of actions as the
-collector does it. The density of a clipped action is that of the noise beyond the limit (Fujita &
-Maeda 2018, arXiv 1802.07564), so what is learnt from is what was done, but for how far the
-normalisers move with the new episodes; from the fourth cycle on that is next to nothing.
+The policy is the actor with Gaussian noise of `noise_std`, clipped to the range of actions as in
+the collector. The density of a clipped action is that of the noise beyond the limit (Fujita & Maeda
+2018, arXiv 1802.07564). So the densities are those of the collected actions, except that the
+normalizers include the new episodes; from the fourth cycle on the difference is very small.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from policy_node.training.learners.actor_critic import ActorCritic, Losses
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.research.rollouts import RolloutTransitions
 
-# How far an update may move the probability of an action (the paper's value).
+# Largest change of the probability of an action in an update (the paper's value).
 CLIP = 0.2
 # Logarithm of the largest ratio of probabilities: the exponential of 89 is beyond float32.
 LARGEST_LOG_RATIO = 20.0
@@ -31,13 +31,13 @@ _ROOT = math.sqrt(2.0 * math.pi)
 
 
 class PPO(ActorCritic):
-    """Actor, value of states, and one update.
+    """An actor, a critic of states, and one update.
 
     Args:
-        shape: Of both networks.
+        shape: Shape of both networks.
         config: The configuration.
-        device: Where they live.
-        workers: With whom gradients are averaged.
+        device: Device of the networks.
+        workers: This worker among all; gradients are averaged over all.
     """
 
     def __init__(
@@ -52,10 +52,10 @@ class PPO(ActorCritic):
         super().__init__(actor, critic, config, device, workers)
 
     def update(self, batch: Transitions) -> Losses:
-        """Improves values and actor on a batch of rollouts.
+        """Improve critic and actor on a batch of rollouts.
 
         Raises:
-            TypeError: If the batch is of no rollouts.
+            TypeError: If the batch does not come from rollouts.
         """
         if not isinstance(batch, RolloutTransitions):
             raise TypeError(f'PPO learns from RolloutTransitions, not {type(batch).__name__}')
@@ -73,7 +73,7 @@ class PPO(ActorCritic):
     def _actor_loss(self, batch: RolloutTransitions, features: Tensor, weight: Tensor) -> Tensor:
         mean = self.actor(features)
         logs = log_probability(mean, self._noise_std, self.tensor(batch.action))
-        # Beyond the bound an action is so much more or less likely that float32 has no gradient.
+        # Beyond the bound the exponential has no gradient in float32.
         difference = logs - self.tensor(batch.log_probability)
         ratio = difference.clamp(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO).exp()
         advantage = self.tensor(batch.advantage)
@@ -86,14 +86,14 @@ class PPO(ActorCritic):
 
     @torch.no_grad()
     def values(self, observation: Array32, goal: Array32) -> Array32:
-        """Values (...,) of states (..., observation_size) for goals (..., goal_size)."""
+        """Return values (...,) of states (..., observation_size) for goals (..., goal_size)."""
         features = self.actor.features(self.tensor(observation), self.tensor(goal))
         value: Array32 = self.critic(features).squeeze(-1).cpu().numpy()
         return value
 
     @torch.no_grad()
     def log_probabilities(self, observation: Array32, goal: Array32, action: Array32) -> Array32:
-        """Logarithms (...,) of the densities of actions (..., action_size)."""
+        """Return the logarithms (...,) of the densities of actions (..., action_size)."""
         mean = self.actor(self.actor.features(self.tensor(observation), self.tensor(goal)))
         logs = log_probability(mean, self._noise_std, self.tensor(action))
         found: Array32 = logs.cpu().numpy()
@@ -101,7 +101,7 @@ class PPO(ActorCritic):
 
 
 def log_probability(mean: Tensor, deviation: float, action: Tensor) -> Tensor:
-    """Logarithm (...,) of the density of a noisy action that was clipped to [-1, 1].
+    """Return the logarithm (...,) of the density of a noisy action clipped to [-1, 1].
 
     Args:
         mean: (..., action_size).

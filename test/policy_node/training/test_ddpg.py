@@ -227,5 +227,5 @@ def test_precision_and_device_choices() -> None:
     assert choose_device('cpu') == CPU
     if not torch.cuda.is_available():
         assert choose_device('auto') == CPU
-        with pytest.raises(ValueError, match='torch sees no GPU'):
+        with pytest.raises(ValueError, match='torch has no GPU'):
             choose_device('cuda')
