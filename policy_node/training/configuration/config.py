@@ -393,8 +393,12 @@ def _contradictions_of_options(
     )
     yield (
         isinstance(values, Advantages)
-        and (learner.discount != 'time' or critic != Critics(norm=critic.norm)),
-        'advantage needs discount time and one critic of its mean',
+        and (
+            learner.discount != 'time'
+            or critic.norm == 'batch'
+            or critic != Critics(norm=critic.norm)
+        ),
+        'advantage needs discount time and one critic of its mean, without norm batch',
     )
     yield (
         learner.imagined is not None and not isinstance(values, OneStep | Returns | Chosen),

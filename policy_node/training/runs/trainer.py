@@ -1,4 +1,9 @@
-"""The training loop: collect, learn, evaluate, keep the best."""
+"""The training loop.
+
+One cycle (`Trainer._run_cycle`) in steps: collect episodes (`collector.collect`), store them
+(`replay.add`, `experience.normalize`), draw batches with relabelled goals (`experience.batch`),
+learn (`learner.update`), evaluate (`evaluator.evaluate`) and keep the best actor.
+"""
 
 from __future__ import annotations
 
