@@ -13,8 +13,8 @@ from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import DEFAULTS, from_flat
 
 # Recipes of runs that start from nothing.
-FROM_NOTHING = ('paper', 'best', 'robust')
-RECIPES = (*FROM_NOTHING, 'finetune')
+FROM_NOTHING = ('paper', 'best')
+RECIPES = (*FROM_NOTHING, 'robust', 'finetune')
 # Fields that count steps, which are ticks.
 STEP_COUNTS = ('total_steps', 'evaluate_every')
 # Who sets one of these at another rate than 25 Hz decides what happens there.
@@ -46,8 +46,8 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     Args:
         task: Task name.
         recipe: `paper` (Plappert et al. 2018, appendix B), `best` (the best measured here from
-            nothing), `robust` (as `best`, on a disturbed robot) or `finetune` (what goes on from an
-            actor with an object in the hand).
+            nothing), `robust` (imitation of the shipped policy on a disturbed robot) or `finetune`
+            (continues from a shipped policy with an object in the hand).
         **overrides: Fields of `TrainConfig`.
 
     Raises:
@@ -58,7 +58,7 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     task_spec(task)
     recipes = {'paper': _paper, 'best': _best, 'robust': _robust, 'finetune': _finetune}
     values = recipes[recipe](task)
-    if recipe in ('best', 'robust'):
+    if recipe == 'best':
         values |= _at_rate(task, values, overrides)
         values |= _imagined(task, overrides)
     return from_flat({'task': task, 'recipe': recipe, **values}, **overrides)
