@@ -1,1 +1,1 @@
-"""The simulation as Gymnasium sees it."""
+"""Gymnasium environments of the simulation."""

@@ -110,10 +110,10 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         """Starts an episode.
 
         Args:
-            seed: Starts the random generator again; None lets it go on.
-            options: `goal`, (goal size,): the desired goal, instead of one that is drawn. As
-                `Simulation.set_goal` takes it, quaternions are normalised and taken in the
-                hemisphere nearest to the object's. What else is drawn stays that of the seed.
+            seed: Seed of the random generator; None continues it.
+            options: `goal`, (goal size,): the desired goal, instead of a drawn one. As in
+                `Simulation.set_goal`, quaternions are normalised and moved to the hemisphere
+                nearest to the object's. All other draws follow from the seed.
                 `variation`, a dictionary: values of this episode in place of drawn ones, such as
                 `{'friction': 0.7}` (`Simulation.variation` has the names; needs `disturbances`).
                 `start`, a dictionary: `joints`, `joint_velocities`, `object_pose` and
@@ -124,7 +124,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
 
         Raises:
             TypeError: If options is not a dictionary.
-            ValueError: If an option is unknown or the goal is none.
+            ValueError: If an option is unknown or the goal is invalid.
             gymnasium.error.Error: If the seed is no integer or negative.
         """
         check_reset_options(options, allowed=('goal', 'variation', 'start'))
@@ -186,12 +186,12 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return observation, float(reward), False, diverged, info
 
     def _evaluate(self, diverged: bool) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """What a step gives, asked of the methods, in the order of `robot_env.py`."""
+        """Return the result of a step from the methods, in the order of `robot_env.py`."""
         observation = self._get_obs()
         goals = observation['achieved_goal'], self.goal
         info = {'is_success': self._is_success(*goals), 'diverged': diverged}
         terminated = bool(self.compute_terminated(*goals, info))
-        # Whatever a subclass says: the observation of a lost simulation is that of a new episode.
+        # A diverged simulation has started a new episode, so a subclass cannot go on here.
         truncated = bool(self.compute_truncated(*goals, info)) or diverged
         return observation, float(self.compute_reward(*goals, info)), terminated, truncated, info
 
@@ -265,7 +265,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
         return self.simulation.task.sample_goal(0, self.np_random)
 
     def _release_goal(self) -> None:
-        """Who kept the goal until now keeps it."""
+        """Replace the goals by a copy, so that references to the old array keep their values."""
         self.simulation.goals = self.simulation.goals.copy()
 
     def _show(self) -> None:
@@ -273,7 +273,7 @@ class FetchHandEnv(TaskAttributes, gymnasium.Env[Observation, NDArray[np.float32
             self.render()
 
 
-# What is asked after a step, where somebody overrides one of them.
+# Methods that a step calls if a subclass overrides one of them.
 _EVALUATION = (
     '_get_obs',
     '_is_success',

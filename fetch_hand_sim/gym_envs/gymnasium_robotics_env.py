@@ -85,7 +85,7 @@ def as_reference(reward: Any, reward_type: str) -> Any:
 
 
 class RobotEnv(FetchHandEnv, GoalEnv):
-    """What all Fetch and hand environments of the reference have (`robot_env.py`).
+    """Attributes of all Fetch and hand environments of the reference (`robot_env.py`).
 
     Attributes:
         n_substeps: Physics steps per action.
@@ -96,7 +96,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
         fullpath: The MJCF file.
 
     Raises:
-        TypeError: If a subclass has a hook of the reference that is not asked here.
+        TypeError: If a subclass has a hook of the reference that is not called here.
     """
 
     metadata = {'render_modes': RENDER_MODES, 'render_fps': 25}  # noqa: RUF012
@@ -190,7 +190,7 @@ class RobotEnv(FetchHandEnv, GoalEnv):
 
     @property
     def has_object(self) -> bool:
-        """Whether there is an object beside the robot."""
+        """True if the task has an object."""
         return self.spec_of_task.has_object
 
     def render(self) -> Image | None:
@@ -450,7 +450,7 @@ def _sites(model: mujoco.MjModel, prefix: str) -> list[int]:
 
 
 def _goal_kind(task: str) -> tuple[str, str]:
-    """What the reference calls `target_position` and `target_rotation`."""
+    """Return `target_position` and `target_rotation` of the reference."""
     position = 'random' if task_spec(task).position_counts else 'ignore'
     return position, MANIPULATE_CONFIGS[task].target_rotation
 

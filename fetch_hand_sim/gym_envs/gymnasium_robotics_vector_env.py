@@ -38,7 +38,7 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
         **arguments: As `FetchHandVectorEnv` has them.
 
     Raises:
-        ValueError: If an argument is not allowed; the message says what is.
+        ValueError: If an argument is not allowed.
         TypeError: If the task has no such argument.
     """
 
@@ -105,5 +105,5 @@ class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
 
     @cached_property
     def _single(self) -> RobotEnv:
-        """One of them, which knows what they have in common; made when somebody asks."""
+        """One environment, for the attributes that all have in common; made at first use."""
         return make_env(self.spec_of_task.name, control_hz=self.simulation.control_hz)

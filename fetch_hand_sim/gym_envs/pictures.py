@@ -1,4 +1,4 @@
-"""What `render` of the environments gives, for every render mode."""
+"""The results of `render`, for every render mode."""
 
 from __future__ import annotations
 
@@ -154,10 +154,10 @@ def _open_window(scene: Scene, width: int, height: int) -> Any:
 
 
 def check_render_mode(mode: str | None, known: Sequence[str] = RENDER_MODES) -> None:
-    """Refuses a render mode that is not there.
+    """Reject an unknown render mode.
 
     Raises:
-        ValueError: If there is none; the message says what is allowed.
+        ValueError: If the name is unknown.
     """
     if mode not in (None, *known):
         allowed = ', '.join(('None', *known))

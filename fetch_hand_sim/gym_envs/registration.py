@@ -31,7 +31,7 @@ def environment_id(task: str) -> str:
 
 
 def register_environments() -> None:
-    """Registers what is not registered yet; imports nothing that is slow, such as MuJoCo."""
+    """Register the missing ids; import nothing slow, such as MuJoCo."""
     for task in TASKS:
         if environment_id(task) not in gymnasium.registry:
             _register(environment_id(task), _ENV, _VECTOR_ENV, task=task)
@@ -55,8 +55,8 @@ def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
     needs `max_episode_steps` too.
 
     Args:
-        name: The task (`FetchPush`; `msgs_spec.tasks.TASKS` has all), the id, or what `spec` of an
-            environment says.
+        name: The task (`FetchPush`; `msgs_spec.tasks.TASKS` has all), the id, or `spec` of an
+            environment.
         **arguments: As `gymnasium.make` and `FetchHandEnv` have them, such as `reward_type`,
             `render_mode` and `control_hz`.
 
@@ -83,7 +83,7 @@ def _id_of(name: str | EnvSpec) -> str | EnvSpec:
         return name
     if name in TASKS:
         return environment_id(name)
-    # Gymnasium finds the version, or says which ones there are.
+    # Gymnasium finds the version, or lists the existing ones.
     if find_highest_version(None, name.partition('-v')[0]) is not None:
         return name
     reference = '; register_gymnasium_robotics() brings it' if name in reference_ids() else ''
@@ -106,7 +106,7 @@ def _with_length(name: str | EnvSpec, arguments: dict[str, Any]) -> dict[str, An
 
 
 def _spec_of(name: str) -> EnvSpec:
-    """What is registered under an id, as `gymnasium.make` reads it: [module:]id[-v...]."""
+    """Return the spec of an id in the form of `gymnasium.make`: [module:]id[-v...]."""
     module, _, short = name.rpartition(':')
     if module:
         import_module(module)
@@ -127,11 +127,11 @@ def make_vec(
     Episodes are as long in seconds at every rate, as those of `make`.
 
     Args:
-        name: The task, the id, or what `spec` of an environment says.
+        name: The task, the id, or `spec` of an environment.
         num_envs: Number of copies.
-        wrappers: What goes around the batch, the innermost first: wrappers of
-            `gymnasium.wrappers.vector`, or those of single environments that have one of the same
-            name there.
+        wrappers: Wrappers of the batch, the innermost first: those of
+            `gymnasium.wrappers.vector`, or those of single environments that exist there by the
+            same name.
         **arguments: As `FetchHandVectorEnv` has them.
 
     Raises:

@@ -1,4 +1,4 @@
-"""MuJoCo's model and data of a simulation, shared with whoever reaches for them."""
+"""MuJoCo's model and data of a simulation, shared with the user."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from msgs_spec.arrays import Array
 
 
 class SharedPhysics:
-    """What `env.unwrapped.model` and `env.unwrapped.data` give: live, to read and to write.
+    """Live `env.unwrapped.model` and `env.unwrapped.data`, to read and to write.
 
-    What was written into the data counts from the next call on, as if the simulation had come to it
-    itself; so does what was written into the model. Nothing is copied before somebody asks.
+    Changes of model and data take effect in the next call. Nothing is copied before the first
+    access.
     """
 
     # Values of the model when it was first shared, where its physics vary.

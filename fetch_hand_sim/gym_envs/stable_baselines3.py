@@ -33,7 +33,7 @@ class FetchHandVecEnv(VecEnv):
         batch: The environments.
 
     Raises:
-        ValueError: If an argument is not allowed; the message says what is.
+        ValueError: If an argument is not allowed.
     """
 
     def __init__(self, task: str, num_envs: int = 1, **arguments: Any) -> None:
@@ -91,7 +91,7 @@ class FetchHandVecEnv(VecEnv):
         assert self._actions is not None, 'step_async comes before step_wait'
         observation, reward, terminated, truncated, info = self.batch.step(self._actions)
         ended = terminated | truncated
-        # What an ended episode says of its last step.
+        # The info of the last step of an ended episode.
         last = info.get('final_info', info)
         columns = {
             name: np.where(ended, last[name], info.get(name, last[name]))
@@ -139,7 +139,7 @@ class FetchHandVecEnv(VecEnv):
         """Calls a method of the environments.
 
         Raises:
-            AttributeError: If there is none.
+            AttributeError: If the name is unknown.
             ValueError: If it is for all of them only: `reset`, `step` or `close`.
         """
         results = self.batch.call(method_name, *method_args, **method_kwargs)

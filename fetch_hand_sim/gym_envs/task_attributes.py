@@ -1,4 +1,4 @@
-"""What one environment and a batch of them have in common: the task's rewards and thresholds."""
+"""Rewards and thresholds of a task, for one environment and for a batch."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TaskAttributes:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How Gymnasium made it; None where somebody else did."""
+        """The spec from which Gymnasium made the environment; None without one."""
         return self._spec
 
     @spec.setter
@@ -60,9 +60,9 @@ class TaskAttributes:
         return self.simulation.compute_reward(achieved_goal, desired_goal, info)
 
     def overrides(self, name: str) -> bool:
-        """Whether a subclass, or who has the object, brought a method `name` of its own.
+        """True if a subclass or the user has replaced the method `name`.
 
-        Steps and resets then ask it, as those of Gymnasium-Robotics do.
+        Steps and resets then call it, as those of Gymnasium-Robotics do.
         """
         module = getattr(getattr(type(self), name), '__module__', '')
         return name in self.__dict__ or not module.startswith('fetch_hand_sim.')
@@ -76,7 +76,7 @@ class TaskAttributes:
     def compute_truncated(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
     ) -> Any:
-        """Whether MuJoCo lost the simulation at the step that gave `info`.
+        """True if the simulation diverged at the step that returned `info`.
 
         Returns:
             A boolean; an array (N,) for N infos, or for those of a batch of N.
@@ -143,7 +143,7 @@ class TaskAttributes:
 
 
 def _check_task(spec: EnvSpec) -> None:
-    """Refuses what was made by the id of one task and is another; only its spec tells.
+    """Reject an argument `task` that differs from the task of the id.
 
     Raises:
         ValueError: If the argument `task` is not that of the id.

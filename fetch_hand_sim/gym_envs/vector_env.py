@@ -28,7 +28,7 @@ from msgs_spec.arrays import Array, Flags
 from msgs_spec.disturbances import Disturbances
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, RewardType, SuccessRule
 
-# What Gymnasium takes for episodes that no number of steps ends.
+# Gymnasium's value for episodes without a limit of steps.
 _NO_LIMIT = -1
 # A window shows one environment.
 _RENDER_MODES = [mode for mode in RENDER_MODES if mode != 'human']
@@ -140,7 +140,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self.set_thresholds(distance_threshold, rotation_threshold)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Refuses a method that would be asked by single environments and is not here."""
+        """Reject a method that only single environments call."""
         if name in _OF_SINGLE:
             raise TypeError(_refusal(name))
         super().__setattr__(name, value)
@@ -155,7 +155,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
         Args:
             seed: One seed (environment i takes seed + i), one per environment, or None: the random
-                generators go on.
+                generators continue.
             options: `reset_mask`, booleans (N,): which environments start again; default all.
                 `goal`, (N, goal size) or (goal size,) for all of them: desired goals of those that
                 start, as `FetchHandEnv.reset` takes one. `variation` and `start`, likewise: one for
@@ -168,8 +168,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         Raises:
             TypeError: If options is not a dictionary, the mask is no boolean array or a seed is no
                 integer.
-            ValueError: If an option is unknown, mask or goal has another shape, a goal is none, a
-                seed is negative or there are too many or too few.
+            ValueError: If an option is unknown, mask or goal has another shape, a goal or a
+                seed is invalid or the number of seeds is wrong.
             gymnasium.error.ResetNeeded: If the mask leaves out one that was never reset.
         """
         mask = self._reset_mask(options)
@@ -202,15 +202,15 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             actions: (N, action size); what lies outside [-1, 1], also infinitely far, is clipped.
 
         Returns:
-            Observations (N, ...), rewards (N,), terminated (N,), never, truncated (N,), at the end
-            of an episode, or when MuJoCo lost the simulation, both also where a subclass says so,
-            and a dictionary with `is_success` and `diverged` (N,), masked by `_is_success` and
-            `_diverged` where an episode only started. In mode `SAME_STEP` also `final_obs` (N,), a
+            Observations (N, ...), rewards (N,), terminated (N,), truncated (N,) and a dictionary.
+            Only a subclass terminates. Episodes are truncated at their end or if they diverge. The
+            dictionary has `is_success` and `diverged` (N,), masked by `_is_success` and `_diverged`
+            where an episode only started. In mode `SAME_STEP` it also has `final_obs` (N,), a
             dictionary for each episode that ended, and `final_info`.
 
         Raises:
-            ValueError: If the actions have a wrong shape, a value is not a number (NaN), or what a
-                subclass says of endings is not (N,) booleans.
+            ValueError: If the actions have a wrong shape, a value is NaN, or a subclass ends
+                episodes by anything but (N,) booleans.
             gymnasium.error.ResetNeeded: If one was never reset or, in mode `DISABLED`, an
                 episode has ended.
         """
@@ -221,12 +221,12 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             )
         wanted = clip_actions(np.asarray(actions))
         if started.any() and wanted.shape == self.action_space.shape:
-            # They only begin an episode, whatever their action is.
+            # These only begin an episode; their action is ignored.
             wanted = np.where(started[:, None], wanted.dtype.type(0), wanted)
         before = {i: self._random(i).state for i in np.flatnonzero(started).tolist()}
         result = self.simulation.step(wanted)
         for index in np.flatnonzero(started & result.diverged).tolist():
-            # The episode that was drawn because MuJoCo lost it is nobody's.
+            # The episode that replaced the diverged one is not played.
             self._random(index).state = before[index]
         observation, reward = result.observation, self._rewards(result)
         success, diverged = result.success, result.diverged & ~started
@@ -235,7 +235,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
             reward = np.where(started, 0.0, reward)
             success = success & ~started
         self._elapsed = np.where(started, 0, self._elapsed + 1)
-        # Not a `RobotEpisode` each: nobody reads ticks here, and 64 cost half a millisecond.
+        # Not a `RobotEpisode` each: 64 of them cost half a millisecond.
         truncated = has_ended(self._elapsed, self._episode_steps, diverged)
         terminated = self._endings('compute_terminated', result) & ~started
         truncated |= self._endings('compute_truncated', result) & ~started
@@ -259,7 +259,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         return np.asarray(self.compute_reward(*_evaluated(result)), dtype=np.float64)
 
     def _endings(self, name: str, result: StepResult) -> Flags:
-        """Which episodes end by a method that somebody overrides, (N,)."""
+        """Return which episodes an overridden method ends, (N,)."""
         if not self.overrides(name):
             return np.zeros(self.num_envs, dtype=bool)
         ends = getattr(self, name)(*_evaluated(result))
@@ -274,7 +274,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     def _start_next(
         self, last: Observation, info: dict[str, Any], ended: Flags
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts the ended episodes again; says what their last observation was."""
+        """Start the next episodes; return the last observations of the ended ones as well."""
         final = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(ended).tolist():
             final[index] = {name: rows[index] for name, rows in last.items()}
@@ -294,7 +294,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         """The random generator of every environment, (N,), live."""
         for index, seed in enumerate(self._seeds):
             if seed is None:
-                # Who holds it before the first episode finds that drawn from it, too.
+                # A generator that is read before the first episode also draws that episode.
                 fresh, self._seeds[index] = seeding.np_random()
                 self._random(index).state = fresh.bit_generator.state
         return tuple(self.simulation.generator(i) for i in range(self.num_envs))
@@ -321,7 +321,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Calls a method, or gives an attribute, of every environment, as `SyncVectorEnv` does.
 
-        What the environments share, such as `compute_reward`, is called once.
+        Shared methods, such as `compute_reward`, are called once.
 
         Raises:
             AttributeError: If an environment has no such attribute.
@@ -385,7 +385,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         self._pictures.close()
 
     def _each_seed(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        """The seed of each environment; None where its random generator goes on."""
+        """Return the seed of each environment; None continues its random generator."""
         if isinstance(seed, bool) or not isinstance(
             seed, int | np.integer | Sequence | np.ndarray | None
         ):
@@ -395,7 +395,7 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         each = [None] * self.num_envs if seed is None else list(seed)
         if len(each) != self.num_envs:
             raise ValueError(f'{self.num_envs} environments take as many seeds, not {len(each)}')
-        # Who never had a seed draws one that can be told.
+        # An environment without a seed draws one, which `np_random_seed` returns.
         return [
             seeding.np_random()[1] if new is None and old is None else new
             for new, old in zip(each, self._seeds, strict=True)
@@ -416,16 +416,16 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
 
 _SETTABLE = ('reward_type', 'distance_threshold', 'rotation_threshold')
-# What each environment has for itself.
+# Attributes of each environment.
 _OF_EACH: dict[str, Callable[[FetchHandVectorEnv], Sequence[Any]]] = {
     'np_random': lambda batch: batch.np_random,
     'np_random_seed': lambda batch: batch.np_random_seed,
     'goal': lambda batch: list(batch.simulation.goals.copy()),
     'data': lambda batch: [batch.simulation.data(i) for i in range(batch.num_envs)],
 }
-# What one environment of a batch does not do without the others.
+# Methods that all environments of a batch run together.
 _FOR_ALL = ('reset', 'step', 'close')
-# What only single environments ask of a subclass.
+# Methods that only single environments call.
 _OF_SINGLE = ('_get_obs', '_is_success', '_sample_goal')
 # Names of the single environment for what the batch calls otherwise.
 _SHARED = {'action_space': 'single_action_space', 'observation_space': 'single_observation_space'}
@@ -445,7 +445,7 @@ def _evaluated(result: StepResult) -> tuple[Array, Array, dict[str, Any]]:
 
 
 def _masked(values: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
-    """Info as Gymnasium batches it: values (N,) and for whom they count, be it nobody."""
+    """Return info as Gymnasium batches it: values (N,), and masks of the environments."""
     return {**values, **{f'_{name}': mask.copy() for name in values}}
 
 

@@ -1,1 +1,1 @@
-"""What a run is told: fields, their rules, recipes, and options of a command line."""
+"""The configuration of a run: fields, rules, recipes and command-line options."""

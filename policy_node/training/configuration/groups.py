@@ -34,7 +34,7 @@ class Sparse(Checked):
 
     @property
     def narrows(self) -> bool:
-        """Whether goals are met more easily at the start of a run than at its end."""
+        """True if goals are easier to meet at the start of a run than at its end."""
         return self.first_distance != 1.0 or self.first_rotation != 1.0
 
 
@@ -273,7 +273,7 @@ class Ppo(Learner):
 
 @dataclass(frozen=True, slots=True)
 class Imitation(Learner):
-    """Imitation of the policy in `init_from`, which sees the true state (DAgger)."""
+    """Imitate the policy in `init_from` on true states (DAgger)."""
 
     marks: ClassVar[dict[str, Any]] = {'algorithm': 'imitation'}
 

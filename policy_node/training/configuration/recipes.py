@@ -17,13 +17,13 @@ FROM_NOTHING = ('paper', 'best')
 RECIPES = (*FROM_NOTHING, 'robust', 'finetune')
 # Fields that count steps, which are ticks.
 STEP_COUNTS = ('total_steps', 'evaluate_every')
-# Who sets one of these at another rate than 25 Hz decides what happens there.
+# At another rate than 25 Hz, a user who sets one of these gets no automatic changes.
 _DECIDE_AT_RATES = (
     'algorithm discount n_step noise_seconds parameter_noise longest_hold advantage condition '
     'importance subgoal_every goal_choice'
 ).split()
 
-# Who sets one of these does without imagined subgoals, which exclude other values of them.
+# A user who sets one of these gets no imagined subgoals, which exclude other values.
 _EXCLUDE_IMAGINED = (
     'subgoal_prior algorithm subgoal_every condition advantage longest_hold'
 ).split()
@@ -73,7 +73,7 @@ def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any])
     control_hz = overrides.get('control_hz', DEFAULT_CONTROL_HZ)
     if control_hz == DEFAULT_CONTROL_HZ:
         return {}
-    # Refuses a rate that there is not, before anything is multiplied by it.
+    # Reject an invalid rate before it is used.
     task_spec(task, control_hz=control_hz)
     counts = steps_at_rate({**DEFAULTS, **values}, control_hz)
     if control_hz < DEFAULT_CONTROL_HZ or any(name in overrides for name in _DECIDE_AT_RATES):
@@ -214,10 +214,10 @@ def _object_in_hand(task: str) -> dict[str, Any]:
 
 
 def _finetune(task: str) -> dict[str, Any]:
-    """From the shipped actor, which touches its goals, to one that holds them.
+    """Fine-tune the shipped policy, which reaches its goals, until it holds them.
 
-    Goals that are not chosen by where steps led, a short horizon and an actor that learns slowly
-    keep the critic from promising what there is not (docs/lab_notes/training_log.md).
+    Goals that do not depend on outcomes, a short horizon and a slow actor keep the critic from
+    overestimating values (docs/lab_notes/training_log.md).
     """
     if not task.startswith('HandManipulate'):
         raise ValueError(f'recipe finetune is for the tasks with an object in the hand, not {task}')
