@@ -461,7 +461,7 @@ def test_a_policy_is_reset_between_episodes(status_first: bool) -> None:
 
     for _ in range(5):
         play(phase_is_told=True)
-    assert np.count_nonzero(commander._state) == 12
+    assert np.count_nonzero(commander._state) == 16
     runner.end_episode()
     play(phase_is_told=True)
     assert np.count_nonzero(commander._state) == 4

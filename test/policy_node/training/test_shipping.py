@@ -15,6 +15,7 @@ import torch
 from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.machine.distributed import Workers
+from policy_node.training.runs.run import Caller, train_run
 from policy_node.training.runs.run_log import RunLog
 from policy_node.training.runs.trainer import Trainer
 from policy_node.training.ship_actor import main
@@ -31,12 +32,9 @@ TEXT = '{"success_gymnasium": 0.5, "mean_return": -1, "episodes": "9"}'
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    return trained(tmp_path / 'run', 'best')
-
-
-def trained(folder: Path, recipe: str) -> Path:
+    folder = tmp_path / 'run'
     folder.mkdir()
-    trainer = Trainer(recipe_config('FetchReach', recipe, **SMALL), folder, Workers())
+    trainer = Trainer(recipe_config('FetchReach', 'best', **SMALL), folder, Workers())
     log = RunLog(folder, 800, 0.0)
     trainer.train(log)
     log.close()
@@ -119,7 +117,9 @@ def test_a_robust_actor_is_shipped_beside_the_usual_one_and_evaluated_with_its_d
     run: Path, tmp_path: Path
 ) -> None:
     actors = tmp_path / 'actors'
-    assert ship(run, actors, 2) == ship(trained(tmp_path / 'robust', 'robust'), actors, 2) == 0
+    robust = tmp_path / 'robust'
+    train_run(recipe_config('FetchReach', 'robust', **SMALL), robust, caller=Caller(quiet=True))
+    assert ship(run, actors, 2) == ship(robust, actors, 2) == 0
     reports = {name: json.loads((actors / f'{name}.json').read_text()) for name in NAMES}
     assert [report['actor'] for report in reports.values()] == list(NAMES)
     assert 'disturbances' not in reports['FetchReach']
