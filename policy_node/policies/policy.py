@@ -216,11 +216,11 @@ def observation_and_goal(
 def past_before(
     state: Any, episode_start: Any, leading: tuple[int, ...], size: int
 ) -> NDArray[np.float32]:
-    """Return the past actions (*leading, size) before a prediction, newest first.
+    """Return the past actions (`*leading`, size) before a prediction, newest first.
 
     Args:
         state: State that the last prediction returned; None at the start of all episodes.
-        episode_start: Booleans (*leading,), True where an episode starts; its past is zeros.
+        episode_start: Booleans (`*leading`,), True where an episode starts; its past is zeros.
         leading: Leading axes of the observation.
         size: Number of past actions times the action size.
 
