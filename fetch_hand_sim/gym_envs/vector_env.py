@@ -364,8 +364,8 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
         Raises:
             AttributeError: If there is no such attribute, or it cannot be set.
-            ValueError: If there are too many or too few, a goal is none, or a shared one would
-                differ.
+            ValueError: If the number of values is not `num_envs`, a goal is invalid, or the values
+                of a shared attribute differ.
         """
         each = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
         if len(each) != self.num_envs:

@@ -65,10 +65,10 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
 
 
 def _at_rate(task: str, values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """What `best` changes at another rate, so that a run is as long in simulated time.
+    """Return the changes to `best` that keep the simulated time of a run equal at other rates.
 
-    Above 25 Hz also what keeps learning alive: time that is counted as time, and returns that span
-    40 ms (docs/research/rates).
+    Above 25 Hz, learning also needs a discount by time, exploration noise that lasts 40 ms and
+    returns that span 40 ms (docs/research/rates).
     """
     control_hz = overrides.get('control_hz', DEFAULT_CONTROL_HZ)
     if control_hz == DEFAULT_CONTROL_HZ:

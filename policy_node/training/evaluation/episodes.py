@@ -31,7 +31,7 @@ class EpisodeOutcomes:
         success_paper: Success at the last step, rule of the paper's text.
         touched: Success (rule of the simulation) at any step.
         episode_return: Sum of rewards.
-        diverged: MuJoCo lost the episode; it counts as a failure.
+        diverged: The simulation diverged; the episode counts as a failure.
         ticks_reached: Ticks in success (rule of the simulation) that another tick follows.
         ticks_kept: Those of them that are followed by success.
         long_way: The quaternions of goal and object had opposite signs at the start, so that the
