@@ -12,6 +12,7 @@ from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
 from fetch_hand_sim.simulation.tasks import Task
+from fetch_hand_sim.simulation.tasks.task import free_joint
 from msgs_spec.arrays import Array
 from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TaskSpec
@@ -262,10 +263,10 @@ def _read_object_velocity(given: Any, task: Task, start: StartState) -> None:
 
 def _object_places(task: Task) -> tuple[int, int]:
     """Return where the object's pose and velocity begin in `qpos` and `qvel`."""
-    free = np.flatnonzero(task.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE.value)
-    if not free.size:
+    joint = free_joint(task.model)
+    if joint is None:
         raise ValueError(f'start: {task.spec.name} has no object; allowed: {_listed(PARTS[:2])}')
-    return int(task.model.jnt_qposadr[free[0]]), int(task.model.jnt_dofadr[free[0]])
+    return int(task.model.jnt_qposadr[joint]), int(task.model.jnt_dofadr[joint])
 
 
 def _numbers(name: str, given: Any, count: int) -> Array:
@@ -292,10 +293,11 @@ def _require_apart(start: StartState, task: Task) -> None:
     data = task.new_data(task.start_state)
     start.write(data.qpos, data.qvel)
     mujoco.mj_forward(task.model, data)
-    model = task.model
-    free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE.value
+    model, joint = task.model, free_joint(task.model)
     # The task places an object that is not given, after this check.
-    elsewhere = set() if _is_object_given(start, task) else set(model.jnt_bodyid[free].tolist())
+    elsewhere = set()
+    if joint is not None and int(model.jnt_qposadr[joint]) not in start.positions:
+        elsewhere = {int(model.jnt_bodyid[joint])}
     for contact in data.contact:
         bodies = [int(model.geom_bodyid[geom]) for geom in contact.geom]
         if contact.dist < -_DEEPEST and not elsewhere & set(bodies):
@@ -304,8 +306,3 @@ def _require_apart(start: StartState, task: Task) -> None:
                 f'start: {first} and {second} would overlap by {-1e3 * contact.dist:.0f} mm; '
                 f'allowed: up to {1e3 * _DEEPEST:g} mm'
             )
-
-
-def _is_object_given(start: StartState, task: Task) -> bool:
-    free = np.flatnonzero(task.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE.value)
-    return bool(free.size) and int(task.model.jnt_qposadr[free[0]]) in start.positions

@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from fetch_hand_sim.simulation.tasks import Task
-from fetch_hand_sim.simulation.tasks.task import chain_dofs
+from fetch_hand_sim.simulation.tasks.task import chain_dofs, free_joint
 from fetch_hand_sim.simulation.varied_physics import VariedPhysics, first_body, joint_dofs
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import MOST_TICKS, Disturbances, PhysicsDisturbance
@@ -97,7 +96,9 @@ class Disturber:
         self._pushed_body = _pushed_body(task)
         gravity = float(np.linalg.norm(task.model.opt.gravity))
         self._weight = gravity * float(task.model.body_subtreemass[self._pushed_body])
-        self._object = _object_address(task.model)
+        joint = free_joint(task.model)
+        # Index of the object's pose in qpos.
+        self._object = None if joint is None else int(task.model.jnt_qposadr[joint])
         model, names = task.model, task.spec.robot.joints
         self._joint_qpos = np.array([int(model.joint(names[i]).qposadr[0]) for i in self._angles])
         self._levers = _levers(task) if self._moves_joint_readings() else {}
@@ -389,12 +390,6 @@ def _turned(quaternion: Array, turn: Array) -> Array:
     axis = turn / np.maximum(angle, 1e-12)
     rotation = np.concatenate([np.cos(angle / 2.0), np.sin(angle / 2.0) * axis], axis=1)
     return quaternion_multiply(rotation, quaternion)
-
-
-def _object_address(model: mujoco.MjModel) -> int | None:
-    """Where the object's pose begins in qpos; None without an object."""
-    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE.value)
-    return int(model.jnt_qposadr[free[0]]) if free.size else None
 
 
 def _pushed_body(task: Task) -> int:

@@ -317,6 +317,12 @@ def joint_qvel_slice(model: mujoco.MjModel, name: str) -> slice:
     return slice(address, address + 6)
 
 
+def free_joint(model: mujoco.MjModel) -> int | None:
+    """Return the index of the object's free joint; None without an object."""
+    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE.value)
+    return int(free[0]) if free.size else None
+
+
 def chain_dofs(model: mujoco.MjModel, body: int) -> NDArray[np.intp]:
     """Return the degrees of freedom that move a body, ascending."""
     dofs: list[int] = []
