@@ -15,6 +15,11 @@ from policy_node.training.evaluation.episodes import EpisodeOutcomes, evaluate, 
 EVALUATION_SEED = 1_000_000_000
 
 
+def training_seeds(sequence: np.random.SeedSequence, count: int) -> list[int]:
+    """Return seeds of `count` training episodes; evaluation never uses them."""
+    return [int(seed) % EVALUATION_SEED for seed in sequence.generate_state(count) >> 2]
+
+
 class Evaluator:
     """Evaluates on the same episodes each time, in simulations of its own.
 

@@ -1,7 +1,7 @@
 """Imitate a policy of the undisturbed robot on a disturbed one (DAgger, Ross et al. 2011).
 
 The imitating policy acts. The imitated policy answers each state as it truly is at the tick in
-which the action arrives, so that latency is learned away; see docs/robustness.md.
+which the action arrives, so that latency is learned away; see docs/robust_policies.md.
 """
 
 from __future__ import annotations
@@ -15,19 +15,18 @@ import torch
 from torch import Tensor
 
 from msgs_spec.arrays import Array, Array32
-from node_runtime.command_line import complain
 from policy_node.policies.actor import Actor
 from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
-from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
+from policy_node.training.evaluation.evaluator import Evaluator, training_seeds
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.machine.host import split_threads
 from policy_node.training.research.registry import make_simulation, network_shape
 from policy_node.training.runs.initial_networks import InitialNetworks
-from policy_node.training.runs.run_folder import LATEST_FILE, NAME, RunFolder
+from policy_node.training.runs.run_folder import LATEST_FILE, RunFolder
 from policy_node.training.runs.run_log import RunLog, progress_row
-from policy_node.training.runs.training_state import Counters, RunClock, part_of
+from policy_node.training.runs.training_state import Counters, RunClock, ended_by, part_of
 
 
 class Answers:
@@ -107,7 +106,11 @@ class ImitationTrainer:
         self._stop_reason = reason
 
     def train(self, log: RunLog | None = None) -> str:
-        """Run until a limit is reached or `stop` is called; return why it ended."""
+        """Run until a limit is reached or `stop` is called; return why it ended.
+
+        Raises:
+            OSError: If a file cannot be written; the earlier files stay.
+        """
         config, counters, clock = self.config, self.counters, RunClock(self.counters)
         while True:
             before = time.monotonic()
@@ -116,6 +119,9 @@ class ImitationTrainer:
             clock.update()
             reason = self._reason_to_stop()
             outcomes = self._evaluate(is_last=bool(reason))
+            reason = reason or self._reason_to_stop()
+            if outcomes is not None or reason:
+                self._folder.save_actor(LATEST_FILE, self.actor, counters.env_steps)
             row = progress_row(counters, success, outcomes, config.collect.success_rule, [])
             seconds = max(time.monotonic() - before, 1e-9)
             ticks = self._simulation.spec.episode_ticks
@@ -129,7 +135,6 @@ class ImitationTrainer:
             if log is not None:
                 log.write(row)
             if reason:
-                self._save()
                 return reason
 
     def _collect(self) -> float:
@@ -137,9 +142,10 @@ class ImitationTrainer:
         simulation, ticks = self._simulation, self._simulation.spec.episode_ticks
         count = simulation.num_envs
         seeds = np.random.SeedSequence([self.config.seed, self.counters.env_steps])
-        resets = seeds.generate_state(count) >> 2
-        observation = simulation.reset(seed=[int(each) % EVALUATION_SEED for each in resets])
-        latency = [simulation.variation(i).get('action_latency', 0.0) for i in range(count)]
+        observation = simulation.reset(seed=training_seeds(seeds, count))
+        latency = np.array(
+            [int(simulation.variation(i).get('action_latency', 0)) for i in range(count)]
+        )
         past = np.zeros((count, self.actor.shape.past_size), np.float32)
         nothing, diverged = past.copy(), np.zeros(count, np.bool_)
         inputs, answers = [], []
@@ -153,8 +159,8 @@ class ImitationTrainer:
             past = past_after(past, action)
             result = simulation.step(action)
             observation, diverged = result.observation, diverged | result.diverged
-        for delay in np.unique(latency).astype(int):
-            rows = np.flatnonzero((np.array(latency) == delay) & ~diverged)
+        for delay in np.unique(latency):
+            rows = np.flatnonzero((latency == delay) & ~diverged)
             # An action takes effect `delay` ticks later; the last ones never do.
             early = torch.stack(inputs[: ticks - delay])[:, rows].flatten(0, 1)
             late = torch.stack(answers[delay:])[:, rows].flatten(0, 1)
@@ -191,21 +197,8 @@ class ImitationTrainer:
         counters.next_evaluation = counters.env_steps + self.config.run.evaluate_every
         outcomes = self._evaluator.evaluate(self.actor, -1.0)
         self._folder.keep_best(outcomes, self.actor, counters)
-        self._save()
         return outcomes
 
-    def _save(self) -> None:
-        try:
-            self._folder.save_actor(LATEST_FILE, self.actor, self.counters.env_steps)
-        except OSError as error:
-            complain(NAME, f'no checkpoint, the one before is kept: {error}')
-
     def _reason_to_stop(self) -> str:
-        limits = self.config.run
-        if self._stop_reason:
-            return self._stop_reason
-        if self.counters.env_steps >= limits.total_steps:
-            return f'total_steps {limits.total_steps:,} reached'
-        if limits.time_limit and self.counters.seconds >= limits.time_limit:
-            return f'time_limit {limits.time_limit:g} s reached'
-        return ''
+        _, ended = ended_by(self.config.run, self.counters) or ('', '')
+        return self._stop_reason or ended

@@ -83,7 +83,7 @@ class InitialNetworks:
     def require_fit(self, config: TrainConfig) -> None:
         """Raise ValueError if a run with this configuration cannot start from these networks."""
         ours = described(network_shape(config), config.network.goal_features)
-        theirs = described(self._with_past_of(config).shape, self.goal_features)
+        theirs = described(self._shape_in(config), self.goal_features)
         if can_widen(self.shape.hidden_sizes, config.network.hidden_sizes):
             theirs['hidden_sizes'] = config.network.hidden_sizes
         differing = [
@@ -135,13 +135,18 @@ class InitialNetworks:
         tensors = widened(fitted.tensors, config.network.hidden_sizes)
         return replace(fitted, tensors=tensors, shape=wider)
 
+    def _shape_in(self, config: TrainConfig) -> NetworkShape:
+        """Return the shape with the past actions of a run, or with their own if they have some."""
+        past = self.shape.past_actions or config.network.past_actions
+        return replace(self.shape, past_actions=past)
+
     def _with_past_of(self, config: TrainConfig) -> InitialNetworks:
         """Return these networks with the past actions of a run as inputs, if they have none.
 
         The weights of these inputs start at zero; the normaliser starts at mean 0 and deviation 1.
         """
-        shape = replace(self.shape, past_actions=config.network.past_actions)
-        if self.shape.past_actions or not shape.past_actions:
+        shape = self._shape_in(config)
+        if shape == self.shape:
             return self
         tensors = with_inputs(self.tensors, shape.past_start, shape.past_size)
         added = {'mean': 0.0, 'std': 1.0, 'total': 0.0}

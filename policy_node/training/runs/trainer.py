@@ -24,7 +24,7 @@ from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Critics, Ppo
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
-from policy_node.training.evaluation.evaluator import EVALUATION_SEED, Evaluator
+from policy_node.training.evaluation.evaluator import Evaluator, training_seeds
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.replay_file import load_replay
 from policy_node.training.learners.actor_critic import Losses
@@ -48,6 +48,7 @@ from policy_node.training.runs.run_log import RunLog, progress_row
 from policy_node.training.runs.training_state import (
     Counters,
     RunClock,
+    ended_by,
     fitting,
     load_networks,
     load_state,
@@ -126,9 +127,7 @@ class Trainer:
         config = self.config
         seeds = np.random.SeedSequence([config.seed, self.workers.rank, env_steps])
         collector_seeds, sampler_seed = seeds.spawn(2)
-        # Evaluation uses larger seeds, so its episodes are never trained on.
-        resets = collector_seeds.generate_state(self.simulation.num_envs) >> 2
-        starts = [int(seed) % EVALUATION_SEED for seed in resets]
+        starts = training_seeds(collector_seeds, self.simulation.num_envs)
         self.collector = make_collector(self.simulation, starts, config)
         return np.random.default_rng(sampler_seed)
 
@@ -375,14 +374,7 @@ class Trainer:
 
     def _ended(self) -> tuple[str, str] | None:
         """Return the field that ends the run and the reason in words, or None."""
-        config, counters = self.config, self.counters
-        if 0 < config.run.success_target <= counters.best_success:
-            return 'success_target', f'success target {config.run.success_target:g} reached'
-        if counters.env_steps >= config.run.total_steps:
-            return 'total_steps', f'{config.run.total_steps:,} environment steps done'
-        if 0 < config.run.time_limit <= counters.seconds:
-            return 'time_limit', f'time limit of {config.run.time_limit:g} s reached'
-        return None
+        return ended_by(self.config.run, self.counters)
 
     def _reason_to_stop(self) -> str:
         _, ended = self._ended() or ('', '')
