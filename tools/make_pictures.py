@@ -165,11 +165,11 @@ def film(acts: Mapping[str, Act]) -> Iterator[Picture]:
     """Yields the sheets of the film."""
     cameras = [Camera(task, TILE) for task in acts]
     players = [play(camera, act) for camera, act in zip(cameras, acts.values(), strict=True)]
+    text = caption(len(acts)) if len(acts) % COLUMNS else None
     with progress('film', FRAMES) as advance:
         for _ in range(FRAMES):
             sheet = tile([next(player) for player in players], COLUMNS)
-            if -len(acts) % COLUMNS:
-                text = caption(len(acts))
+            if text is not None:
                 sheet[-text.shape[0] :, -text.shape[1] :] = text
             yield sheet
             advance(1)

@@ -20,7 +20,7 @@ def test_an_episode_has_a_tick_at_any_rate(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 class Package:
-    """An entry point of a package of somebody else."""
+    """An entry point of a third-party package."""
 
     def __init__(self, package: str, name: str, given: object) -> None:
         self.dist = self
