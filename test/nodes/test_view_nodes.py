@@ -328,6 +328,8 @@ def test_commands_of_the_page_never_reach_the_next_robot(start_process: Start, t
             return picture.task == task and picture.facts.seed >= 7 and picture.facts.tick > 20
 
         follower.until(is_next, 'next robot')
+        # The viewer may have found the publishers of the next robot before this client did.
+        connection.spin_until(lambda: connection.received['applied_command'], 'applied command')
         assert not follower.picture.facts.is_commanding
         source = topic(REACH, 'applied_command')
         applied = [decode(source, each) for each in connection.received['applied_command']]
