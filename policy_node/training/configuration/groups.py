@@ -275,6 +275,10 @@ class Ppo(Learner):
 class Imitation(Learner):
     """Imitate the policy in `init_from` on true states (DAgger)."""
 
+    value_weight: Annotated[float, Range(0, 1000)] = 0.0
+    """Weight of the value that an action loses against the action of the imitated policy, by its
+    critic. It is added to the mean squared difference of the actions."""
+
     marks: ClassVar[dict[str, Any]] = {'algorithm': 'imitation'}
 
     @property

@@ -18,8 +18,10 @@ from msgs_spec.arrays import Array, Array32
 from policy_node.policies.actor import Actor
 from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import Imitation
 from policy_node.training.evaluation.episodes import EpisodeOutcomes
 from policy_node.training.evaluation.evaluator import Evaluator, training_seeds
+from policy_node.training.learners.ddpg import Critic
 from policy_node.training.machine.distributed import Workers
 from policy_node.training.machine.host import split_threads
 from policy_node.training.research.registry import make_simulation, network_shape
@@ -33,26 +35,34 @@ class Answers:
     """The newest inputs of the imitating policy and the answers of the imitated one.
 
     Args:
-        capacity: Most pairs kept.
-        inputs: Length of an input.
+        capacity: Most rows kept.
+        features: Length of an input.
         action_size: Length of an answer.
     """
 
-    def __init__(self, capacity: int, inputs: int, action_size: int) -> None:
-        self._inputs = torch.empty(capacity, inputs)
-        self._answers = torch.empty(capacity, action_size)
-        self._count = 0
+    def __init__(self, capacity: int, features: int, action_size: int) -> None:
+        sizes = (features, features, action_size)
+        self._parts = [torch.empty(capacity, size) for size in sizes]
+        self._capacity, self._count = capacity, 0
 
-    def add(self, inputs: Tensor, answers: Tensor) -> None:
-        """Store inputs (n, features) and answers (n, action size)."""
-        rows = (self._count + torch.arange(len(inputs))) % len(self._inputs)
-        self._inputs[rows], self._answers[rows] = inputs, answers
+    def add(self, inputs: Tensor, states: Tensor, answers: Tensor) -> None:
+        """Store rows.
+
+        Args:
+            inputs: (n, features) of the imitating policy.
+            states: (n, features) of the true state in which the action arrives.
+            answers: (n, action size) of the imitated policy in this state.
+        """
+        rows = (self._count + torch.arange(len(inputs))) % self._capacity
+        for part, values in zip(self._parts, (inputs, states, answers), strict=True):
+            part[rows] = values
         self._count += len(inputs)
 
-    def draw(self, count: int) -> tuple[Tensor, Tensor]:
-        """Draw `count` random pairs."""
-        rows = torch.randint(min(self._count, len(self._inputs)), (count,))
-        return self._inputs[rows], self._answers[rows]
+    def draw(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw `count` random rows: inputs, states and answers."""
+        rows = torch.randint(min(self._count, self._capacity), (count,))
+        inputs, states, answers = (part[rows] for part in self._parts)
+        return inputs, states, answers
 
 
 class ImitationTrainer:
@@ -67,7 +77,7 @@ class ImitationTrainer:
         init_from: The policy to imitate.
 
     Raises:
-        ValueError: With several workers.
+        ValueError: With several workers, or if `value_weight` needs a critic and there is none.
     """
 
     def __init__(
@@ -81,7 +91,9 @@ class ImitationTrainer:
     ) -> None:
         if workers.world_size > 1:
             raise ValueError(f'{workers.world_size} workers; algorithm imitation needs 1')
+        assert isinstance(config.learner, Imitation)
         self.config, self.workers, self.counters = config, workers, Counters()
+        self._learner = config.learner
         origin = init_from.origin
         self._folder = RunFolder(output, config, workers, command, source_revision, origin)
         threads, torch_threads = split_threads(config)
@@ -94,12 +106,27 @@ class ImitationTrainer:
         self.actor.load_state_dict(part_of(init_from.tensors, 'actor'))
         # The past actions, which the imitated policy does not have, have zero weights here.
         self._imitated = copy.deepcopy(self.actor).requires_grad_(False)
+        self._critic = self._make_critic(init_from)
         self._optimizer = torch.optim.Adam(self.actor.network.parameters())
         shape, capacity = self.actor.shape, config.replay.replay_transitions
         self._answers = Answers(
             min(capacity, config.run.total_steps), shape.feature_size, shape.action_size
         )
         self._stop_reason = ''
+
+    def _make_critic(self, init_from: InitialNetworks) -> Critic | None:
+        if not self._learner.value_weight:
+            return None
+        shape = self.actor.shape
+        critic = Critic(shape.feature_size + shape.action_size, shape)
+        try:
+            critic.load_state_dict(part_of(init_from.tensors, 'critic'))
+        except RuntimeError:
+            name = init_from.origin['name']
+            raise ValueError(
+                f'value_weight {self._learner.value_weight}: {name} has no single critic beside it'
+            ) from None
+        return critic.requires_grad_(False)
 
     def stop(self, reason: str) -> None:
         """Request the end of the run after the current cycle."""
@@ -148,12 +175,13 @@ class ImitationTrainer:
         )
         past = np.zeros((count, self.actor.shape.past_size), np.float32)
         nothing, diverged = past.copy(), np.zeros(count, np.bool_)
-        inputs, answers = [], []
+        inputs, states, answers = [], [], []
         for _ in range(ticks):
             goal = torch.tensor(observation['desired_goal'], dtype=torch.float32)
             true = simulation.observe_from(simulation.true_readings())['observation']
             with torch.no_grad():
-                answers.append(self._imitated(self._features(true, nothing, goal)))
+                states.append(self._features(true, nothing, goal))
+                answers.append(self._imitated(states[-1]))
                 inputs.append(self._features(observation['observation'], past, goal))
                 action = self.actor(inputs[-1]).numpy()
             past = past_after(past, action)
@@ -162,9 +190,8 @@ class ImitationTrainer:
         for delay in np.unique(latency):
             rows = np.flatnonzero((latency == delay) & ~diverged)
             # An action takes effect `delay` ticks later; the last ones never do.
-            early = torch.stack(inputs[: ticks - delay])[:, rows].flatten(0, 1)
-            late = torch.stack(answers[delay:])[:, rows].flatten(0, 1)
-            self._answers.add(early, late)
+            parts = inputs[: ticks - delay], states[delay:], answers[delay:]
+            self._answers.add(*(torch.stack(part)[:, rows].flatten(0, 1) for part in parts))
         self.counters.env_steps += count * ticks
         self.counters.episodes += count
         return float(result.success.mean())
@@ -175,14 +202,18 @@ class ImitationTrainer:
 
     def _learn(self) -> float:
         """Fit the actor to stored answers; return the mean loss."""
-        learner, total = self.config.learner, 0.0
+        learner, total = self._learner, 0.0
         left = max(1.0 - self.counters.env_steps / self.config.run.total_steps, 0.0)
         share = learner.final_learning_rate + (1.0 - learner.final_learning_rate) * left
         for group in self._optimizer.param_groups:
             group['lr'] = learner.learning_rate * share
         for _ in range(learner.updates_per_cycle):
-            inputs, answers = self._answers.draw(learner.batch_size)
-            loss = (self.actor(inputs) - answers).square().mean()
+            inputs, states, answers = self._answers.draw(learner.batch_size)
+            actions = self.actor(inputs)
+            loss = (actions - answers).square().mean()
+            if self._critic is not None:
+                lost = self._critic(states, answers) - self._critic(states, actions)
+                loss = loss + learner.value_weight * lost.mean()
             self._optimizer.zero_grad()
             loss.backward()
             self._optimizer.step()

@@ -29,7 +29,7 @@ def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_pat
     trainer = ImitationTrainer(config, tmp_path, Workers(), '', '', networks)
     trainer._collect()
     pairs = 2 * (TASKS[task].episode_ticks - 1)
-    inputs, answers = trainer._answers._inputs[:pairs], trainer._answers._answers[:pairs]
+    inputs, _, answers = (part[:pairs] for part in trainer._answers._parts)
     # Without other disturbances, the next input contains the state in which the action arrives.
     imitated, size = load_actor(task, task), config.network.past_actions * 4
     start = trainer.actor.shape.past_start
@@ -39,13 +39,28 @@ def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_pat
     assert not torch.allclose(answers[:-2], expected[:-2], rtol=1e-3, atol=1e-3)
 
 
+def test_the_critic_of_the_imitated_policy_judges_the_actions(tmp_path: Path) -> None:
+    task = 'FetchSlide'
+    config = recipe_config(task, 'robust', num_envs=2, value_weight=1.0, updates_per_cycle=5)
+    networks = read_initial_networks(task).fitted(config)
+    trainer = ImitationTrainer(config, tmp_path, Workers(), '', '', networks)
+    trainer._collect()
+    _, states, answers = trainer._answers.draw(64)
+    # The imitated policy was trained to maximise the values of this critic.
+    assert trainer._critic is not None
+    assert trainer._critic(states, answers).mean() > trainer._critic(states, -answers).mean()
+    before = trainer.actor(states).detach()
+    trainer._learn()
+    assert not torch.equal(before, trainer.actor(states))
+
+
 def test_the_newest_answers_are_kept() -> None:
     answers = Answers(3, 1, 1)
     for value in range(5):
-        answers.add(torch.full((1, 1), float(value)), torch.full((1, 1), -float(value)))
-    inputs, outputs = answers.draw(200)
+        answers.add(*(torch.full((1, 1), factor * value) for factor in (1.0, 10.0, -1.0)))
+    inputs, states, outputs = answers.draw(200)
     assert set(inputs.flatten().tolist()) == {2.0, 3.0, 4.0}
-    assert torch.equal(outputs, -inputs)
+    assert torch.equal(states, 10.0 * inputs) and torch.equal(outputs, -inputs)
 
 
 def test_a_run_writes_a_policy_with_past_actions(tmp_path: Path) -> None:
@@ -67,6 +82,10 @@ def test_a_run_writes_a_policy_with_past_actions(tmp_path: Path) -> None:
         (['--set', 'algorithm=imitation'], 'init_from'),
         (['--recipe', 'robust', '--set', 'gamma=.9', '--set', 'past_actions=99'], 'past_actions'),
         (['--recipe', 'robust', '--set', 'subgoal_every=5'], 'subgoal_every'),
+        (
+            ['--task', 'FetchPush', '--recipe', 'robust', '--set', 'value_weight=1'],
+            'no single critic',
+        ),
     ],
 )
 def test_a_setting_that_does_not_fit_is_one_line(
