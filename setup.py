@@ -40,6 +40,7 @@ TEST = [
     'colcon-ros',
     'mcap-ros2-support',
     'pytest',
+    'pytest-rerunfailures',
     'pytest-timeout',
     'pytest-xdist',
     # colcon-core needs it below 80.
