@@ -187,13 +187,8 @@ def test_a_stopped_simulation_counts_missed_ticks_and_never_catches_up(
     end(sim)
 
 
-def test_two_arms_and_two_hands_in_one_graph(start_process: Start, tmp_path: Path) -> None:
-    robots = {
-        'arm1': 'FetchReach',
-        'arm2': 'FetchReach',
-        'hand1': 'HandReach',
-        'hand2': 'HandReach',
-    }
+def test_two_arms_and_a_hand_in_one_graph(start_process: Start, tmp_path: Path) -> None:
+    robots = {'arm1': 'FetchReach', 'arm2': 'FetchReach', 'hand': 'HandReach'}
     sims, policies = {}, []
     for index, (name, task) in enumerate(robots.items()):
         namespace = ['-r', f'__ns:=/{name}']
@@ -222,9 +217,8 @@ def test_two_arms_and_two_hands_in_one_graph(start_process: Start, tmp_path: Pat
     def states(name: str) -> list[bytes]:
         return [m.data for m in logged[name][0].topics[f'/{name}/joint_states'].messages]
 
-    # Alone in their namespaces: equal robots with equal commanders do the same.
+    # Alone in their namespaces: equal robots with equal policies do the same.
     assert states('arm1') == states('arm2')
-    assert states('hand1') == states('hand2')
     for policy in policies:
         end(policy)
 
@@ -303,7 +297,7 @@ def test_ctrl_c_at_any_moment_ends_with_0_and_no_traceback(
 ) -> None:
     arguments = ros_args(policy='FetchReach') if command is POLICY_NODE else ros_args()
     robot = start_process(*SIM_NODE, *ros_args(mode='lockstep'))
-    delays = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.8, 1.2, 2.0, 3.0)
+    delays = (0.0, 0.05, 0.2, 0.5, 1.2, 3.0)
     for group in (delays[::2], delays[1::2]):
         processes = [start_process(*command, *arguments) for _ in group]
         for process in processes:

@@ -23,7 +23,6 @@ from msgs_spec.codecs import decode_status, message_stamp
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import TickEncoder
-from msgs_spec.topics import topics
 from policy_node.node.commander import Commander
 from policy_node.node.responder import Responder
 from policy_node.policies.loading import load_policy
@@ -303,9 +302,3 @@ def test_two_commanders_are_reported_and_health_is_published(start_process: Star
     assert code == 0
     assert '2 publish commands: /client, /policy_node' in output
     assert finish(policy)[0] == 0
-
-
-def test_topics_of_the_batch_are_those_of_a_log() -> None:
-    (episode,) = batch_run(REACH, 1)
-    published = {'/' + s.name.lstrip('/') for s in topics(REACH) if s.direction == 'published'}
-    assert set(episode) == published | {'/commands'}

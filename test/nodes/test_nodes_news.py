@@ -114,19 +114,6 @@ def test_publishers_that_the_robot_cannot_receive_are_reported(start_process: St
     assert all(line in output for line in lines)
 
 
-def test_a_robot_in_another_namespace_names_the_policy_that_waits(start_process: Start) -> None:
-    policy = start_process(*POLICY_NODE)
-    sim = start_process(*SIM_NODE, *ros_args(mode='lockstep'), '-r', '__ns:=/arm1')
-    text = 'no node publishes any; /policy_node waits for a robot on /episode_status'
-    with client(REACH) as robot:
-        robot.subscribe('/diagnostics')
-        robot.spin_until(
-            lambda: any(text in each.message for each in robot.reports('/arm1/sim_node')), 'line'
-        )
-    end(sim)
-    end(policy)
-
-
 @pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
 def test_the_state_after_a_reset_comes_also_while_the_robot_stands_still(
     start_process: Start, mode: str
@@ -162,8 +149,9 @@ def test_a_late_subscriber_of_a_standing_robot_receives_its_last_state(
         robot.spin(0.2)
         last = message_stamp(robot.received['joint_states'][-1])
     with client(REACH, 'late') as robot:
-        robot.subscribe('joint_states', 'end_effector_pose', 'achieved_goal', 'desired_goal')
-        robot.spin_until(lambda: len(robot.received) == 4, 'the last state', 5.0)
-        stamps = {message_stamp(each[0]) for each in robot.received.values()}
-        assert stamps == {last}
+        names = ('joint_states', 'end_effector_pose', 'achieved_goal', 'desired_goal')
+        robot.subscribe(*names, 'episode_status')
+        robot.spin_until(lambda: len(robot.received) == 5, 'the last state')
+        assert {message_stamp(robot.received[name][0]) for name in names} == {last}
+        assert robot.statuses()[-1].task == 'FetchReach'
     end(sim)

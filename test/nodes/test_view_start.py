@@ -55,8 +55,7 @@ def start_view(start_process: Start, *arguments: str) -> tuple[subprocess.Popen[
     return view, said
 
 
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGHUP])
-@pytest.mark.parametrize('is_loaded', [False, True])
+@pytest.mark.parametrize(('number', 'is_loaded'), [(signal.SIGKILL, False), (signal.SIGHUP, True)])
 def test_the_nodes_end_with_who_started_them(
     start_process: Start, number: signal.Signals, is_loaded: bool
 ) -> None:

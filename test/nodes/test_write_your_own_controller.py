@@ -35,7 +35,7 @@ def test_it_is_short_and_knows_only_ros(controller):
     assert imported == {'rclpy', 'geometry_msgs', 'std_msgs'}
 
 
-@pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
+@pytest.mark.parametrize('mode', ['realtime', pytest.param('lockstep', marks=pytest.mark.release)])
 def test_it_drives_the_arm_to_its_goals(controller, start_process, tmp_path, mode):
     start_process(sys.executable, controller, cwd=tmp_path)
     arguments = ros_args(

@@ -76,7 +76,7 @@ def test_a_file_of_a_task_that_is_not_installed(capsys, tmp_path):
         (['--policy', 'x', '--wait', '0'], '--policy: only together with --task', ''),
         (['--episode-dir', 'x', '--wait', '0'], '--episode-dir: only together with --task', ''),
         (['--wait=nan'], '--wait nan; allowed: 0 and more', ''),
-        (['--wait=-3'], '--wait -3; allowed: 0 and more', ''),
+        (['--port', '99999'], '--port 99999; allowed: 0 ... 65535', ''),
         (['--task', 'fetchpush'], '', "; did you mean 'FetchPush'?"),
     ],
 )
