@@ -213,7 +213,8 @@ class ImitationTrainer:
             loss = (actions - answers).square().mean()
             if self._critic is not None:
                 lost = self._critic(states, answers) - self._critic(states, actions)
-                loss = loss + learner.value_weight * lost.mean()
+                # An action of higher value than the imitated one exploits errors of the critic.
+                loss = loss + learner.value_weight * lost.clamp(min=0.0).mean()
             self._optimizer.zero_grad()
             loss.backward()
             self._optimizer.step()
