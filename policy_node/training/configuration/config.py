@@ -336,6 +336,11 @@ def _contradictions(config: TrainConfig, spec: TaskSpec) -> Iterator[tuple[bool,
     )
     yield 'outcome' in config.goals.goals and not ppo, 'goals outcome needs algorithm ppo'
     yield ppo and config.machine.overlap, 'algorithm ppo needs overlap=false'
+    scales = learner.disturbance_scales if isinstance(learner, Imitation) else (1.0,)
+    yield (
+        not scales or not all(0.0 <= scale <= 10.0 for scale in scales),
+        f'disturbance_scales {scales}; allowed: one or more factors 0 ... 10',
+    )
     yield (
         isinstance(learner, Imitation) and not config.network.init_from,
         'algorithm imitation needs init_from, the policy to imitate',

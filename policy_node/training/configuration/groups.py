@@ -278,6 +278,8 @@ class Imitation(Learner):
     value_weight: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of the value that an action loses against the action of the imitated policy, by its
     critic. It is added to the mean squared difference of the actions."""
+    disturbance_scales: tuple[float, ...] = (1.0,)
+    """Factors on `disturbances`, one for each cycle of collecting in turn."""
 
     marks: ClassVar[dict[str, Any]] = {'algorithm': 'imitation'}
 

@@ -7,7 +7,9 @@ which the action arrives, so that latency is learned away; see docs/robust_polic
 from __future__ import annotations
 
 import copy
+import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ import torch
 from torch import Tensor
 
 from msgs_spec.arrays import Array, Array32
+from msgs_spec.disturbances import read_disturbances
 from policy_node.policies.actor import Actor
 from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import TrainConfig
@@ -65,6 +68,14 @@ class Answers:
         return inputs, states, answers
 
 
+def _scaled(config: TrainConfig, scale: float) -> TrainConfig:
+    if scale == 1.0:
+        return config
+    scaled = read_disturbances(config.collect.disturbances).scaled(scale)
+    collect = replace(config.collect, disturbances=json.dumps(scaled.as_dict()))
+    return replace(config, collect=collect)
+
+
 class ImitationTrainer:
     """One run of imitation.
 
@@ -99,7 +110,10 @@ class ImitationTrainer:
         threads, torch_threads = split_threads(config)
         torch.set_num_threads(torch_threads)
         torch.manual_seed(config.seed)
-        self._simulation = make_simulation(config, config.collect.num_envs, threads)
+        self._simulations = [
+            make_simulation(_scaled(config, scale), config.collect.num_envs, threads)
+            for scale in config.learner.disturbance_scales
+        ]
         count = min(config.collect.num_envs, config.run.evaluation_episodes)
         self._evaluator = Evaluator(make_simulation(config, count, threads), config)
         self.actor = Actor(network_shape(config))
@@ -151,7 +165,7 @@ class ImitationTrainer:
                 self._folder.save_actor(LATEST_FILE, self.actor, counters.env_steps)
             row = progress_row(counters, success, outcomes, config.collect.success_rule, [])
             seconds = max(time.monotonic() - before, 1e-9)
-            ticks = self._simulation.spec.episode_ticks
+            ticks = self._simulations[0].spec.episode_ticks
             row |= {
                 'actor_loss': loss,
                 'steps_per_second': config.collect.num_envs * ticks / seconds,
@@ -166,8 +180,10 @@ class ImitationTrainer:
 
     def _collect(self) -> float:
         """Run one episode of each simulation and store the answers; return the success rate."""
-        simulation, ticks = self._simulation, self._simulation.spec.episode_ticks
-        count = simulation.num_envs
+        count = self.config.collect.num_envs
+        cycle = self.counters.episodes // count
+        simulation = self._simulations[cycle % len(self._simulations)]
+        ticks = simulation.spec.episode_ticks
         seeds = np.random.SeedSequence([self.config.seed, self.counters.env_steps])
         observation = simulation.reset(seed=training_seeds(seeds, count))
         latency = np.array(

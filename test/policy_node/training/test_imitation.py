@@ -39,6 +39,17 @@ def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_pat
     assert not torch.allclose(answers[:-2], expected[:-2], rtol=1e-3, atol=1e-3)
 
 
+def test_successive_cycles_scale_the_disturbances(tmp_path: Path) -> None:
+    config = recipe_config(
+        'FetchPush', 'robust', num_envs=2, disturbances=LATE, disturbance_scales=(0.0, 1.0)
+    )
+    networks = read_initial_networks('FetchPush').fitted(config)
+    trainer = ImitationTrainer(config, tmp_path, Workers(), '', '', networks)
+    for stored in (2 * 50, 2 * 50 + 2 * 49):
+        trainer._collect()
+        assert trainer._answers._count == stored
+
+
 def test_the_critic_of_the_imitated_policy_judges_the_actions(tmp_path: Path) -> None:
     task = 'FetchSlide'
     config = recipe_config(task, 'robust', num_envs=2, value_weight=1.0, updates_per_cycle=5)
@@ -82,6 +93,8 @@ def test_a_run_writes_a_policy_with_past_actions(tmp_path: Path) -> None:
         (['--set', 'algorithm=imitation'], 'init_from'),
         (['--recipe', 'robust', '--set', 'gamma=.9', '--set', 'past_actions=99'], 'past_actions'),
         (['--recipe', 'robust', '--set', 'subgoal_every=5'], 'subgoal_every'),
+        (['--recipe', 'robust', '--set', 'disturbance_scales='], 'one or more'),
+        (['--recipe', 'robust', '--set', 'disturbance_scales=1,-1'], '0 ... 10'),
         (
             ['--task', 'FetchPush', '--recipe', 'robust', '--set', 'value_weight=1'],
             'no single critic',
