@@ -39,8 +39,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         '--twin-seeds',
         type=int,
-        default=2,
-        help='seeds per task in the comparison with Gymnasium-Robotics (default: 2)',
+        default=1,
+        help='seeds per task in the comparison with Gymnasium-Robotics (default: 1)',
     )
     parser.addoption(
         '--hostile-messages',

@@ -21,7 +21,7 @@ from msgs_spec.codecs import build_message, decode, message_stamp
 from msgs_spec.observations import ObservationAssembler
 from msgs_spec.robots import command_from_action
 from msgs_spec.schemas import deserialize, serialize
-from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.tasks import task_spec
 from msgs_spec.topics import topic, topics
 from node_runtime.ros import rclpy_profile
 from support.graph import (
@@ -34,6 +34,7 @@ from support.graph import (
     finish,
     ros_args,
 )
+from support.tasks import each_task
 
 REACH = task_spec('FetchReach')
 
@@ -78,17 +79,7 @@ def test_every_topic_has_the_promised_type_and_quality(start_process: Start) -> 
             )
 
 
-# One task of each robot; `make test-release` takes the others too.
-SOME_TASKS = ('FetchPickAndPlace', 'HandManipulateEggFull')
-
-
-@pytest.mark.parametrize(
-    'task',
-    [
-        pytest.param(task, marks=[] if task in SOME_TASKS else [pytest.mark.release])
-        for task in TASKS
-    ],
-)
+@each_task
 def test_every_task_runs_and_logs_its_topics(
     start_process: Start, tmp_path: Path, task: str
 ) -> None:

@@ -87,9 +87,7 @@ def without_times(episode) -> dict[str, list[bytes]]:
     return {name: [data for _, _, data in messages] for name, messages in episode.items()}
 
 
-def test_bytes_are_equal_between_runs_in_real_time_and_without_ros(
-    start_process: Start, tmp_path: Path
-) -> None:
+def test_bytes_are_equal_between_runs_and_without_ros(start_process: Start, tmp_path: Path) -> None:
     # One policy for all of them: what it did before must not matter.
     policy = start_process(*POLICY_NODE)
     first = logged_run(start_process, tmp_path / '1', mode='lockstep', episodes=2)
@@ -97,15 +95,6 @@ def test_bytes_are_equal_between_runs_in_real_time_and_without_ros(
     assert first == second
     assert [without_times(episode) for episode in first] == batch_run(REACH, 2)
     assert first[0]['/joint_states'] != first[1]['/joint_states']
-    for attempt in range(3):
-        # Half speed: even a busy machine answers within 80 ms, mostly.
-        (paced,) = logged_run(
-            start_process, tmp_path / f'paced{attempt}', real_time_factor=0.5, episodes=1
-        )
-        # A command is logged behind the tick it answers: equal log times mean none was late.
-        if [m[0] for m in paced['/commands']] == [m[0] for m in first[0]['/commands']]:
-            break
-    assert paced == first[0]
     end(policy)
 
 

@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
 from rcl_interfaces.srv import SetParameters
@@ -298,7 +297,6 @@ def test_a_robot_that_does_not_fit_is_not_commanded(start_process: Start) -> Non
     end(sim)
 
 
-@pytest.mark.alone
 def test_the_first_command_comes_soon_after_the_start(start_process: Start) -> None:
     """Under 3 s on an idle machine; this one may be busy, so only what it costs is counted."""
     import resource

@@ -303,37 +303,6 @@ def test_the_page_commands_until_somebody_else_does(start_process: Start) -> Non
         assert not np.allclose(follower.picture.command, values)
 
 
-def test_commands_of_the_page_never_reach_the_next_robot(start_process: Start) -> None:
-    robot = start_process(*SIM_NODE, *ros_args(task='FetchReach'))
-    with client(REACH) as connection:
-        follower = Follower(connection)
-        follower.until(lambda p: p.frame is not None and p.facts.rate > 0.0, 'picture')
-        values = np.array([0.25, -0.5, 0.75, 1.0])
-        follower.robot.perform(SetCommanding(True))
-
-        def is_obeyed(picture):
-            follower.robot.perform(SetCommand(values))
-            return picture.command is not None and np.allclose(picture.command, values)
-
-        follower.until(is_obeyed, 'command that is applied')
-        robot.kill()
-        connection.spin(0.2)
-        connection.subscribe('applied_command')
-        start_process(*SIM_NODE, *ros_args(task='FetchReach', seed=7))
-
-        def is_next(picture):
-            follower.robot.perform(SetCommand(values))
-            return picture.facts.seed >= 7 and picture.facts.tick > 20
-
-        follower.until(is_next, 'next robot')
-        # The viewer may have found the publishers of the next robot before this client did.
-        connection.spin_until(lambda: connection.received['applied_command'], 'applied command')
-        assert not follower.picture.facts.is_commanding
-        source = topic(REACH, 'applied_command')
-        applied = [decode(source, each) for each in connection.received['applied_command']]
-        assert applied and not any(np.allclose(each, values) for each in applied)
-
-
 def test_who_may_only_watch_changes_nothing(start_process: Start) -> None:
     start_process(*SIM_NODE, *ros_args(task='FetchReach'))
     with client(REACH) as connection:
@@ -384,7 +353,7 @@ def wait_for_pictures(connection: Client, visitor: Visitor) -> None:
     [
         pytest.param('visitor leaves', marks=pytest.mark.release),
         'visitor is deaf',
-        'SIGSTOP',
+        pytest.param('SIGSTOP', marks=pytest.mark.release),
         pytest.param('SIGKILL', marks=pytest.mark.release),
     ],
 )
@@ -829,8 +798,6 @@ def processes_of_session(session: int) -> list[str]:
     ('arguments', 'line'),
     [
         (['--wait', '0.2', '--robot', 'nosuch'], 'no robot in namespace /nosuch'),
-        (['--wait', '0.2'], 'start sim_node'),
-        (['--host', '203.0.113.1'], 'cannot listen on 203.0.113.1'),
         (['--task', 'FetchReach', '--policy', 'nosuch'], 'policy_node ended'),
     ],
 )

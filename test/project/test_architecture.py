@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -44,24 +45,24 @@ def pages_of_docs() -> list[Path]:
 
 def lost_files(page: str) -> list[str]:
     """The Python files that a page names and that are nowhere in the repository."""
-    files = [path.relative_to(ROOT) for name in FOLDERS for path in (ROOT / name).rglob('*.py')]
-    tree = {f'/{path}' for path in files} | {'/setup.py'}
     named = re.findall(r'`([\w/]*\w\.py)`', page)
-    return [name for name in named if not any(path.endswith(f'/{name}') for path in tree)]
+    return [name for name in named if not any(path.endswith(f'/{name}') for path in tree())]
+
+
+@cache
+def tree() -> list[str]:
+    """The Python files of the repository."""
+    files = [path.relative_to(ROOT) for name in FOLDERS for path in (ROOT / name).rglob('*.py')]
+    return ['/setup.py', *(f'/{path}' for path in files)]
 
 
 FOLDERS = (*PACKAGES, 'bench', 'examples', 'test', 'tools')
 
 
-@pytest.mark.parametrize('page', pages(), ids=lambda path: path.name)
-def test_files_named_by_the_documentation_exist(page: Path) -> None:
-    assert lost_files(page.read_text()) == []
-
-
-@pytest.mark.parametrize('page', sorted({*pages(), *pages_of_docs()}), ids=lambda path: path.name)
-def test_links_between_pages_lead_somewhere(page: Path) -> None:
-    targets = re.findall(r'\]\(([^)#:\s]+)(?:#[^)]*)?\)', page.read_text())
-    assert [each for each in targets if not (page.parent / each).exists()] == []
+def test_files_named_by_pages_and_package_docstrings_exist() -> None:
+    packages = [path for name in PACKAGES for path in (ROOT / name).rglob('__init__.py')]
+    lost = {str(path): lost_files(path.read_text()) for path in (*pages(), *packages)}
+    assert {path: files for path, files in lost.items() if files} == {}
 
 
 def test_every_page_is_in_the_documentation() -> None:
@@ -81,10 +82,3 @@ def test_every_page_is_in_the_documentation() -> None:
 @pytest.mark.parametrize('path', ['fetch_hand_sim/episode_check.py', 'rewards_of_old.py'])
 def test_a_file_that_moved_is_noticed(path: str) -> None:
     assert lost_files(f'see `{path}` and `simulation/rewards.py`') == [path]
-
-
-@pytest.mark.parametrize('package', PACKAGES)
-def test_package_docstrings_name_existing_files(package: str) -> None:
-    paths = (ROOT / package).rglob('__init__.py')
-    lost = {str(path): files for path in paths if (files := lost_files(path.read_text()))}
-    assert lost == {}

@@ -70,6 +70,7 @@ def test_bad_usage_ends_with_status_2(
     assert line in capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.release
 def test_competitors_train_on_the_same_task(
     bench_her: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 import runpy
 
-import pytest
-
 from msgs_spec.parameters import NODES
 from msgs_spec.robots import SHADOW_HAND
 from msgs_spec.tasks import TASKS
@@ -76,27 +74,6 @@ def test_section_is_replaced_and_the_rest_kept(tmp_path):
     assert text == f'# Title\n{START}\n\n{interface_markdown()}\n\n{END}\nrest\n'
     assert main(['--write', str(path)]) == 0
     assert path.read_text() == text
-
-
-@pytest.mark.parametrize('text', ['', START, END + START, START + END + END])
-def test_missing_markers_are_one_line_and_change_nothing(text, tmp_path, capsys):
-    path = tmp_path / 'page.md'
-    path.write_text(text)
-    assert main(['--write', str(path)]) == 1
-    assert path.read_text() == text
-    error = capsys.readouterr().err
-    assert error.count('\n') == 1
-    assert f'{path}: allowed: a file with one {START}' in error
-
-
-def test_missing_file_is_one_line(tmp_path, capsys):
-    assert main(['--write', str(tmp_path / 'none.md')]) == 1
-    assert 'No such file' in capsys.readouterr().err
-
-
-def test_without_arguments_it_is_printed(capsys):
-    assert main([]) == 0
-    assert capsys.readouterr().out == interface_markdown() + '\n'
 
 
 def test_the_joints_of_the_hand_have_both_numberings():

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from support import ROOT, script_environment
 from support.run_guard import DOMAIN_LOCK_PORT, processes_of
 
@@ -51,6 +53,7 @@ def is_running(process: int) -> bool:
     return state != 'Z'
 
 
+@pytest.mark.release
 def test_a_killed_run_takes_its_nodes_along(tmp_path):
     test = tmp_path / 'test_for_ever.py'
     test.write_text(TEST.format(folder=str(tmp_path)))

@@ -135,22 +135,14 @@ def fill(path):
                 size //= 2
 
 
-def test_a_disk_that_is_full_from_the_start(start_process, mount):
-    disk = mount('size=8m')
-    robot = start_process(*SIM_NODE, *ros_args(episode_dir=disk))
-    with client(REACH) as listener:
-        listener.subscribe('joint_states')
-        ticks_after(listener, 60)
-    (error,) = error_lines(stop(robot))
-    assert 'MiB free on the disk, 64.0 MiB wanted' in error
-    assert list(disk.iterdir()) == []
-
-
 def test_episodes_that_were_asked_for_and_not_logged_are_a_failure(start_process, mount):
     disk = mount('size=8m')
     arguments = ros_args(episode_dir=disk, episodes=3, real_time_factor=0.0)
     code, output = finish(start_process(*SIM_NODE, *arguments))
     assert code == 1 and 'Traceback' not in output
+    (error,) = error_lines(output)
+    assert 'MiB free on the disk, 64.0 MiB wanted' in error
+    assert list(disk.iterdir()) == []
     # Episodes that are not logged are still reported.
     assert 'episode 2 seed 2: 50 steps, return' in output
     assert output.splitlines()[-1] == f'sim_node: not all episodes are in {disk}'
@@ -161,7 +153,7 @@ def test_a_read_only_disk(start_process, mount):
     robot = start_process(*SIM_NODE, *ros_args(episode_dir=disk / 'episodes'))
     with client(REACH) as listener:
         listener.subscribe('joint_states')
-        ticks_after(listener, 60)
+        ticks_after(listener, 10)
     (error,) = error_lines(stop(robot))
     assert 'Read-only file system' in error
 
@@ -210,14 +202,6 @@ def test_a_robot_under_nohup_survives_its_terminal(start_process):
         robot.send_signal(signal.SIGHUP)
         ticks_after(listener)
     stop(robot)
-
-
-def test_a_directory_that_is_a_file_is_one_line(start_process, tmp_path):
-    (tmp_path / 'file').touch()
-    code, output = finish(start_process(*SIM_NODE, *ros_args(episode_dir=tmp_path / 'file')))
-    assert code == 2
-    (line,) = output.splitlines()
-    assert 'episode_dir' in line and 'Not a directory' in line
 
 
 def test_a_pipe_among_the_leftovers_holds_nothing_up(start_process, tmp_path):

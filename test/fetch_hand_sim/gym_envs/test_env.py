@@ -22,6 +22,7 @@ from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
 from fetch_hand_sim.simulation import Simulation, rendering
 from msgs_spec.tasks import TASKS
 from support.hindsight import assert_goals_are_exchanged
+from support.tasks import each_task
 
 # Positions are unbounded, and Gymnasium wonders about it.
 pytestmark = pytest.mark.filterwarnings('ignore:.*Box observation space')
@@ -36,7 +37,7 @@ def state_of(env: gymnasium.Env) -> bytes:
     return env.unwrapped.simulation.task.batch.state.tobytes() + repr(generator).encode()
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_gymnasiums_checker_is_content(task):
     env = make(task)
     assert env.spec.id == f'fetch_hand_sim/{task}-v0'

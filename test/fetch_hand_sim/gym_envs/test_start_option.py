@@ -7,7 +7,7 @@ import pytest
 
 import fetch_hand_sim
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.tasks import TASKS
+from support.tasks import each_task
 
 POSE = [1.25, 0.65, 0.45, 0.6, 0.0, 0.0, 0.8]
 PUSH = {'object_pose': POSE, 'object_velocity': [0.1, 0.0, 0.0, 0.0, 0.0, 2.0]}
@@ -33,7 +33,7 @@ def test_an_object_starts_where_it_was_placed_with_its_velocity():
     assert (again['observation'] == drawn['observation']).all(), 'the next start is drawn again'
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_the_same_start_gives_the_same_bits_and_a_state_can_be_given_again(task):
     simulation = Simulation(task, 2)
     simulation.reset(seed=4)

@@ -15,7 +15,7 @@ import fetch_hand_sim
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.gym_envs.registration import environment_id
 from fetch_hand_sim.gym_envs.vector_env import FetchHandVectorEnv
-from msgs_spec.tasks import TASKS
+from support.tasks import each_task
 
 
 def make_vec(task: str, num_envs: int, **arguments) -> gymnasium.vector.VectorEnv:
@@ -41,7 +41,7 @@ def assert_same(first, second) -> None:
         assert np.asarray(first).tobytes() == np.asarray(second).tobytes()
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_the_batch_is_described_like_its_members(task):
     env = make_vec(task, 3)
     single = gymnasium.make(environment_id(task))

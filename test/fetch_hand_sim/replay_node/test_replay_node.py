@@ -378,7 +378,6 @@ def test_an_episode_whose_topics_have_no_names_of_ros_is_refused(episode, tmp_pa
         ReplaySchedule(writer.finish({}))
 
 
-@pytest.mark.alone
 def test_playhead_follows_rate_and_pauses():
     head = Playhead(1_000, 2.0, now=10.0, is_paused=True)
     assert head.position_ns(99.0) == 1_000

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.simulation import Simulation
-from msgs_spec.tasks import TASKS
+from support.tasks import each_task
 
 FAMILIES = ['FetchReach', 'FetchPush', 'HandReach', 'HandManipulateEggFull']
 
@@ -20,7 +20,7 @@ def actions(simulation: Simulation, ticks: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_start_and_goal_are_the_same_with_and_without_disturbances(task: str) -> None:
     plain = Simulation(task, 2).reset(seed=3)
     noise = {'action': {'latency': 2, 'noise': 0.1}, 'physics': {'friction': [0.5, 2.0]}}

@@ -13,6 +13,7 @@ from fetch_hand_sim.gym_envs.registration import environment_id
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.tasks.fetch import lead_scale
 from msgs_spec.tasks import TASKS
+from support.tasks import each_task
 
 RATES = [12.5, 125.0, 250.0, 500.0]
 
@@ -29,7 +30,7 @@ def play(simulation: Simulation, ticks: int) -> list[bytes]:
     return [row.tobytes() for row in (*rows, simulation.task.batch.state)]
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_at_25_hz_nothing_depends_on_the_timing(task):
     simulations = [
         Simulation(task, num_threads=1, timing=timing) for timing in ('seconds', 'ticks')

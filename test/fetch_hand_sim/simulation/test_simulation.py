@@ -19,8 +19,8 @@ from mujoco.batch import SimulationError
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.robots import command_from_action
 from msgs_spec.rotations import quaternion_from_axis_angle, quaternion_multiply
-from msgs_spec.tasks import TASKS
 from support import peak_memory, reset_peak_memory
+from support.tasks import each_task
 
 
 def actions(simulation: Simulation, steps: int, seed: int = 0) -> np.ndarray:
@@ -51,7 +51,7 @@ def state_of(simulation: Simulation) -> bytes:
     return state + repr(generators).encode()
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_the_nth_episode_of_a_seed_equals_the_first(task):
     simulation = Simulation(task, num_envs=2, num_threads=1)
     played = actions(simulation, 12)
@@ -67,7 +67,7 @@ def test_the_nth_episode_of_a_seed_equals_the_first(task):
     assert play(simulation, played).tobytes() == first.tobytes()
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_neither_neighbours_nor_threads_change_a_bit(task):
     batch = Simulation(task, num_envs=64, num_threads=1)
     threaded = Simulation(task, num_envs=64, num_threads=3)

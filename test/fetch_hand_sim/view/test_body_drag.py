@@ -17,6 +17,7 @@ from fetch_hand_sim.view.page.ray import MousePlace, mouse_ray
 from fetch_hand_sim.view.requests import Push
 from fetch_hand_sim.view.session import Requests
 from msgs_spec.tasks import TASKS
+from support.tasks import each_task
 
 ASPECT = 1.5
 LIMIT = 10.0
@@ -82,7 +83,7 @@ def test_the_pull_reaches_the_limit_a_tenth_of_the_view_away(task):
     assert total * 2.0 * np.tan(np.radians(22.5)) == pytest.approx(0.1, rel=0.4)
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_world_table_and_ghost_cannot_be_pulled(task):
     model = Scene(task).model
     names = {model.body(i).name for i in range(model.nbody) if can_be_pulled(model, i)}

@@ -28,6 +28,7 @@ from fetch_hand_sim.view.requests import (
 )
 from msgs_spec.tasks import TASKS
 from support.episode_recorder import Recorder
+from support.tasks import each_task
 
 
 class Clock:
@@ -56,7 +57,7 @@ def player(folder, clock):
     return Player(find_playable(folder), clock)
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_frames_are_what_was_logged(task, tmp_path):
     recorder = Recorder(task)
     path = recorder.record(EpisodeDirectory(tmp_path))

@@ -12,8 +12,9 @@ from fetch_hand_sim.simulation.scene import Frame
 from fetch_hand_sim.view.robot_watch import SeenTick
 from fetch_hand_sim.visualization_node.messages import Scalars
 from msgs_spec.codecs import decode, message_stamp
-from msgs_spec.tasks import TASKS, task_spec
+from msgs_spec.tasks import task_spec
 from msgs_spec.topics import scalar_topics
+from support.tasks import each_task
 
 STAMP = 3_000_000_007
 
@@ -28,7 +29,7 @@ def tick_of(spec, reward):
 
 
 @pytest.mark.parametrize('rule', ['gymnasium', 'paper'])
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_a_tick_becomes_the_numbers_its_task_has(task, rule):
     spec = task_spec(task)
     tick = tick_of(spec, reward=-0.25)

@@ -31,6 +31,7 @@ from fetch_hand_sim.visualization_node.transforms import Transforms, frame_prefi
 from msgs_spec.rotations import quaternion_to_matrix
 from msgs_spec.tasks import TASKS
 from support.frames import tree
+from support.tasks import each_task
 
 STAMP = 3_000_000_007
 
@@ -83,7 +84,7 @@ def test_transforms_put_every_frame_where_mujoco_has_it(task, namespace):
         )
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_markers_are_the_shapes_of_the_scene(task):
     scene, frame = Scene(task), moved_frame(task)
     drawn = {'goal': scene.markers(frame), 'object': scene.object_markers(frame)}
@@ -115,7 +116,7 @@ def test_the_object_is_drawn_where_mujoco_has_it(task):
     assert longest == pytest.approx(2.0 * scene.model.geom(geom.id).size.max())
 
 
-@pytest.mark.parametrize('task', TASKS)
+@each_task
 def test_the_table_of_a_fetch_is_drawn(task):
     scene = Scene(task)
     mujoco.mj_kinematics(scene.model, scene.data)

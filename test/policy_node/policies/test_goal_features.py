@@ -15,6 +15,7 @@ from msgs_spec.tasks import TASKS, GoalKind, task_spec
 from policy_node.policies.actor import Actor
 from policy_node.policies.goal_features import RelativeGoal, goal_features
 from policy_node.policies.network_shape import NetworkShape
+from support.tasks import each_task
 
 
 def relative_goal(task: str) -> RelativeGoal:
@@ -34,7 +35,7 @@ def _observation(task: str, achieved: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(observation)
 
 
-@pytest.mark.parametrize('task', list(TASKS))
+@each_task
 def test_the_achieved_goal_is_at_its_specified_place(task: str) -> None:
     from fetch_hand_sim.simulation import Simulation
 
