@@ -28,7 +28,7 @@ def test_a_policy_that_is_killed_is_missed_in_real_time(start_process: Start) ->
         policy.send_signal(signal.SIGKILL)
         text = 'commands have stopped, the robot holds; /policy_node sends none'
         robot.spin_until(
-            lambda: any(text in report.message for report in robot.reports()), 'warning', 5.0
+            lambda: any(text in report.message for report in robot.reports()), 'warning'
         )
         assert robot.reports()[-1].level == b'\x01'
         # A successor is one commander, though the graph remembers the first for 20 s.
@@ -50,7 +50,7 @@ def test_episodes_after_an_actor_has_left_do_not_bear_its_name(
     policy = start_process(*POLICY_NODE)
     with client(REACH) as robot:
         robot.subscribe('episode_status')
-        robot.spin_until(lambda: robot.statuses()[-1:] and robot.statuses()[-1].episode > 1, 'two')
+        robot.spin_until(lambda: robot.statuses()[-1].episode > 1, 'two')
         end(policy)
         robot.spin(0.5)
         last = robot.statuses()[-1].episode
@@ -128,8 +128,8 @@ def test_the_state_after_a_reset_comes_also_while_the_robot_stands_still(
         for episode in (1, 2):
             count = len(robot.stamps('joint_states'))
             assert robot.call(Trigger, 'sim_node/reset').success
-            robot.spin_until(lambda: len(robot.stamps('joint_states')) > count, 'state', 5.0)  # noqa: B023
-            robot.spin_until(lambda: robot.statuses()[-1].episode >= episode, 'status', 5.0)  # noqa: B023
+            robot.spin_until(lambda: len(robot.stamps('joint_states')) > count, 'state')  # noqa: B023
+            robot.spin_until(lambda: robot.statuses()[-1].episode >= episode, 'status')  # noqa: B023
             assert robot.statuses()[-1].tick == 0
         robot.spin(0.3)
         assert len(robot.stamps('joint_states')) == count + 1

@@ -88,7 +88,7 @@ def test_a_paused_robot_is_reported_until_it_is_gone(start_process: Start) -> No
 
         def last() -> Any:
             found = robot.received['/diagnostics']
-            return next(m for m in reversed(found) if m.status[0].name == '/policy_node')
+            return [m for m in found if m.status[0].name == '/policy_node'][-1]
 
         robot.spin_until(
             lambda: (

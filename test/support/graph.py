@@ -115,8 +115,16 @@ class Client:
     def spin_until(
         self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT
     ) -> None:
+        """Spin until a condition holds; it may index messages that have not come yet."""
         end = time.monotonic() + timeout
-        while not condition():
+
+        def holds() -> bool:
+            try:
+                return bool(condition())
+            except IndexError:
+                return False
+
+        while not holds():
             assert time.monotonic() < end, f'no {what} within {timeout} s'
             self._executor.spin_once(timeout_sec=0.05)
 

@@ -147,26 +147,27 @@ def test_every_message_comes_back_as_recorded_with_its_timing(start_process, epi
         listener.subscribe(depth=1000)
         replay = start_process(*REPLAY_NODE, *ros_args(path=episode, start_paused=True))
         listener.spin_until(lambda: bool(listener.received['episode_status']), 'latched status')
+        subscriptions = list(listener.node.subscriptions)
         listener.spin_until(
-            lambda: all(
-                listener.node.count_publishers(s.name)
-                for s in topics(REACH)
-                if s.direction == 'published'
-            ),
-            'all topics',
+            lambda: all(each.get_publisher_count() for each in subscriptions), 'all topics'
         )
         assert listener.node.count_publishers('commands') == 0
         assert listener.call(SetBool, 'replay_node/pause', data=False).message == 'running'
         listener.spin_until(lambda: replay.poll() is not None, 'the end of the replay')
+        published = [spec for spec in topics(REACH) if spec.direction == 'published']
+        messages = {s.name: logged.topics['/' + s.name.lstrip('/')].messages for s in published}
+        listener.spin_until(
+            lambda: all(len(listener.received[n]) >= len(m) for n, m in messages.items()),
+            'all messages',
+        )
         listener.spin(0.2)
-        for spec in topics(REACH):
-            if spec.direction == 'published':
-                expected = [m.data for m in logged.topics['/' + spec.name.lstrip('/')].messages]
-                got = [serialize(spec.type_name, from_ros(m)) for m in listener.received[spec.name]]
-                # Latched topics are published once more before the start.
-                extra = len(got) - len(expected)
-                assert extra == (1 if spec.qos.durability == 'transient_local' else 0), spec.name
-                assert got[extra:] == expected, spec.name
+        for spec in published:
+            expected = [m.data for m in messages[spec.name]]
+            got = [serialize(spec.type_name, from_ros(m)) for m in listener.received[spec.name]]
+            # Latched topics are published once more before the start.
+            extra = len(got) - len(expected)
+            assert extra == (1 if spec.qos.durability == 'transient_local' else 0), spec.name
+            assert got[extra:] == expected, spec.name
         times = np.array(listener.received_at['joint_states'])
     # Two seconds of episode; a busy machine may delay single messages.
     assert times[-1] - times[0] == pytest.approx(2.0, abs=0.2)
@@ -181,6 +182,8 @@ def test_late_subscribers_get_the_latched_topics_of_an_offset(start_process, epi
         listener.spin_until(lambda: bool(listener.received['episode_status']), 'the latched status')
         assert message_stamp(listener.received['desired_goal'][0]) == 1_960_000_000
         assert listener.statuses()[0].phase == 'reset'
+        subscriptions = list(listener.node.subscriptions)
+        listener.spin_until(lambda: all(s.get_publisher_count() for s in subscriptions), 'replay')
         listener.call(SetBool, 'replay_node/pause', data=False)
         listener.spin_until(lambda: bool(listener.received['joint_states']), 'a tick')
         assert message_stamp(listener.received['joint_states'][0]) == 2_000_000_000
