@@ -91,6 +91,7 @@ def test_a_task_is_simulated_by_the_package_that_it_is_of(
         ('Pushed', None, 'NoneType given; allowed: a TaskSpec'),
         ('Other', PUSH, "has the name 'Pushed'; allowed: 'Other'"),
         ('x' * 65, replace(PUSH, name='x' * 65), 'allowed: up to 64 letters'),
+        ('Push (near)', replace(PUSH, name='Push (near)'), 'letters, digits, _, - and .'),
         ('Pushed', replace(PUSH, observation=list(PUSH.observation)), 'unhashable'),
         ('FetchPush', replace(PUSH, name='FetchPush'), 'another task has this name'),
     ],

@@ -128,7 +128,6 @@ def test_a_full_output_is_one_line():
     'words',
     [
         ['fetch_hand_sim', '--print-completion', 'bash'],
-        ['fetch_hand_sim', '--version'],
         ['fetch_hand_sim', 'episodes', 'list', '--help'],
         ['fetch_hand_sim.sim_node', '--help'],
     ],

@@ -232,9 +232,13 @@ def test_pause_step_and_reset(start_process: Start) -> None:
         robot.spin_until(lambda: bool(robot.statuses()), 'status')
         episode = robot.statuses()[-1].episode
         assert robot.call(Trigger, 'sim_node/reset').success
-        assert robot.call(SetBool, 'sim_node/pause', data=False).success
         robot.spin_until(lambda: robot.statuses()[-1].episode > episode, 'the next episode')
         assert robot.statuses()[-1].tick == 0
+        robot.spin_until(lambda: len(robot.stamps('joint_states')) > count + 1, 'its state')
+        robot.spin(0.2)
+        assert len(robot.stamps('joint_states')) == count + 2
+        assert robot.call(SetBool, 'sim_node/pause', data=False).success
+        robot.spin_until(lambda: len(robot.stamps('joint_states')) > count + 4, 'ticks')
 
 
 def test_a_robot_that_waits_for_commands_can_be_seeded_and_stepped(start_process: Start) -> None:

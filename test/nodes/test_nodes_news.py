@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from msgs_spec.codecs import message_stamp
 from msgs_spec.tasks import task_spec
@@ -112,28 +112,6 @@ def test_publishers_that_the_robot_cannot_receive_are_reported(start_process: St
         )
     output = end(sim)
     assert all(line in output for line in lines)
-
-
-@pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
-def test_the_state_after_a_reset_comes_also_while_the_robot_stands_still(
-    start_process: Start, mode: str
-) -> None:
-    sim = start_process(*SIM_NODE, *ros_args(mode=mode))
-    with client(REACH) as robot:
-        robot.subscribe('joint_states', 'episode_status')
-        robot.spin_until(lambda: bool(robot.received['joint_states']), 'a tick')
-        if mode == 'realtime':
-            assert robot.call(SetBool, 'sim_node/pause', data=True).success
-            robot.spin(0.2)
-        for episode in (1, 2):
-            count = len(robot.stamps('joint_states'))
-            assert robot.call(Trigger, 'sim_node/reset').success
-            robot.spin_until(lambda: len(robot.stamps('joint_states')) > count, 'state')  # noqa: B023
-            robot.spin_until(lambda: robot.statuses()[-1].episode >= episode, 'status')  # noqa: B023
-            assert robot.statuses()[-1].tick == 0
-        robot.spin(0.3)
-        assert len(robot.stamps('joint_states')) == count + 1
-    end(sim)
 
 
 @pytest.mark.parametrize('mode', ['realtime', 'lockstep'])
