@@ -304,7 +304,6 @@ def test_names_that_are_no_text_and_command_a_terminal(finished, tmp_path):
     for command, arguments, code in (
         ('list', [], 1),
         ('recover', [], 0),
-        ('check', [], 2),
         ('export', parquet, 1),
     ):
         run = subprocess.run(

@@ -39,7 +39,14 @@ def generated(directory, task):
     return min(directory.iterdir())
 
 
-@pytest.fixture(scope='module', params=['FetchPickAndPlace', 'HandReach', 'HandManipulateEggFull'])
+@pytest.fixture(
+    scope='module',
+    params=[
+        'HandManipulateEggFull',
+        pytest.param('FetchPickAndPlace', marks=pytest.mark.release),
+        pytest.param('HandReach', marks=pytest.mark.release),
+    ],
+)
 def episode(request, tmp_path_factory):
     """A complete episode of each family."""
     return generated(tmp_path_factory.mktemp(request.param), request.param)

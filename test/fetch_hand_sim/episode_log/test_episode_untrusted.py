@@ -16,7 +16,7 @@ from support import SUPPORT, script_environment
 from support.episode_recorder import Recorder
 
 # `make torture` turns these up.
-FILES = int(os.environ.get('EPISODE_MUTATIONS', '240'))
+FILES = int(os.environ.get('EPISODE_MUTATIONS', '80'))
 CRAFTED = int(os.environ.get('EPISODE_CRAFTED', '25'))
 SCRIPT = SUPPORT / 'mutated_files.py'
 READERS = 6

@@ -419,7 +419,7 @@ def test_a_file_of_one_meaning_is_read_sorted_by_time(parts, episodes, tmp_path,
     assert_same(path, episodes[0])
 
 
-@pytest.mark.parametrize('compression', ['none', 'lz4', 'zstd'])
+@pytest.mark.parametrize('compression', ['none', 'lz4'])
 def test_files_without_chunks_and_of_all_compressions_are_read(episodes, tmp_path, compression):
     recorder = Recorder('FetchReach')
     settings = LogSettings(compression=compression)
@@ -461,6 +461,8 @@ def run_tool(tool, arguments, paths):
     assert run.returncode == 0, run.stdout + run.stderr
 
 
+# The program takes seconds to start.
+@pytest.mark.release
 @pytest.mark.parametrize('tool', TOOLS)
 def test_files_that_pymcap_rewrote_are_read(episodes, tmp_path, tool):
     source = episodes[0] / f'{episodes[0].name}_0.mcap'
@@ -468,6 +470,7 @@ def test_files_that_pymcap_rewrote_are_read(episodes, tmp_path, tool):
     assert_same(tmp_path / 'out.mcap', episodes[0])
 
 
+@pytest.mark.release
 @pytest.mark.parametrize('number', [0, 1])
 def test_a_merged_file_is_rejected_as_two_episodes(episodes, tmp_path, number):
     files = [path / f'{path.name}_0.mcap' for path in (episodes[0], episodes[number])]

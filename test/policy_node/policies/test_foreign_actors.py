@@ -50,12 +50,10 @@ def test_onnx_actor_answers_as_its_checkpoint(onnx_file):
     assert found.sha256 == checkpoint.checkpoint_hash(onnx_file)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     ('task', 'features'),
-    [
-        pytest.param('HandManipulateBlockFull', 'symmetric', marks=pytest.mark.release),
-        ('HandManipulatePenFull', 'relative'),
-    ],
+    [('HandManipulateBlockFull', 'symmetric'), ('HandManipulatePenFull', 'relative')],
 )
 def test_actors_that_see_how_far_the_goal_is_are_exported(task, features, tmp_path):
     source, target = tmp_path / 'a.safetensors', tmp_path / 'a.onnx'
@@ -140,6 +138,8 @@ def test_a_few_bytes_of_onnx_that_ask_for_gigabytes_are_refused(onnx_file, tmp_p
     assert time.perf_counter() - began < 20.0
 
 
+# It computes for up to 30 s.
+@pytest.mark.release
 def test_onnx_that_computes_for_ever_is_refused(onnx_file, tmp_path):
     metadata = {p.key: p.value for p in onnx.load(onnx_file).metadata_props}
     scalars = {'count': np.array(2**60), 'go': np.array(True), 'four': np.array([4])}

@@ -232,6 +232,7 @@ def test_ctrl_c_keeps_what_there_is_and_the_same_command_goes_on(
     assert 'continues' not in capsys.readouterr().out
 
 
+@pytest.mark.release
 def test_a_closed_pipe_does_not_end_jobs() -> None:
     code = (
         'import sys\n'
@@ -248,6 +249,7 @@ def test_a_closed_pipe_does_not_end_jobs() -> None:
     assert process.returncode == 0
 
 
+@pytest.mark.release
 def test_a_job_of_another_process_is_left_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

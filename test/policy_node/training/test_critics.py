@@ -53,12 +53,9 @@ def chain_batch(count: int, generator: np.random.Generator) -> Transitions:
 @pytest.mark.parametrize(
     'changes',
     [
-        {'target': 'none'},
-        {'target': 'none', 'norm': 'layer'},
         {'target': 'none', 'norm': 'batch'},
         {'critics': 3, 'aggregate': 'min', 'target_update_interval': 5},
         {'critics': 2, 'aggregate': 'truncated', 'norm': 'layer', 'target': 'none'},
-        {'quantiles': 5, 'target_update_interval': 5},
         {'critics': 2, 'quantiles': 5, 'aggregate': 'truncated', 'target_update_interval': 5},
     ],
     ids=str,
