@@ -58,7 +58,7 @@ def test_flood_of_commands_neither_delays_nor_grows_the_robot(start_process: Sta
                 robot.publish('commands', (good, bad)[sent % 2])
                 sent += 1
             robot.spin(0.0005)
-        assert sent > 20_000
+        assert sent > 5_000
         grown = resident_kilobytes(sim) - before
         # On a busy machine most push each other out before they are read.
         robot.spin_until(
