@@ -124,6 +124,7 @@ def test_long_datasets_are_several_files(episodes, tmp_path, monkeypatch):
 FILM = 'videos/observation.images.scene/chunk-000/file-000.mp4'
 
 
+@pytest.mark.release
 def test_films_show_every_frame_and_say_where_each_episode_begins(episodes, tmp_path):
     imageio_ffmpeg = pytest.importorskip('imageio_ffmpeg')
     try:

@@ -402,6 +402,7 @@ def test_a_film_that_a_full_disk_does_not_take_is_an_os_error(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.release
 def test_the_film_of_an_episode_is_that_of_the_command(folder, opengl, tmp_path):
     episode = sorted(folder.iterdir())[0]
     film = Film.of_episode(episode, width=64, height=48)
@@ -412,6 +413,7 @@ def test_the_film_of_an_episode_is_that_of_the_command(folder, opengl, tmp_path)
         Film.of_episode(tmp_path / 'nowhere')
 
 
+@pytest.mark.release
 def test_an_environment_without_a_time_limit_is_filmed_for_an_episode(opengl):
     env = FetchHandEnv('FetchReach', render_mode='rgb_array', width=32, height=32)
     assert len(film_episode(env, lambda observation: np.zeros(4))) == 51

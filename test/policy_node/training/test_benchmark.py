@@ -264,6 +264,7 @@ def test_a_job_of_another_process_is_left_alone(
     assert not (taken / 'progress.csv').exists()
 
 
+@pytest.mark.release
 def test_a_job_whose_end_was_not_saved_is_not_finished(tmp_path: Path) -> None:
     """The log is ahead where the last checkpoint failed, or where a kill came before it."""
     arguments = small(tmp_path, '--arms', 'her_sparse')
@@ -280,6 +281,7 @@ def test_a_job_whose_end_was_not_saved_is_not_finished(tmp_path: Path) -> None:
     assert read_info(job.folder / 'latest.safetensors').env_steps == 1200
 
 
+@pytest.mark.release
 def test_another_budget_in_the_same_folder_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

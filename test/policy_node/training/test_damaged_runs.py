@@ -174,9 +174,7 @@ def test_an_invalid_replay_is_collected_again(
     assert '1,200 steps fill the replay' in error
 
 
-@pytest.mark.parametrize(
-    'content', [bytes(range(256)) * 10, b'a,b\n1,2\n', b'\xff' * 200_000, b'env_steps\n9999\n']
-)
+@pytest.mark.parametrize('content', [bytes(range(256)) * 10, b'env_steps\n9999\n'])
 def test_an_invalid_log_does_not_stop_a_run(
     run: Path, content: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -143,7 +143,7 @@ def test_the_actor_update_leaves_the_critic_alone_and_normalizers_untouched() ->
         (False, 'float32'),
         pytest.param(True, 'float32', marks=pytest.mark.release),
         pytest.param(False, 'bfloat16', marks=pytest.mark.release),
-        (True, 'bfloat16'),
+        pytest.param(True, 'bfloat16', marks=pytest.mark.release),
     ],
 )
 def test_it_finds_the_best_action(layer_norm: bool, precision: str) -> None:

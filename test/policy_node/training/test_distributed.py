@@ -39,6 +39,7 @@ leave_workers(workers)
 """
 
 
+@pytest.mark.release
 def test_two_workers_agree() -> None:
     command = [sys.executable, '-m', 'torch.distributed.run', '--nproc-per-node', '2']
     command += ['--rdzv-backend', 'c10d', '--rdzv-endpoint', 'localhost:0', '--no-python']

@@ -165,6 +165,7 @@ SMALL = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_ep
 SMALL |= {'simulation_threads': 1, 'torch_threads': 1, 'evaluate_every': 400}
 
 
+@pytest.mark.release
 def test_a_run_goes_on_where_it_stopped_and_saves_an_actor_like_any_other(tmp_path: Path) -> None:
     config = recipe_config('FetchReach', 'best', subgoal_every=10, total_steps=1_200, **SMALL)
     trainer = Trainer(config, tmp_path, Workers())

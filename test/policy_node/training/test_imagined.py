@@ -107,6 +107,7 @@ def test_the_network_that_imagines_learns_at_its_interval() -> None:
     assert learnt == [True, False, False, True, False, False, True]
 
 
+@pytest.mark.release
 def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     small = {'num_envs': 8, 'updates_per_cycle': 4, 'batch_size': 64, 'evaluation_episodes': 8}
     small |= {'simulation_threads': 1, 'torch_threads': 1, 'subgoal_prior': 0.3}

@@ -74,6 +74,7 @@ def test_a_run_starts_with_all_networks_of_another(tmp_path: Path, block_run: Pa
     assert source.learner.critic_optimizer.state_dict()['state'] != {}
 
 
+@pytest.mark.release
 def test_a_run_starts_from_the_mean_of_several(tmp_path: Path, block_run: Path) -> None:
     task, runs = 'HandManipulateBlockRotateXYZ', [block_run]
     for seed in (1, 2):
@@ -209,6 +210,7 @@ def test_a_condition_starts_without_effect_and_is_fixed_for_other_runs(
     torch.testing.assert_close(said(follower), said(run, acting))
 
 
+@pytest.mark.release
 def test_a_second_critic_starts_from_random_weights(tmp_path: Path, block_run: Path) -> None:
     task, runs = 'HandManipulateBlockRotateXYZ', [tmp_path / 'two', tmp_path / 'mean']
     twins = ['--set=critics=2', '--set=aggregate=min', *SET]
@@ -241,6 +243,7 @@ def test_a_second_critic_starts_from_random_weights(tmp_path: Path, block_run: P
     assert same(alone.critic.state_dict(), part_of(mean.tensors, 'critic.members.0'))
 
 
+@pytest.mark.release
 def test_a_critic_with_another_norm_starts_from_random_weights(
     tmp_path: Path, block_run: Path
 ) -> None:
@@ -258,6 +261,7 @@ def test_a_critic_with_another_norm_starts_from_random_weights(
     assert not read_initial_networks(f'{block_run},{run}').has_critic
 
 
+@pytest.mark.release
 def test_the_mean_of_batch_norms_counts_no_batches(tmp_path: Path) -> None:
     task, runs = 'HandManipulateBlockRotateXYZ', [tmp_path / name for name in 'ab']
     for seed, run in enumerate(runs):

@@ -239,6 +239,7 @@ def test_a_stored_run_is_not_trained_again_and_another_seed_is_added(
     assert {path.name: path.read_bytes() for path in report.iterdir()} == kept
 
 
+@pytest.mark.release
 def test_a_killed_measurement_is_done_again_without_training(tmp_path: Path) -> None:
     report = tmp_path / 'report'
     arguments = [*SMALL, '--arms', 'actual', '--output', str(tmp_path), '--report', str(report)]
@@ -357,6 +358,7 @@ def test_processes_that_store_runs_at_once_lose_nothing(tmp_path: Path) -> None:
     assert sorted(seed for *_, seed in read_runs(tmp_path)) == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.release
 def test_a_run_with_a_damaged_actor_or_log_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -39,6 +39,7 @@ def test_the_sentence_names_what_is_kept_and_what_is_lost() -> None:
     assert 'up to 80 ms action latency, ' in text and 'not with 0.005 rad joint noise.' in text
 
 
+@pytest.mark.release
 def test_an_interrupted_command_goes_on_with_the_missing_points(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -107,6 +107,7 @@ def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(
     assert '2,000 steps fill the replay' in said
 
 
+@pytest.mark.release
 def test_a_run_that_is_stopped_while_its_replay_fills_has_learnt_nothing_from_a_part(
     tmp_path: Path,
 ) -> None:
@@ -131,7 +132,7 @@ def test_a_run_that_is_stopped_while_its_replay_fills_has_learnt_nothing_from_a_
     assert [(row['env_steps'], row['updates']) for row in log.rows] == [(2_400, 24)]
 
 
-@pytest.mark.parametrize('damaged', [True, False])
+@pytest.mark.parametrize('damaged', [pytest.param(True, marks=pytest.mark.release), False])
 def test_a_replay_that_is_no_multiple_of_an_episode_is_full_with_whole_ones(
     tmp_path: Path, damaged: bool
 ) -> None:
@@ -165,7 +166,13 @@ def test_a_best_actor_that_is_newer_than_the_checkpoint_stays(tmp_path: Path) ->
     assert best.read_bytes() == saved
 
 
-@pytest.mark.parametrize('change', [{'evaluation_episodes': 9}, {'success_rule': 'paper'}])
+@pytest.mark.parametrize(
+    'change',
+    [
+        {'evaluation_episodes': 9},
+        pytest.param({'success_rule': 'paper'}, marks=pytest.mark.release),
+    ],
+)
 def test_a_best_actor_that_was_measured_otherwise_is_measured_anew(
     tmp_path: Path, change: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
