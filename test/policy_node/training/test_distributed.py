@@ -6,11 +6,13 @@ import os
 import subprocess
 import sys
 
+import pytest
 import torch
 
 from policy_node.training.machine.distributed import Workers, join_workers
 
 PROGRAM = """
+import pytest
 import torch
 from policy_node.training.machine.distributed import join_workers, leave_workers
 from policy_node.training.experience.statistics import RunningStatistics
