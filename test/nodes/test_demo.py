@@ -53,6 +53,7 @@ def test_the_demo_logs_episodes_and_stops_in_order(
     assert not [path for path in paths if path.name.startswith('.')]
 
 
+@pytest.mark.release
 def test_the_demo_counts_no_episodes_of_others_in_its_directory(
     start_process, tmp_path, tmp_path_factory
 ):
@@ -73,7 +74,9 @@ def test_the_demo_counts_no_episodes_of_others_in_its_directory(
     ('node', 'who'),
     [
         ([*SIM_NODE, *ros_args(task='HandReach')], 'a robot'),
-        ([*POLICY_NODE, '--ros-args', '-r', '__node:=actor'], 'actor'),
+        pytest.param(
+            [*POLICY_NODE, '--ros-args', '-r', '__node:=actor'], 'actor', marks=pytest.mark.release
+        ),
     ],
 )
 def test_the_demo_is_not_begun_beside_others(node, who, start_process, tmp_path):

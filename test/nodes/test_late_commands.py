@@ -71,7 +71,9 @@ def answer_after(robot: Client, seconds: float, steps: int, *, is_stamped: bool 
     return robot.received_at['joint_states'][-1] - first
 
 
-@pytest.mark.parametrize(('is_stamped', 'fewest'), [(False, 5), (True, 45)])
+@pytest.mark.parametrize(
+    ('is_stamped', 'fewest'), [pytest.param(False, 5, marks=pytest.mark.release), (True, 45)]
+)
 def test_late_commands_are_in_diagnostics_in_the_file_and_in_the_list(
     start_process: Start, tmp_path: Path, capsys, is_stamped: bool, fewest: int
 ) -> None:

@@ -191,6 +191,7 @@ def test_a_stopped_simulation_counts_missed_ticks_and_never_catches_up(
     end(sim)
 
 
+@pytest.mark.release
 def test_two_arms_and_a_hand_in_one_graph(start_process: Start, tmp_path: Path) -> None:
     robots = {'arm1': 'FetchReach', 'arm2': 'FetchReach', 'hand': 'HandReach'}
     sims, policies = {}, []
@@ -295,7 +296,11 @@ def wait_for_handler(process: subprocess.Popen[str]) -> None:
     raise AssertionError('no signal handler')
 
 
-@pytest.mark.parametrize('command', [SIM_NODE, POLICY_NODE], ids=['sim_node', 'policy_node'])
+@pytest.mark.parametrize(
+    'command',
+    [SIM_NODE, pytest.param(POLICY_NODE, marks=pytest.mark.release)],
+    ids=['sim_node', 'policy_node'],
+)
 def test_ctrl_c_at_any_moment_ends_with_0_and_no_traceback(
     start_process: Start, command: tuple[str, ...]
 ) -> None:

@@ -139,6 +139,7 @@ def test_disturbances_change_between_episodes(start_process: Start, tmp_path: Pa
     assert EpisodeChecker().check(last).difference is None
 
 
+@pytest.mark.release
 def test_an_episode_at_250_hz_takes_ten_times_the_ticks(
     start_process: Start, tmp_path: Path
 ) -> None:

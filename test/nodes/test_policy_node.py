@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
 from rcl_interfaces.srv import SetParameters
@@ -124,6 +125,7 @@ def test_a_policy_of_another_rate_is_refused_while_another_acts(start_process: S
     end(policy)
 
 
+@pytest.mark.release
 def test_an_actor_of_another_task_may_be_set_once_the_robot_is_gone(start_process: Start) -> None:
     policy = start_process(*POLICY_NODE)
     end(_answered_robot(start_process, REACH))

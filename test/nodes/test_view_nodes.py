@@ -214,6 +214,7 @@ def test_a_replay_is_told_from_a_robot_and_paused(start_process: Start, tmp_path
         follower.until(lambda p: not p.facts.is_paused and p.stamp_ns != stamp, 'it goes on')
 
 
+@pytest.mark.release
 def test_a_replay_of_any_name_in_any_namespace_is_paused(
     start_process: Start, tmp_path: Path
 ) -> None:
@@ -576,7 +577,8 @@ def test_who_comes_while_the_robot_stands_still_sees_the_last_tick(start_process
     end(node)
 
 
-@pytest.mark.parametrize('simulated_time', [pytest.param(False, marks=pytest.mark.release), True])
+@pytest.mark.release
+@pytest.mark.parametrize('simulated_time', [False, True])
 def test_another_robot_in_the_same_place_is_followed(
     start_process: Start, simulated_time: bool
 ) -> None:
@@ -697,6 +699,7 @@ def test_a_fast_robot_is_seen_as_it_is_now_and_then_and_a_replay_after_it(
         assert follower.picture.facts.seed == 5
 
 
+@pytest.mark.release
 def test_without_opengl_the_camera_says_so_and_the_rest_goes_on(
     start_process: Start, ros_environment: dict[str, str]
 ) -> None:

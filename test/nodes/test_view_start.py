@@ -94,6 +94,7 @@ def test_what_a_running_robot_would_not_do_is_refused(start_process: Start, tmp_
     )
 
 
+@pytest.mark.release
 def test_the_robot_is_in_the_namespace_of_ros_arguments(start_process: Start) -> None:
     start_view(start_process, '--task', 'FetchReach', '--ros-args', '-r', '__ns:=/left')
     with client(REACH) as connection:
@@ -102,6 +103,7 @@ def test_the_robot_is_in_the_namespace_of_ros_arguments(start_process: Start) ->
         assert not connection.node.count_publishers('episode_status')
 
 
+@pytest.mark.release
 def test_of_two_robots_one_publishes_the_clock(start_process: Start) -> None:
     for robot, task in (('left', 'FetchReach'), ('right', 'HandReach')):
         _, said = start_view(start_process, '--robot', robot, '--task', task)

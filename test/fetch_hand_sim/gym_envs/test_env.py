@@ -306,6 +306,7 @@ def test_the_flat_view_is_the_concatenation():
     assert flat.tobytes() == np.concatenate([parts[name] for name in names]).tobytes()
 
 
+@pytest.mark.release
 def test_stable_baselines3_learns_with_hindsight():
     library = pytest.importorskip('stable_baselines3')
     torch.set_num_threads(1)

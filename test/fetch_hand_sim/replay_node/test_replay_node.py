@@ -247,7 +247,6 @@ def assert_ends_well(replay, said=''):
     [
         ('wait_for_commands', '2.00 s, at 1 x real time; topics in /; waits for commands'),
         ('start_paused', '; topics in /; paused until ~/pause is called with false'),
-        ('loop', '; topics in /'),
     ],
 )
 def test_an_interrupted_replay_prints_one_line(parameter, said, start_process, episode):
@@ -303,6 +302,7 @@ def test_in_a_namespace_it_replays_a_robot_of_that_namespace(start_process, epis
         assert_ends_well(replay)
 
 
+@pytest.mark.release
 def test_a_policy_goes_on_when_less_than_a_second_is_replayed_again(start_process, episode):
     with client(REACH) as listener:
         received = collect(listener, 'commands')
@@ -329,10 +329,8 @@ def test_topics_of_a_running_robot_are_rejected_unless_forced(start_process, epi
     ('parameters', 'line'),
     [
         ({}, 'path is missing; allowed: a bag directory or an MCAP file'),
-        ({'path': '/nowhere'}, '/nowhere: No such file or directory'),
         ({'topics': 'wheels'}, "no topic 'wheels' in the episode; allowed: /clock, /joint_states"),
         ({'start_offset': 9.0}, 'start_offset: 9.0 given; allowed: up to 2.000'),
-        ({'rate': 0.0}, '0.01 ... 100'),
     ],
 )
 def test_bad_parameters_end_with_one_line_and_code_2(start_process, episode, parameters, line):
