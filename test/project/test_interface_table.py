@@ -56,16 +56,6 @@ def test_hand_commands_are_listed_in_order_with_their_ranges():
     ]
 
 
-def test_tables_are_rectangular():
-    columns = None
-    for line in interface_markdown().splitlines():
-        if not line.startswith('|'):
-            columns = None
-            continue
-        columns = columns or line.count('|')
-        assert line.count('|') == columns, line
-
-
 def test_section_is_replaced_and_the_rest_kept(tmp_path):
     path = tmp_path / 'page.md'
     path.write_text(f'# Title\n{START}\nold\n{END}\nrest\n')
