@@ -26,8 +26,11 @@ from bench_view import start  # noqa: E402
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import topic, view_topic  # noqa: E402
 from node_runtime.event_loop import EventLoop  # noqa: E402
-from node_runtime.ros import rclpy_profile, ros_message_class  # noqa: E402
-from node_runtime.transport import keep_discovery_local  # noqa: E402
+from node_runtime.ros import (  # noqa: E402
+    keep_discovery_local,
+    rclpy_profile,
+    ros_message_class,
+)
 
 _TICKS_PER_SECOND = os.sysconf('SC_CLK_TCK')
 # Seconds before each measurement.

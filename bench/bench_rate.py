@@ -31,8 +31,12 @@ from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import DIAGNOSTICS, TopicSpec, topic  # noqa: E402
 from node_runtime.diagnostics import MISSED_TICKS  # noqa: E402
 from node_runtime.event_loop import EventLoop  # noqa: E402
-from node_runtime.ros import rclpy_profile, ros_message_class  # noqa: E402
-from node_runtime.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402
+from node_runtime.ros import (  # noqa: E402  # noqa: E402
+    keep_discovery_local,
+    leave_out_shared_memory,
+    rclpy_profile,
+    ros_message_class,
+)
 
 
 class Watcher:

@@ -27,7 +27,7 @@ from bench_rate import Watcher, report  # noqa: E402
 
 from msgs_spec.tasks import TASKS, task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
-from node_runtime.transport import keep_discovery_local  # noqa: E402
+from node_runtime.ros import keep_discovery_local  # noqa: E402
 from support.visitors import DeafVisitor, Visitor  # noqa: E402
 
 VISITORS = 3

@@ -14,8 +14,12 @@ import rclpy  # noqa: E402
 from msgs_spec.codecs import TopicCodec  # noqa: E402
 from msgs_spec.tasks import task_spec  # noqa: E402
 from msgs_spec.topics import topic  # noqa: E402
-from node_runtime.ros import rclpy_profile, ros_message_class  # noqa: E402
-from node_runtime.transport import keep_discovery_local, leave_out_shared_memory  # noqa: E402
+from node_runtime.ros import (  # noqa: E402  # noqa: E402
+    keep_discovery_local,
+    leave_out_shared_memory,
+    rclpy_profile,
+    ros_message_class,
+)
 
 BYTES = 10_000_000
 

@@ -27,8 +27,8 @@ from node_runtime.command_line import (
     require_extra,
     run_command,
 )
+from node_runtime.ros import keep_discovery_local, leave_out_shared_memory
 from node_runtime.signals import available_signals
-from node_runtime.transport import keep_discovery_local, leave_out_shared_memory
 
 if TYPE_CHECKING:
     from rclpy.node import Node

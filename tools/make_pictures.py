@@ -17,8 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from fetch_hand_sim.commands.node_processes import is_actor_shipped
 from fetch_hand_sim.films.film import write_film, write_picture
-from fetch_hand_sim.films.recording import Recording, load_recordings
-from fetch_hand_sim.films.studio import sheet_size, tile, with_edge
+from fetch_hand_sim.films.recording import Recording, load_recordings, sheet_size, tile, with_edge
 from fetch_hand_sim.simulation.rendering import SceneRenderer
 from fetch_hand_sim.simulation.scene import Scene, trail_of
 from msgs_spec.arrays import Picture

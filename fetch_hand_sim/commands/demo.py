@@ -42,8 +42,13 @@ from node_runtime.command_line import (
     whole_number,
 )
 from node_runtime.node_main import StopSignals, destroy, find_place_for_logs
-from node_runtime.ros import DISCOVERY_TIME, count_publishers, rclpy_profile, ros_message_class
-from node_runtime.transport import keep_discovery_local
+from node_runtime.ros import (
+    DISCOVERY_TIME,
+    count_publishers,
+    keep_discovery_local,
+    rclpy_profile,
+    ros_message_class,
+)
 
 _NAME = 'fetch_hand_sim demo'
 _START_TIMEOUT = 60.0

@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from fetch_hand_sim.commands.options import add_filter_options, is_wanted, picture_size
+from fetch_hand_sim.commands.episodes_list import add_filter_options, is_wanted
 from fetch_hand_sim.datasets import minari
 from fetch_hand_sim.datasets.parquet import export_parquet
 from fetch_hand_sim.datasets.writing import ByTask, why_apart
@@ -31,6 +31,7 @@ from node_runtime.command_line import (
     CommandParser,
     UsageError,
     complain,
+    picture_size,
     progress,
     require_extra,
     run_command,
@@ -167,8 +168,7 @@ def _export(options: argparse.Namespace, by_task: ByTask, name: str) -> dict[str
 
 def _export_lerobot(options: argparse.Namespace, by_task: ByTask) -> dict[str, Path]:
     # Only films need MuJoCo.
-    from fetch_hand_sim.datasets.lerobot import export_lerobot
-    from fetch_hand_sim.datasets.lerobot_film import Camera
+    from fetch_hand_sim.datasets.lerobot import Camera, export_lerobot
 
     camera = None
     if options.pictures is not None:

@@ -10,7 +10,6 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from fetch_hand_sim.commands.options import picture_size, two_numbers
 from msgs_spec.arrays import Picture
 from node_runtime.command_line import (
     EXIT_SUCCESS,
@@ -18,9 +17,11 @@ from node_runtime.command_line import (
     CommandParser,
     UsageError,
     complain,
+    picture_size,
     progress,
     run_command,
     say,
+    two_numbers,
 )
 
 _NAME = 'fetch_hand_sim episodes film'
@@ -90,8 +91,16 @@ def _check_is_used(options: argparse.Namespace) -> None:
 
 def _render(options: argparse.Namespace) -> None:
     from fetch_hand_sim.films.film import STILL, check_size, write_film, write_picture
-    from fetch_hand_sim.films.recording import Recording, find_playable, load_recordings
-    from fetch_hand_sim.films.studio import Studio, grid, sheet_size, sheets, tile
+    from fetch_hand_sim.films.recording import (
+        Recording,
+        Studio,
+        find_playable,
+        grid,
+        load_recordings,
+        sheet_size,
+        sheets,
+        tile,
+    )
 
     columns, rows = options.grid or (1, 1)
     recordings: list[Recording] = load_recordings(

@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.datasets.lerobot_columns import Columns, features, frames, statistics
-from fetch_hand_sim.datasets.lerobot_film import Camera, Histogram, color_statistics, write_episodes
 from fetch_hand_sim.datasets.writing import (
     ByTask,
     ExportError,
@@ -28,6 +26,9 @@ from fetch_hand_sim.datasets.writing import (
     require_new,
 )
 from fetch_hand_sim.episode_log import EpisodeArrays
+from fetch_hand_sim.films.film import write_film
+from fetch_hand_sim.films.recording import Studio, recording_of
+from msgs_spec.arrays import Picture
 from msgs_spec.tasks import TaskSpec
 
 _VERSION = 'v3.0'
@@ -236,3 +237,207 @@ def _tasks(spec: TaskSpec) -> Any:
     }
     table = require_module('pyarrow').table({'task_index': [0], names: [spec.name]})
     return table.replace_schema_metadata({'pandas': json.dumps(pandas)})
+
+
+# Columns; names and types are those of lerobot 0.4.4 (`utils/constants.py`, `datasets/utils.py`)
+
+Columns = dict[str, NDArray[Any]]
+
+QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+# Beginning of the names of observed parts that do not belong to the robot.
+_OBJECT = 'object'
+# Numbers of frames, episodes and tasks.
+_COUNTS = ('frame_index', 'episode_index', 'index', 'task_index')
+
+
+def features(spec: TaskSpec) -> dict[str, dict[str, Any]]:
+    """Return type, shape and names of the columns, as in `meta/info.json`."""
+    robot, rest = _parts(spec)
+    goal = [f'desired_goal_{index}' for index in range(spec.goal.size)]
+    return {
+        'observation.state': _feature('float32', robot),
+        'observation.environment_state': _feature('float32', rest + goal),
+        'action': _feature('float32', [part.name for part in spec.robot.command]),
+        'next.reward': _feature('float32'),
+        'next.success': _feature('bool'),
+        'next.done': _feature('bool'),
+        'timestamp': _feature('float32'),
+        **{name: _feature('int64') for name in _COUNTS},
+    }
+
+
+def _feature(dtype: str, names: list[str] | None = None) -> dict[str, Any]:
+    return {'dtype': dtype, 'shape': [len(names) if names else 1], 'names': names}
+
+
+def _parts(spec: TaskSpec) -> tuple[list[str], list[str]]:
+    """Return the names of the observed numbers of the robot, and of its object."""
+    robot: list[str] = []
+    rest: list[str] = []
+    for part in spec.observation:
+        into = rest if part.name.startswith(_OBJECT) else robot
+        into += [f'{part.name}_{index}' for index in range(part.size)]
+    return robot, rest
+
+
+def frames(episode: EpisodeArrays, episode_index: int, first_index: int) -> Columns:
+    """Return the columns of the N frames of an episode, one per action.
+
+    Args:
+        episode_index: Number of the episode in the dataset.
+        first_index: Number of frames before it.
+    """
+    spec, count = episode.spec, len(episode)
+    seen = episode.observations['observation'][:count]
+    of_object = np.repeat(
+        [part.name.startswith(_OBJECT) for part in spec.observation],
+        [part.size for part in spec.observation],
+    )
+    environment = [seen[:, of_object], episode.observations['desired_goal'][:count]]
+    frame = np.arange(count)
+    return {
+        'observation.state': seen[:, ~of_object].astype(np.float32),
+        'observation.environment_state': np.concatenate(environment, axis=1).astype(np.float32),
+        'action': episode.actions.astype(np.float32),
+        'next.reward': episode.rewards.astype(np.float32),
+        'next.success': episode.success[1:],
+        'next.done': episode.terminated | episode.truncated,
+        'timestamp': (frame / episode.record.control_hz).astype(np.float32),
+        'frame_index': frame,
+        'episode_index': np.full(count, episode_index),
+        'index': first_index + frame,
+        'task_index': np.zeros_like(frame),
+    }
+
+
+def statistics(values: NDArray[Any]) -> dict[str, Any]:
+    """Return the statistics of frames (n,) or (n, size) for normalisation; each is a list."""
+    rows = values.reshape(len(values), -1)
+    numbers = rows.astype(np.float64)
+    return {
+        'min': rows.min(axis=0).tolist(),
+        'max': rows.max(axis=0).tolist(),
+        'mean': numbers.mean(axis=0).tolist(),
+        'std': numbers.std(axis=0).tolist(),
+        'count': [len(rows)],
+        **{
+            quantile_name(share): quantile.tolist()
+            for share, quantile in zip(
+                QUANTILES, np.quantile(numbers, QUANTILES, axis=0), strict=True
+            )
+        },
+    }
+
+
+def quantile_name(share: float) -> str:
+    """Return the name of a quantile, such as `q50`."""
+    return f'q{round(100 * share):02d}'
+
+
+# Films: every frame of the episodes, drawn from the log
+
+_LEVELS = 256
+# Pictures from one keyframe to the next, as lerobot encodes films.
+_KEYFRAME_EVERY = 2
+
+Histogram = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """The camera of the films of a dataset.
+
+    Attributes:
+        width: Width of pictures, pixels; even, because of H.264.
+        height: Height, likewise.
+        name: Name of a camera of the model; None for the usual view.
+    """
+
+    width: int
+    height: int
+    name: str | None = None
+
+    @property
+    def key(self) -> str:
+        """The name of the column."""
+        return f'observation.images.{self.name or "scene"}'
+
+    def feature(self, rate: float) -> dict[str, Any]:
+        """Return the column as in `meta/info.json`, for `rate` pictures per second."""
+        return {
+            'dtype': 'video',
+            'shape': [self.height, self.width, 3],
+            'names': ['height', 'width', 'channels'],
+            'info': {
+                'video.height': self.height,
+                'video.width': self.width,
+                'video.codec': 'h264',
+                'video.pix_fmt': 'yuv420p',
+                'video.is_depth_map': False,
+                'video.fps': rate,
+                'video.channels': 3,
+                'has_audio': False,
+            },
+        }
+
+
+def write_episodes(
+    path: Path, episodes: Sequence[EpisodeArrays], camera: Camera, rate: float
+) -> list[Histogram]:
+    """Write a film of all frames of episodes except the last of each, which has no action.
+
+    Returns:
+        How often each level of each channel was drawn, (3, 256) for each episode.
+
+    Raises:
+        ValueError: If the model has no such camera, an episode cannot be read, or ffmpeg is
+            missing.
+        RuntimeError: If OpenGL is missing.
+        OSError: If the film cannot be written.
+    """
+    studio = Studio(camera.width, camera.height, camera.name)
+    histograms = [np.zeros((3, _LEVELS), dtype=np.int64) for _ in episodes]
+    try:
+        pictures = _counted(studio, episodes, histograms)
+        write_film(path, pictures, rate, keyframe_every=_KEYFRAME_EVERY)
+    finally:
+        studio.close()
+    return histograms
+
+
+def _counted(
+    studio: Studio, episodes: Sequence[EpisodeArrays], histograms: Sequence[Histogram]
+) -> Iterator[Picture]:
+    for episode, histogram in zip(episodes, histograms, strict=True):
+        recording = recording_of(episode)
+        for index in range(len(recording.frames) - 1):
+            picture = studio.plain(recording, index)
+            for channel, row in enumerate(histogram):
+                row += np.bincount(picture[..., channel].ravel(), minlength=_LEVELS)
+            yield picture
+
+
+def color_statistics(histogram: Histogram, pixels: int) -> dict[str, Any]:
+    """Return the statistics of pictures for normalisation: levels in [0, 1], each (3, 1, 1).
+
+    Args:
+        histogram: (3, 256) how often each level was drawn.
+        pixels: Number of pixels of a picture.
+    """
+    levels = np.arange(_LEVELS) / (_LEVELS - 1)
+    total = int(histogram[0].sum())
+    share = histogram / total
+    mean = share @ levels
+    drawn, below = histogram > 0, np.cumsum(histogram, axis=1)
+    found = {
+        'min': levels[drawn.argmax(axis=1)],
+        'max': levels[_LEVELS - 1 - drawn[:, ::-1].argmax(axis=1)],
+        'mean': mean,
+        'std': np.sqrt(np.maximum(share @ levels**2 - mean**2, 0.0)),
+        **{
+            quantile_name(each): levels[(below >= each * total).argmax(axis=1)]
+            for each in QUANTILES
+        },
+    }
+    values = {name: each.reshape(3, 1, 1).tolist() for name, each in found.items()}
+    return {**values, 'count': [total // pixels]}

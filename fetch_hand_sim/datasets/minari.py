@@ -29,7 +29,6 @@ from fetch_hand_sim.datasets.writing import (
 )
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
-from fetch_hand_sim.gym_envs.spaces import observation_space
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from msgs_spec.text import one_line
 from node_runtime.command_line import UsageError, progress
@@ -117,6 +116,9 @@ def _create_dataset(
     minari: Any, dataset_id: str, episodes: Sequence[EpisodeArrays], buffers: Iterator[Any]
 ) -> None:
     """Write a dataset into `MINARI_DATASETS_PATH`."""
+    # Loads MuJoCo, which other exports do not need.
+    from fetch_hand_sim.gym_envs.task_attributes import observation_space
+
     spec = episodes[0].spec
     # Actions computed from commands may need float64.
     actions = spaces.Box(-1.0, 1.0, (spec.robot.action_size,), np.float64)

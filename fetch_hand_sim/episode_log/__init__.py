@@ -2,13 +2,14 @@
 
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episodes
 from fetch_hand_sim.episode_log.bag import Attachment, LogSettings
-from fetch_hand_sim.episode_log.errors import (
+from fetch_hand_sim.episode_log.files import (
     EpisodeExistsError,
     EpisodeInUseError,
     EpisodeLogError,
     EpisodeReadError,
+    expand_episodes,
+    find_episodes,
 )
-from fetch_hand_sim.episode_log.files import expand_episodes, find_episodes
 from fetch_hand_sim.episode_log.metadata import EpisodeOutcome, EpisodeRecord, episode_metadata
 from fetch_hand_sim.episode_log.reader import Episode, EpisodeSummary, read_episode, read_summary
 from fetch_hand_sim.episode_log.recovery import Leftover, find_leftovers, recover_episode

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.episode_log.errors import EpisodeReadError
-from fetch_hand_sim.episode_log.files import expand_episodes
+from fetch_hand_sim.episode_log.files import EpisodeReadError, expand_episodes
 from fetch_hand_sim.episode_log.metadata import EpisodeOutcome, EpisodeRecord, HasOutcome
 from fetch_hand_sim.episode_log.reader import Episode, MessageRows, read_episode
 from msgs_spec.arrays import Array, Flags

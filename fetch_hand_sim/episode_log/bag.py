@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, Literal
 import yaml
 from mcap.writer import CompressionType, IndexType, Writer
 
-from fetch_hand_sim.episode_log.limits import (
+from fetch_hand_sim.episode_log.records import (
     MAX_ATTACHMENTS,
     MAX_CHUNK_BYTES,
     MAX_CHUNKS,

@@ -15,8 +15,8 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from fetch_hand_sim.episode_log.limits import MAX_SUMMARY_BYTES
 from fetch_hand_sim.episode_log.records import (
+    MAX_SUMMARY_BYTES,
     RECORD,
     Contents,
     Fields,

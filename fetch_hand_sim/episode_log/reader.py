@@ -16,11 +16,11 @@ from rosbags.typesys.base import TypesysError
 
 from fetch_hand_sim.episode_log import files
 from fetch_hand_sim.episode_log.bag import EPISODE, EPISODE_RESULT
-from fetch_hand_sim.episode_log.errors import EpisodeReadError
+from fetch_hand_sim.episode_log.files import EpisodeReadError
 from fetch_hand_sim.episode_log.indexes import parse_file
-from fetch_hand_sim.episode_log.limits import MAX_FILE_BYTES
 from fetch_hand_sim.episode_log.metadata import HasOutcome, parse_task
 from fetch_hand_sim.episode_log.records import (
+    MAX_FILE_BYTES,
     MESSAGE,
     MESSAGE_FIELD_BYTES,
     Channel,

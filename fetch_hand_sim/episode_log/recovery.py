@@ -29,12 +29,12 @@ from fetch_hand_sim.episode_log.bag import (
     LogSettings,
     checked_strings,
 )
-from fetch_hand_sim.episode_log.errors import EpisodeInUseError, EpisodeLogError
+from fetch_hand_sim.episode_log.files import EpisodeInUseError, EpisodeLogError
 from fetch_hand_sim.episode_log.indexes import require_one_meaning
-from fetch_hand_sim.episode_log.limits import MAX_FILE_BYTES
 from fetch_hand_sim.episode_log.metadata import RECOVERED, EpisodeOutcome
 from fetch_hand_sim.episode_log.reader import contract_topics, read_episode, require_contract
 from fetch_hand_sim.episode_log.records import (
+    MAX_FILE_BYTES,
     RECORD,
     RECOVERY_LIMITS,
     Contents,

@@ -20,8 +20,8 @@ from pathlib import Path
 
 from fetch_hand_sim.episode_log import files
 from fetch_hand_sim.episode_log.bag import Attachment, BagFile, LogSettings, checked_strings
-from fetch_hand_sim.episode_log.errors import EpisodeExistsError, EpisodeLogError
-from fetch_hand_sim.episode_log.limits import (
+from fetch_hand_sim.episode_log.files import EpisodeExistsError, EpisodeLogError
+from fetch_hand_sim.episode_log.records import (
     MAX_ATTACHMENT_BYTES,
     MAX_CHUNKS,
     MAX_MESSAGES,

@@ -22,11 +22,14 @@ from fetch_hand_sim.episode_log import (
 )
 from fetch_hand_sim.episode_log.bag import offered_qos_text
 from fetch_hand_sim.episode_log.metadata import RECOVERED
-from fetch_hand_sim.episode_log.model import former_model_sha256, mjcf_attachment, model_sha256
 from fetch_hand_sim.episode_log.reader import LoggedTick, logged_topics, split_ticks
-from fetch_hand_sim.episodes.inputs import accept_goal, accept_perturbation
-from fetch_hand_sim.episodes.recorder import episode_result
-from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.episodes.recorder import (
+    episode_result,
+    former_model_sha256,
+    mjcf_attachment,
+    model_sha256,
+)
+from fetch_hand_sim.episodes.runner import EpisodeRunner, accept_goal, accept_perturbation
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array
 from msgs_spec.codecs import decode
@@ -34,7 +37,7 @@ from msgs_spec.schemas import deserialize, type_hash
 from msgs_spec.text import one_line
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import TopicSpec
-from node_runtime.source_revision import source_revision
+from node_runtime.command_line import source_revision
 
 # Characters of a value in a line.
 _LONGEST = 80

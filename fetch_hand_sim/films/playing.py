@@ -21,8 +21,7 @@ from fetch_hand_sim.films.film import (
     write_animation,
     write_film,
 )
-from fetch_hand_sim.films.recording import load_recordings
-from fetch_hand_sim.films.studio import Studio
+from fetch_hand_sim.films.recording import Studio, load_recordings
 from fetch_hand_sim.gym_envs.task_attributes import TaskAttributes
 from msgs_spec.arrays import Picture
 

@@ -182,9 +182,7 @@ def _wrapper_of_batches(wrapper: Any) -> Any:
 
 
 _REFERENCE_ENV = 'fetch_hand_sim.gym_envs.gymnasium_robotics_env:make_env'
-_REFERENCE_VECTOR_ENV = (
-    'fetch_hand_sim.gym_envs.gymnasium_robotics_vector_env:GymnasiumRoboticsVectorEnv'
-)
+_REFERENCE_VECTOR_ENV = 'fetch_hand_sim.gym_envs.gymnasium_robotics_env:GymnasiumRoboticsVectorEnv'
 _WITHOUT_TOUCH = 'fetch_hand_sim.gym_envs.registration:refuse_touch_sensors'
 _TOUCH_SENSORS = ('_BooleanTouchSensors', '_ContinuousTouchSensors')
 

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from fetch_hand_sim.episodes.runner import has_ended
 from fetch_hand_sim.gym_envs.pictures import RENDER_MODES, Pictures, check_render_mode, render_fps
-from fetch_hand_sim.gym_envs.spaces import action_space, clip_actions, observation_space
 from fetch_hand_sim.gym_envs.task_attributes import (
     TaskAttributes,
+    action_space,
     check_reset_options,
+    clip_actions,
     given_by_options,
     goals_of_options,
+    observation_space,
 )
 from fetch_hand_sim.simulation import Observation, Simulation, StepResult
 from fetch_hand_sim.simulation.arguments import finite_goal, require_whole

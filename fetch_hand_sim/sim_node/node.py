@@ -23,10 +23,9 @@ from fetch_hand_sim.sim_node import NODE_NAME
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
 from fetch_hand_sim.sim_node.health import WAITING_PERIOD, Reporter
-from fetch_hand_sim.sim_node.latest_tick import LatestTick
 from fetch_hand_sim.sim_node.receivers import Receivers
 from fetch_hand_sim.sim_node.robot import Messages, Robot
-from fetch_hand_sim.sim_node.schedule import TickSchedule
+from fetch_hand_sim.sim_node.schedule import LatestTick, TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.disturbances import read_disturbances

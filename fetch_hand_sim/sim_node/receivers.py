@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from fetch_hand_sim.episodes.runner import accept_perturbation
 from fetch_hand_sim.sim_node.robot import Robot
 from msgs_spec.codecs import answered_stamp, decode_status
 from msgs_spec.schemas import deserialize, require_short, serialize
@@ -51,7 +52,9 @@ class Receivers:
                 message.name, message.position
             ),
             'set_goal': robot.set_goal,
-            'perturb': robot.perturb,
+            'perturb': lambda spec, message: accept_perturbation(
+                robot.runner, spec, message, robot.perturb_limit
+            ),
             'policy_status': self._policy_status,
         }
 

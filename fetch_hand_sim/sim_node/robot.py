@@ -8,8 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from fetch_hand_sim.episodes.inputs import accept_goal, accept_perturbation
-from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.episodes.runner import EpisodeRunner, accept_goal
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from msgs_spec.tick import Tick, TickEncoder
@@ -209,14 +208,6 @@ class Robot:
         """Count a rejected goal and keep the reason."""
         self.counters.goals_rejected += 1
         self.counters.last_goal_rejection = reason
-
-    def perturb(self, topic: TopicSpec, message: Any) -> None:
-        """Push a body during the next tick.
-
-        Raises:
-            ValueError: If `accept_perturbation` rejects it.
-        """
-        accept_perturbation(self.runner, topic, message, self.perturb_limit)
 
     # Services and parameters
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 
-from fetch_hand_sim.episodes.inputs import bounded_wrench
+from fetch_hand_sim.episodes.runner import bounded_wrench
 from fetch_hand_sim.view.requests import (
     ChooseActor,
     LatestRequest,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import node_runtime
-from node_runtime.transport import keep_discovery_local, leave_out_shared_memory
+from node_runtime.ros import keep_discovery_local, leave_out_shared_memory
 
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'

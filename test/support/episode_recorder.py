@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeWriter, episode_metadata
-from fetch_hand_sim.episode_log.model import model_sha256
+from fetch_hand_sim.episodes.recorder import model_sha256
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import TopicCodec

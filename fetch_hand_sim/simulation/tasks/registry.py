@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS, FetchTask
+from fetch_hand_sim.simulation.tasks.hand import REACH_ASSET, HandReachTask
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
-from fetch_hand_sim.simulation.tasks.hand_reach import REACH_ASSET, HandReachTask
 from fetch_hand_sim.simulation.tasks.task import BatchConfig, Task
 from msgs_spec.tasks import (
     DEFAULT_CONTROL_HZ,

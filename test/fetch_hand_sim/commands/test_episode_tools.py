@@ -25,12 +25,11 @@ from fetch_hand_sim.episode_log import (
     recover_episode,
 )
 from fetch_hand_sim.episode_log.metadata import parse_task
-from fetch_hand_sim.episode_log.model import former_model_sha256, model_sha256
 from fetch_hand_sim.episode_log.reader import split_ticks
 from fetch_hand_sim.episodes import checker
 from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.episodes.generator import EpisodeGenerator
-from fetch_hand_sim.episodes.recorder import RecordingContext
+from fetch_hand_sim.episodes.recorder import RecordingContext, former_model_sha256, model_sha256
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import LayoutError, TopicCodec, decode
 from msgs_spec.robots import action_from_command
@@ -241,7 +240,7 @@ def test_check_runs_goals_that_were_set_on_the_way(tmp_path):
             # Neither of unit length nor in the hemisphere of the object.
             goal = np.array([1.0, 0.87, 0.2, -0.5, 0.5, 0.5, 0.2])
             writer.write_received(goal_topic, encoder.encode(tick.stamp_ns, goal))
-            recorder.runner.set_goal(goal)
+            recorder.runner.simulation.set_goal(goal[None])
     path = writer.finish({})
     assert EpisodeChecker().check(path).difference is None
     (arrays,) = load_episodes(path)

@@ -11,12 +11,11 @@ import pytest
 
 from fetch_hand_sim.commands import episodes_export
 from fetch_hand_sim.datasets import lerobot
-from fetch_hand_sim.datasets.lerobot_film import color_statistics
+from fetch_hand_sim.datasets.lerobot import color_statistics
 from fetch_hand_sim.datasets.writing import why_apart
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
 from fetch_hand_sim.episode_log.arrays import load_episode
-from fetch_hand_sim.films.recording import load_recordings
-from fetch_hand_sim.films.studio import Studio
+from fetch_hand_sim.films.recording import Studio, load_recordings
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from policy_node.training import generate_episodes
 from support.episode_recorder import Recorder

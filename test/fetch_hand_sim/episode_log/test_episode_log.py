@@ -27,7 +27,7 @@ from fetch_hand_sim.episode_log import (
     read_episode,
 )
 from fetch_hand_sim.episode_log.bag import offered_qos_text
-from fetch_hand_sim.episode_log.model import (
+from fetch_hand_sim.episodes.recorder import (
     compiled_attachment,
     compiled_bytes,
     mjcf_attachment,

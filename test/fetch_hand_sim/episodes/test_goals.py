@@ -10,8 +10,7 @@ import pytest
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, read_episode
 from fetch_hand_sim.episodes.checker import EpisodeChecker
-from fetch_hand_sim.episodes.inputs import accept_goal
-from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.episodes.runner import EpisodeRunner, accept_goal
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import build_message
 from msgs_spec.schemas import serialize

@@ -9,9 +9,8 @@ import pytest
 
 from fetch_hand_sim.commands.episodes_check import main as episodes_check
 from fetch_hand_sim.episode_log import read_episode
-from fetch_hand_sim.episodes.inputs import accept_perturbation, bounded_wrench
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder, RecordingContext
-from fetch_hand_sim.episodes.runner import EpisodeRunner
+from fetch_hand_sim.episodes.runner import EpisodeRunner, accept_perturbation, bounded_wrench
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import build_message
 from msgs_spec.schemas import serialize

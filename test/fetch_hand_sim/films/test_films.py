@@ -21,8 +21,7 @@ from fetch_hand_sim.commands.episodes_film import main as episodes_film
 from fetch_hand_sim.episode_log import EpisodeDirectory, EpisodeReadError, load_episodes
 from fetch_hand_sim.films.film import check_kind, check_size, write_film, write_picture
 from fetch_hand_sim.films.playing import Film, film_episode
-from fetch_hand_sim.films.recording import load_recordings
-from fetch_hand_sim.films.studio import Studio, grid, sheets
+from fetch_hand_sim.films.recording import Studio, grid, load_recordings, sheets
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.simulation.opengl import prepare_opengl
 from support.crafted_files import Crafter

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fetch_hand_sim.sim_node.latest_tick import LatestTick
+from fetch_hand_sim.sim_node.schedule import LatestTick
 from msgs_spec.codecs import decode_status
 from msgs_spec.schemas import deserialize
 from msgs_spec.tick import EpisodeStatus, TickEncoder, split_messages

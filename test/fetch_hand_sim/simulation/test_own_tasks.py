@@ -12,8 +12,8 @@ from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.simulation.tasks import hand_manipulate, registry
 from fetch_hand_sim.simulation.tasks.fetch import FETCH_CONFIGS
+from fetch_hand_sim.simulation.tasks.hand import HandReachTask
 from fetch_hand_sim.simulation.tasks.hand_manipulate import MANIPULATE_CONFIGS, HandManipulateTask
-from fetch_hand_sim.simulation.tasks.hand_reach import HandReachTask
 from fetch_hand_sim.simulation.tasks.task import BatchConfig
 from msgs_spec.robots import FETCH, CommandPart, action_from_command, command_from_action
 from msgs_spec.tasks import TASKS, GoalKind, TaskFormulas

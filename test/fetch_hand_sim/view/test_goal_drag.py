@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from fetch_hand_sim.episodes.inputs import FARTHEST_GOAL
+from fetch_hand_sim.episodes.runner import FARTHEST_GOAL
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.scene import Scene, View, ghost_pose
 from fetch_hand_sim.view.page import goal_panel
