@@ -390,9 +390,6 @@ class CommandCodec:
 
     The stamp of the observation is the label of a second dimension of size 1 in the layout.
     Receivers that read only `data` need not know it.
-
-    Args:
-        topic: The topic `commands` of a task.
     """
 
     def __init__(self, topic: TopicSpec) -> None:
@@ -406,12 +403,7 @@ class CommandCodec:
         self._label = slice(start, start + len(label))
 
     def encode(self, stamp: int, values: ArrayLike) -> bytes:
-        """Return the CDR bytes of a command.
-
-        Args:
-            stamp: Stamp of the observation, nanoseconds.
-            values: (topic.size,) in the order of the layout.
-        """
+        """Return the CDR bytes of a command."""
         data = bytearray(self._template)
         data[self._label] = answer_label(stamp).encode()
         # The numbers are the last field.

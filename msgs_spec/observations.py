@@ -108,9 +108,6 @@ class ObservationAssembler:
 
     Args:
         control_hz: Ticks per simulated second, from `episode_status`; ValueError if not allowed.
-
-    Attributes:
-        topics: The needed topics.
     """
 
     def __init__(self, task: TaskSpec, control_hz: float) -> None:

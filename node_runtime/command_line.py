@@ -270,10 +270,6 @@ def start_command(name: str, module: str, *extras: str) -> int:
 def require_extra(extra: str, *needed: str) -> None:
     """Check that the packages of an extra are installed.
 
-    Args:
-        extra: Name in `EXTRAS`.
-        needed: Modules of the extra that must exist; default all.
-
     Raises:
         UsageError: If a package is missing; the message names what to install.
     """
@@ -301,11 +297,7 @@ def _require_rclpy() -> None:
 
 @contextmanager
 def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar with the remaining time where stderr is a terminal.
-
-    Yields:
-        A function to call with the number of items done since the last call.
-    """
+    """Show a progress bar with the remaining time where stderr is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining
@@ -349,12 +341,7 @@ def source_revision() -> str:
 
 
 def revision_of(root: Path) -> str:
-    """Return the commit of a source tree, with `-dirty` if files of its packages have changed.
-
-    Raises:
-        OSError: If git is not installed.
-        subprocess.SubprocessError: If git fails, times out, or `root` is not a repository.
-    """
+    """Return the commit of a source tree, with `-dirty` if files of its packages have changed."""
 
     def git(*arguments: str) -> str:
         command = ['git', '-C', str(root), *arguments]

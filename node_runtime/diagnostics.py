@@ -50,13 +50,7 @@ class Level(IntEnum):
 
 @dataclass(slots=True)
 class Report:
-    """One status: facts as key/value pairs, and problems.
-
-    Attributes:
-        name: Fully qualified name of the node.
-        hardware_id: Task of the robot.
-        summary: The message of a report without problems.
-    """
+    """One status: facts as key/value pairs, and problems."""
 
     name: str
     hardware_id: str

@@ -107,17 +107,7 @@ def node_main(
     shared_memory: bool = False,
     second_signal_ends: bool = False,
 ) -> int:
-    """Run a node of `NODES` as a process, or print its help; return the exit code of `run_node`.
-
-    Args:
-        name: Name of the executable and of the node.
-        summary: One line for the help.
-        load: Imports and returns the node's class, which may take seconds. A ValueError of its
-            constructor is a usage error.
-        args: Command line; None means `sys.argv`.
-        shared_memory: As in `run_node`.
-        second_signal_ends: As `StopSignals.second_ends`.
-    """
+    """Run a node of `NODES` as a process, or print its help; return the exit code of `run_node`."""
     given = sys.argv[1:] if args is None else args
     if '-h' in given or '--help' in given:
         return run_command(name, lambda: _print_usage(name, summary))
@@ -149,12 +139,7 @@ def _run(load: Callable[[], Callable[[], RunnableNode]], stop: StopSignals) -> N
 
 
 def destroy(node: RunnableNode | Node, exit_code: int | None = None) -> None:
-    """Destroy a node whose work is done; end the process if that takes longer than 10 s.
-
-    Args:
-        node: Node of a process that has no other work left.
-        exit_code: Code of the process in that case; None means that of the current exception, or 0.
-    """
+    """Destroy a node whose work is done; end the process if that takes longer than 10 s."""
     error = sys.exception()
     if exit_code is None:
         exit_code = EXIT_SUCCESS if error is None else getattr(error, 'exit_code', EXIT_FAILURE)

@@ -19,9 +19,6 @@ def declare_parameters(node: Node, specs: Sequence[ParameterSpec]) -> dict[str, 
 
     Also offers the parameter services, so create the node with `start_parameter_services=False`.
     Logs a warning for unknown parameters and for those under a former name.
-
-    Raises:
-        ValueError: If a given value is not allowed.
     """
     _serve_parameter_requests(node)
     # rclpy has no public access to given values before their declaration.

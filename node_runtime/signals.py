@@ -82,9 +82,6 @@ def on_stop_signals(
         stop: Called with the signal number and the frame.
         raises_again: Whether a second SIGINT raises KeyboardInterrupt instead of ending the
             process, for programs of users such as notebooks.
-
-    Yields:
-        A list that collects the numbers of the received signals.
     """
     received: list[int] = []
 
@@ -146,9 +143,6 @@ def end_with_parent(parent: int) -> None:
     """Make Linux send SIGTERM to this process when its parent ends.
 
     For processes outside of their parent's group, which Ctrl-C does not reach.
-
-    Args:
-        parent: Process id of the parent.
     """
     if sys.platform != 'linux':
         return

@@ -7,7 +7,6 @@ dataset could not be written; 2: bad usage.
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -82,7 +81,7 @@ def _run(options: argparse.Namespace) -> int:
     by_task: dict[str, list[EpisodeArrays]] = {}
     filtered = 0
     try:
-        paths = _each_once(expand_episodes(options.path))
+        paths = expand_episodes(options.path)
         with progress('episodes', len(paths)) as advance:
             for path in paths:
                 try:
@@ -104,16 +103,6 @@ def _run(options: argparse.Namespace) -> int:
     return EXIT_FAILURE if skipped else EXIT_SUCCESS
 
 
-def _each_once(paths: Sequence[Path]) -> list[Path]:
-    """Return the paths without links to earlier ones."""
-    first: dict[str, Path] = {}
-    for path in paths:
-        known = first.setdefault(os.path.realpath(path), path)
-        if known is not path:
-            complain(_NAME, f'{path} is {known}, which is exported once')
-    return list(first.values())
-
-
 def _why_none(path: Path, filtered: int) -> str:
     if filtered:
         return f'the filters reject all {filtered} episodes in {path}'
@@ -128,11 +117,7 @@ def _counted(episodes: Sequence[EpisodeArrays]) -> str:
 
 
 def _add(path: Path, by_task: dict[str, list[EpisodeArrays]], options: argparse.Namespace) -> bool:
-    """Read an episode into `by_task` if it passes the filters; return whether it does.
-
-    Raises:
-        EpisodeReadError: If it cannot be read, or a dataset of this kind cannot contain it.
-    """
+    """Read an episode into `by_task` if it passes the filters; EpisodeReadError if unreadable."""
     # Reading a summary is much faster than reading all messages.
     summary = read_summary(path)
     if not is_wanted(options, summary.metadata.get('task'), summary):

@@ -82,11 +82,7 @@ def is_wanted(options: argparse.Namespace, task: str | None, episode: HasOutcome
 
 
 def read_summaries(directory: Path) -> tuple[list[EpisodeSummary], list[EpisodeReadError]]:
-    """Read all episodes of a folder; return the errors of the unreadable ones.
-
-    Raises:
-        EpisodeReadError: If the folder cannot be read.
-    """
+    """Read all episodes of a folder; return the errors of the unreadable ones."""
     episodes, errors = [], []
     for path in find_episodes(directory):
         try:

@@ -30,11 +30,7 @@ class UnknownExecutableError(UsageError):
 
 
 def find_executable(name: str) -> EntryPoint:
-    """Return the entry point of an executable such as `sim_node`.
-
-    Raises:
-        UnknownExecutableError: If the package is not installed or has no such executable.
-    """
+    """Return the entry point of an executable such as `sim_node`; UnknownExecutableError."""
     try:
         points = distribution(_DISTRIBUTION).entry_points.select(group='console_scripts')
     except PackageNotFoundError:
@@ -46,15 +42,7 @@ def find_executable(name: str) -> EntryPoint:
 
 
 def executable(name: str, parent: int | None = None) -> list[str]:
-    """Return the command that runs an executable with this interpreter.
-
-    Args:
-        name: The executable.
-        parent: Process id; the executable terminates when this process does.
-
-    Raises:
-        UnknownExecutableError: If no executable has this name.
-    """
+    """Return the command that runs an executable, which terminates when process `parent` does."""
     point = find_executable(name)
     function = f'__import__({point.module!r}, fromlist=["_"]).{point.attr}'
     # Before slow imports.
@@ -72,11 +60,7 @@ def is_actor_shipped(task: str) -> bool:
 
 
 def open_log(name: str) -> IO[str]:
-    """Open a temporary file for the output of nodes; closing deletes it.
-
-    Raises:
-        CommandError: If the folder for temporary files cannot be written.
-    """
+    """Open a temporary file for the output of nodes, or raise CommandError."""
     try:
         return tempfile.NamedTemporaryFile('w+', prefix=f'{name}_', suffix='.log')
     except OSError as error:
@@ -86,17 +70,7 @@ def open_log(name: str) -> IO[str]:
 def start_node(
     name: str, parameters: Mapping[str, object], output: IO[str], namespace: str = ''
 ) -> subprocess.Popen[str]:
-    """Start a node that terminates with this process and does not receive its Ctrl-C.
-
-    Args:
-        name: The executable.
-        parameters: Text, numbers or truth values by parameter name.
-        output: File for stdout and stderr.
-        namespace: Namespace of the node.
-
-    Raises:
-        UnknownExecutableError: If no executable has this name.
-    """
+    """Start a node that terminates with this process and does not receive its Ctrl-C."""
     words = []
     for parameter, value in parameters.items():
         # ROS reads values as YAML: unquoted text may be a date, a number or a comment.

@@ -16,15 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.datasets.writing import (
-    ByTask,
-    ExportError,
-    alone_in,
-    hidden_folder,
-    move_all,
-    require_module,
-    require_new,
-)
+from fetch_hand_sim.datasets.writing import ByTask, appearing, require_module
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.films.film import write_film
 from fetch_hand_sim.films.recording import Studio, recording_of
@@ -66,18 +58,11 @@ def export_lerobot(
         RuntimeError: If there is no OpenGL to draw with.
     """
     require_module('pyarrow.parquet')
-    targets = {task: directory / task for task in by_task}
-    try:
-        with alone_in(directory):
-            require_new(targets.values())
-            with hidden_folder(directory, 'lerobot') as hidden:
-                for task, episodes in by_task.items():
-                    rate = episodes[0].record.control_hz
-                    _Dataset(hidden / task, episodes[0].spec, rate, camera).write(episodes)
-                move_all({hidden / task: target for task, target in targets.items()})
-    except OSError as error:
-        raise ExportError(f'{directory}: {error.strerror or error}') from error
-    return targets
+    with appearing(directory, by_task) as hidden:
+        for task, episodes in by_task.items():
+            rate = episodes[0].record.control_hz
+            _Dataset(hidden / task, episodes[0].spec, rate, camera).write(episodes)
+    return {task: directory / task for task in by_task}
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,12 +266,7 @@ def _parts(spec: TaskSpec) -> tuple[list[str], list[str]]:
 
 
 def frames(episode: EpisodeArrays, episode_index: int, first_index: int) -> Columns:
-    """Return the columns of the N frames of an episode, one per action.
-
-    Args:
-        episode_index: Number of the episode in the dataset.
-        first_index: Number of frames before it.
-    """
+    """Return the columns of the N frames of an episode, one per action."""
     spec, count = episode.spec, len(episode)
     seen = episode.observations['observation'][:count]
     of_object = np.repeat(
@@ -388,12 +368,6 @@ def write_episodes(
 
     Returns:
         How often each level of each channel was drawn, (3, 256) for each episode.
-
-    Raises:
-        ValueError: If the model has no such camera, an episode cannot be read, or ffmpeg is
-            missing.
-        RuntimeError: If OpenGL is missing.
-        OSError: If the film cannot be written.
     """
     studio = Studio(camera.width, camera.height, camera.name)
     histograms = [np.zeros((3, _LEVELS), dtype=np.int64) for _ in episodes]

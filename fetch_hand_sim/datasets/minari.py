@@ -9,7 +9,7 @@ import copy
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from fetch_hand_sim.datasets.writing import (
-    ByTask,
-    ExportError,
-    alone_in,
-    hidden_folder,
-    move_all,
-    require_module,
-    require_new,
-)
+from fetch_hand_sim.datasets.writing import ByTask, ExportError, appearing, require_module
 from fetch_hand_sim.episode_log import EpisodeArrays
 from fetch_hand_sim.gym_envs.registration import environment_id, register_environments
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
@@ -41,11 +33,7 @@ _MINARI_PATH, _NAMESPACE = 'MINARI_DATASETS_PATH', 'namespace_metadata.json'
 
 
 def dataset_name(text: str) -> str:
-    """Return the name of a dataset; without a version it gets `-v0`.
-
-    Raises:
-        UsageError: If it is not allowed.
-    """
+    """Return the name of a dataset, `-v0` added without a version, or raise UsageError."""
     *folders, _ = text.split('/')
     # A folder with a version is a dataset, and Minari finds no dataset within it.
     if not _DATASET_NAME.fullmatch(text) or any(map(_VERSION.search, folders)):
@@ -79,17 +67,15 @@ def export_minari(by_task: ByTask, directory: Path, name: str) -> dict[str, str]
             raise ExportError(f'Minari takes no dataset of a task that is called {task!r}')
     minari, collector = require_module('minari'), require_module('minari.data_collector')
     ids = {task: f'{task}/{versioned}' for task in by_task}
+    count = sum(map(len, by_task.values()))
     try:
-        with alone_in(directory):
-            require_new(directory / dataset_id for dataset_id in ids.values())
-            count = sum(map(len, by_task.values()))
-            with _appearing(directory, list(ids.values())), progress('written', count) as advance:
-                for task, episodes in by_task.items():
-                    buffers = _buffers(collector, episodes, advance)
-                    _create_dataset(minari, ids[task], episodes, buffers)
+        with _minari_folder(directory, ids.values()), progress('written', count) as advance:
+            for task, episodes in by_task.items():
+                buffers = _buffers(collector, episodes, advance)
+                _create_dataset(minari, ids[task], episodes, buffers)
     except ImportError as error:
         raise ExportError(f"{error}; install with pip install 'fetch_hand_sim[data]'") from error
-    except (OSError, ValueError, AssertionError) as error:
+    except (ValueError, AssertionError) as error:
         raise ExportError(f'{directory}: {one_line(error, longest=1000)}') from error
     return ids
 
@@ -152,11 +138,11 @@ def _unmeasured() -> Iterator[None]:
 
 
 @contextmanager
-def _appearing(directory: Path, dataset_ids: Sequence[str]) -> Iterator[None]:
+def _minari_folder(directory: Path, dataset_ids: Iterable[str]) -> Iterator[None]:
     """Let Minari write into a hidden folder; whole datasets move to their place at the end."""
     # Minari joins a relative path to itself.
     directory, before = directory.resolve(), os.environ.get(_MINARI_PATH)
-    with hidden_folder(directory, 'minari') as hidden:
+    with appearing(directory, dataset_ids) as hidden:
         os.environ[_MINARI_PATH] = str(hidden)
         try:
             with warnings.catch_warnings():
@@ -173,7 +159,6 @@ def _appearing(directory: Path, dataset_ids: Sequence[str]) -> Iterator[None]:
             target.parent.mkdir(parents=True, exist_ok=True)
             if not target.exists():
                 source.replace(target)
-        move_all({hidden / each: directory / each for each in dataset_ids})
 
 
 def _environment(episode: EpisodeArrays) -> Any:

@@ -6,21 +6,15 @@ Needs the extra `[data]`. Values are those of `load_episodes`, float64, unchange
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fetch_hand_sim.datasets.writing import (
-    ByTask,
-    ExportError,
-    alone_in,
-    move_all,
-    require_module,
-    require_new,
-)
+from fetch_hand_sim.datasets.writing import ByTask, appearing, require_module
 from fetch_hand_sim.episode_log import EpisodeArrays
 from msgs_spec.text import printable
 
@@ -35,9 +29,6 @@ def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
     `action`, `command`, `reward`, `terminated`, `truncated`, `next_success`, all null in the last
     row. `<task>_episodes.parquet` has a row per episode with its metadata and result.
 
-    Args:
-        by_task: Episodes, at least one of each task.
-
     Returns:
         The two files of each task.
 
@@ -45,20 +36,13 @@ def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
         ExportError: If pyarrow is missing, or a file exists or cannot be written; none is created.
     """
     pyarrow, parquet = require_module('pyarrow'), require_module('pyarrow.parquet')
-    paths = {
-        task: [directory / f'{task}.parquet', directory / f'{task}_episodes.parquet']
-        for task in by_task
-    }
-    try:
-        with alone_in(directory):
-            require_new(path for pair in paths.values() for path in pair)
-            tables: dict[Path, Any] = {}
-            for task, episodes in by_task.items():
-                tables |= zip(paths[task], _tables(pyarrow, episodes), strict=True)
-            _write_tables(parquet, tables)
-    except OSError as error:
-        raise ExportError(f'{directory}: {error.strerror or error}') from error
-    return paths
+    names = {task: (f'{task}.parquet', f'{task}_episodes.parquet') for task in by_task}
+    with appearing(directory, chain(*names.values())) as hidden:
+        for task, episodes in by_task.items():
+            for name, table in zip(names[task], _tables(pyarrow, episodes), strict=True):
+                with (hidden / name).open('wb') as stream:
+                    parquet.write_table(table, stream, compression='zstd')
+    return {task: [directory / name for name in pair] for task, pair in names.items()}
 
 
 def _tables(pyarrow: Any, episodes: Sequence[EpisodeArrays]) -> tuple[Any, Any]:
@@ -66,19 +50,6 @@ def _tables(pyarrow: Any, episodes: Sequence[EpisodeArrays]) -> tuple[Any, Any]:
     steps = [_step_table(pyarrow, index, episode) for index, episode in enumerate(episodes)]
     rows = [_episode_row(index, episode) for index, episode in enumerate(episodes)]
     return pyarrow.concat_tables(steps), pyarrow.Table.from_pylist(rows)
-
-
-def _write_tables(parquet: Any, tables: Mapping[Path, Any]) -> None:
-    """Write all tables under hidden names, then rename them, so a full disk leaves none."""
-    hidden = {path: path.with_name(f'.{path.name}.partial') for path in tables}
-    try:
-        for path, table in tables.items():
-            with hidden[path].open('wb') as stream:
-                parquet.write_table(table, stream, compression='zstd')
-        move_all({hidden[path]: path for path in tables})
-    finally:
-        for partial in hidden.values():
-            partial.unlink(missing_ok=True)
 
 
 def _step_table(pyarrow: Any, index: int, episode: EpisodeArrays) -> Any:

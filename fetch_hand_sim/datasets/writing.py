@@ -1,14 +1,12 @@
-"""Shared by all exports: exclusive access to a folder, and no overwriting."""
+"""Shared by all exports: whole datasets appear at once, and nothing is overwritten."""
 
 from __future__ import annotations
 
-import fcntl
 import importlib
-import os
-import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from fetch_hand_sim.episode_log import EpisodeArrays
@@ -40,11 +38,7 @@ def why_apart(episode: EpisodeArrays, first: EpisodeArrays) -> str:
 
 
 def require_module(module: str) -> Any:
-    """Import a module of the extra `[data]`.
-
-    Raises:
-        ExportError: If it is missing.
-    """
+    """Import a module of the extra `[data]`, or raise ExportError."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -55,57 +49,28 @@ def require_module(module: str) -> Any:
 
 
 @contextmanager
-def alone_in(directory: Path) -> Iterator[None]:
-    """Make a folder and lock it against other exports until the end of the block."""
-    directory.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        # Some file systems lack locks.
-        with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
+def appearing(directory: Path, names: Iterable[str]) -> Iterator[Path]:
+    """Yield a hidden folder; its entries `names` move to `directory` at the end of the block.
 
-
-@contextmanager
-def hidden_folder(directory: Path, name: str) -> Iterator[Path]:
-    """Make a hidden folder in a locked one, and remove it at the end of the block.
-
-    The hidden folder of a killed export is removed first.
+    Raises:
+        ExportError: If one exists in `directory`, or the disk fails; nothing is written then.
     """
-    hidden = directory / f'.{name}.partial'
-    shutil.rmtree(hidden, ignore_errors=True)
-    hidden.mkdir()
+    targets = {name: directory / name for name in names}
     try:
-        yield hidden
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
+        directory.mkdir(parents=True, exist_ok=True)
+        _require_new(targets.values())
+        with TemporaryDirectory(prefix='.partial.', dir=directory) as hidden:
+            yield Path(hidden)
+            # Another export may have written them meanwhile.
+            _require_new(targets.values())
+            for name, target in targets.items():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                (Path(hidden) / name).rename(target)
+    except OSError as error:
+        raise ExportError(f'{directory}: {error.strerror or error}') from error
 
 
-def require_new(paths: Iterable[Path]) -> None:
-    """Raise `ExportError` if a path exists."""
+def _require_new(paths: Iterable[Path]) -> None:
     for path in paths:
         if path.exists():
             raise ExportError(f'{path} exists; nothing is overwritten')
-
-
-def move_all(targets: Mapping[Path, Path]) -> None:
-    """Rename files or folders, all of them or none.
-
-    Args:
-        targets: New path by present path, on the same disk.
-
-    Raises:
-        OSError: If one cannot be moved.
-    """
-    moved: list[Path] = []
-    try:
-        for source, target in targets.items():
-            source.rename(target)
-            moved.append(source)
-    except BaseException:
-        for source in moved:
-            with suppress(OSError):
-                targets[source].rename(source)
-        raise

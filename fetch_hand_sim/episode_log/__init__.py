@@ -1,7 +1,7 @@
 """Episodes as MCAP files: one rosbag2 bag per episode, complete or marked as interrupted."""
 
 from fetch_hand_sim.episode_log.arrays import EpisodeArrays, load_episodes
-from fetch_hand_sim.episode_log.bag import Attachment, LogSettings
+from fetch_hand_sim.episode_log.bag import Attachment
 from fetch_hand_sim.episode_log.files import (
     EpisodeExistsError,
     EpisodeInUseError,
@@ -34,7 +34,6 @@ __all__ = [
     'EpisodeSummary',
     'EpisodeWriter',
     'Leftover',
-    'LogSettings',
     'episode_metadata',
     'episode_name',
     'expand_episodes',

@@ -10,14 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO
 
 import yaml
 from mcap.writer import CompressionType, IndexType, Writer
 
 from fetch_hand_sim.episode_log.records import (
     MAX_ATTACHMENTS,
-    MAX_CHUNK_BYTES,
     MAX_CHUNKS,
     MAX_MAP_ENTRIES,
     MAX_MESSAGES,
@@ -31,12 +30,8 @@ from msgs_spec.topics import QosSpec, TopicSpec
 # Names of the metadata records; of the two `rosbag2` ones readers take the last.
 EPISODE, EPISODE_RESULT, ROSBAG2 = 'episode', 'episode_result', 'rosbag2'
 
-Compression = Literal['none', 'lz4', 'zstd']
-_COMPRESSIONS = {
-    'none': CompressionType.NONE,
-    'lz4': CompressionType.LZ4,
-    'zstd': CompressionType.ZSTD,
-}
+# Bytes of messages per chunk; small chunks keep the longest write short.
+CHUNK_BYTES, COMPRESSION = 128 * 1024, CompressionType.LZ4
 _ALL_BUT_ATTACHMENTS = IndexType.ALL & ~IndexType.ATTACHMENT
 # Bytes in a chunk beside the data of a message, and at most for the first message of a topic.
 _MESSAGE_BYTES = 1 + 8 + 2 + 4 + 8 + 8
@@ -56,38 +51,6 @@ class Attachment:
     name: str
     media_type: str
     data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class LogSettings:
-    """How episodes are written.
-
-    Attributes:
-        chunk_size: Bytes of messages per chunk, less than half of what readers accept; small chunks
-            keep the longest write short.
-        compression: Compression of the chunks.
-        flush_period_ns: Simulated time after which messages are handed to the operating system, ns.
-            The next tick does that, so a killed process loses up to a tick more: less than a
-            quarter of a second at 12.5 Hz.
-        minimum_free_bytes: No episode is begun with less free space on the disk.
-    """
-
-    chunk_size: int = 128 * 1024
-    compression: Compression = 'lz4'
-    flush_period_ns: int = 150_000_000
-    minimum_free_bytes: int = 64 * 1024 * 1024
-
-    def __post_init__(self) -> None:
-        if self.compression not in _COMPRESSIONS:
-            allowed = ', '.join(_COMPRESSIONS)
-            raise ValueError(f'unknown compression {self.compression!r}; allowed: {allowed}')
-        if not 1 <= self.chunk_size <= MAX_CHUNK_BYTES // 2:
-            raise ValueError(f'chunk_size {self.chunk_size}; allowed: 1 ... {MAX_CHUNK_BYTES // 2}')
-        if self.flush_period_ns < 1 or self.minimum_free_bytes < 0:
-            raise ValueError(
-                f'flush_period_ns {self.flush_period_ns} must be positive, minimum_free_bytes '
-                f'{self.minimum_free_bytes} not negative'
-            )
 
 
 @cache
@@ -143,10 +106,6 @@ class BagFile:
     `OSError`s of the stream are passed on and end the file. The records that identify the episode
     are written at once, so that a cut-off file contains them.
 
-    Args:
-        file_name: Name of the file in its bag directory.
-        metadata: Contents of the record `episode`.
-
     Attributes:
         has_unflushed: Whether there are messages that the operating system does not have yet.
         message_count: Number of messages so far.
@@ -156,7 +115,6 @@ class BagFile:
         self,
         stream: BinaryIO,
         file_name: str,
-        settings: LogSettings,
         metadata: dict[str, str],
         attachments: Sequence[Attachment],
     ) -> None:
@@ -165,11 +123,10 @@ class BagFile:
         self._stream = stream
         self._file_name = file_name
         self._metadata = metadata
-        self._chunk_size = settings.chunk_size
         self._writer = Writer(
             stream,
-            chunk_size=settings.chunk_size,
-            compression=_COMPRESSIONS[settings.compression],
+            chunk_size=CHUNK_BYTES,
+            compression=COMPRESSION,
             # Validators reject an empty index of attachments.
             index_types=IndexType.ALL if attachments else _ALL_BUT_ATTACHMENTS,
             enable_data_crcs=True,
@@ -195,11 +152,6 @@ class BagFile:
         """Append a message; the first message of a topic also creates its channel.
 
         Sequence numbers count the messages of a topic from 0, so a gap is visible.
-
-        Args:
-            name: Resolved name of the topic.
-            data: CDR bytes.
-            log_time_ns: Later than that of the message before.
 
         Raises:
             ValueError: If the time does not grow, the topic had another type before, or readers
@@ -269,7 +221,7 @@ class BagFile:
     def _count_bytes(self, size: int) -> None:
         self._bytes += size
         self._chunk_bytes += size
-        if self._chunk_bytes > self._chunk_size:
+        if self._chunk_bytes > CHUNK_BYTES:
             self._end_chunk()
 
     def _end_chunk(self) -> None:

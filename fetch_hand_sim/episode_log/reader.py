@@ -291,12 +291,7 @@ class TickMessage:
 
 @dataclass(frozen=True, slots=True)
 class LoggedTick:
-    """The messages from one stamp to the next, in order.
-
-    Attributes:
-        published: Messages that the robot published.
-        received: Messages that the robot received after them.
-    """
+    """The messages from one stamp to the next, in order."""
 
     stamp_ns: int
     published: list[TickMessage] = field(default_factory=list)

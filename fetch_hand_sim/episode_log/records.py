@@ -279,11 +279,7 @@ class Contents:
             self._take_attachment(data[start:end], position, end - position)
 
     def define(self, opcode: int, content: bytes, offset: int = 0) -> None:
-        """Take a schema or channel, which may be a repetition.
-
-        Args:
-            offset: Bytes from the start of its chunk.
-        """
+        """Take a schema or channel, which may be a repetition."""
         id = int.from_bytes(content[:2], 'little')
         known = self._definitions.get((opcode, id))
         if known == content:

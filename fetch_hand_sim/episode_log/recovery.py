@@ -26,7 +26,6 @@ from fetch_hand_sim.episode_log.bag import (
     EPISODE_RESULT,
     Attachment,
     BagFile,
-    LogSettings,
     checked_strings,
 )
 from fetch_hand_sim.episode_log.files import EpisodeInUseError, EpisodeLogError
@@ -143,9 +142,6 @@ def recover_episode(leftover: Path | str) -> Path | None:
 
     An episode without messages is moved to `.<name>.aside`. It is removed if its file is empty, or
     has only a few bytes beyond a good header.
-
-    Args:
-        leftover: Hidden directory of the episode, see `find_leftovers`.
 
     Raises:
         EpisodeInUseError: If another process writes, recovers or has recovered it.
@@ -334,7 +330,7 @@ def _write(
     }
     result = records.get(EPISODE_RESULT) if remains.is_whole else None
     attachments = [Attachment(a.name, a.media_type, a.data) for a in contents.attachments]
-    bag = BagFile(stream, file.name, LogSettings(), metadata, attachments)
+    bag = BagFile(stream, file.name, metadata, attachments)
     received = ReceivedAllowance()
     values: dict[str, list[bytes]] = {name: [] for name in _COUNTED}
     for id, _, log_time, _, data in messages.rows():

@@ -19,7 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from fetch_hand_sim.episode_log import files
-from fetch_hand_sim.episode_log.bag import Attachment, BagFile, LogSettings, checked_strings
+from fetch_hand_sim.episode_log.bag import Attachment, BagFile, checked_strings
 from fetch_hand_sim.episode_log.files import EpisodeExistsError, EpisodeLogError
 from fetch_hand_sim.episode_log.records import (
     MAX_ATTACHMENT_BYTES,
@@ -36,6 +36,11 @@ _TOO_LONG = (
     f'the episode is too long for a file of {MAX_MESSAGES} messages and '
     f'{MAX_UNPACKED_BYTES // 2**20} MiB of them'
 )
+# Simulated time after which messages are handed to the operating system. The next tick does that,
+# so a killed process loses up to a tick more: less than a quarter of a second at 12.5 Hz.
+FLUSH_PERIOD_NS = 150_000_000
+# No episode is begun with less free space on the disk.
+MINIMUM_FREE_BYTES = 64 * 2**20
 _NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed(?P<seed>\d+)(\.active|\.aside)?')
 
 
@@ -47,11 +52,7 @@ def log_time(stamp_ns: int, rank: int) -> int:
 
 
 class ReceivedAllowance:
-    """Decides which received messages of an episode are logged, and counts the others.
-
-    Attributes:
-        omitted: Number of messages that are not logged, by topic.
-    """
+    """Decides which received messages of an episode are logged, and counts the others."""
 
     def __init__(self) -> None:
         self.omitted: Counter[str] = Counter()
@@ -94,12 +95,6 @@ class EpisodeWriter:
     Files stay within the limits of readers. Received messages have an allowance; the record
     `episode_result` counts the messages beyond it.
 
-    Args:
-        directory: Directory of episodes; created if missing.
-        name: Name of the episode, see `episode_name`.
-        metadata: See `episode_metadata`; `episode_id`, the name, is added.
-        namespace: ROS namespace of relative topic names.
-
     Raises:
         EpisodeExistsError: If the name is taken; episodes are never overwritten.
         EpisodeLogError: If the disk is too full or the file cannot be written; then no file is left
@@ -113,14 +108,12 @@ class EpisodeWriter:
         name: str,
         metadata: Mapping[str, str],
         attachments: Sequence[Attachment] = (),
-        settings: LogSettings | None = None,
         namespace: str = '/',
     ) -> None:
         metadata = {'episode_id': name, **checked_strings(metadata)}
         attached = sum(len(each.data) for each in attachments)
         if attached > MAX_ATTACHMENT_BYTES:
             raise ValueError(f'{attached} bytes attached; allowed: {MAX_ATTACHMENT_BYTES}')
-        self._settings = settings or LogSettings()
         self._namespace = namespace.rstrip('/') + '/'
         directory = Path(directory)
         self._final = directory / name
@@ -132,7 +125,7 @@ class EpisodeWriter:
         self._completed: Path | None = None
         try:
             directory.mkdir(parents=True, exist_ok=True)
-            files.require_free_space(directory, self._settings.minimum_free_bytes)
+            files.require_free_space(directory, MINIMUM_FREE_BYTES)
             self._stream = files.claim(directory, name)
         except OSError as error:
             raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
@@ -140,7 +133,7 @@ class EpisodeWriter:
         self._is_open = True
         try:
             file_name = Path(self._stream.name).name
-            self._bag = BagFile(self._stream, file_name, self._settings, metadata, attachments)
+            self._bag = BagFile(self._stream, file_name, metadata, attachments)
         except (OSError, ValueError) as error:
             self.discard()
             if isinstance(error, ValueError):
@@ -286,7 +279,7 @@ class EpisodeWriter:
     def _is_flush_due(self, log_time_ns: int) -> bool:
         if self._flushed_ns is None:
             self._flushed_ns = log_time_ns
-        return log_time_ns - self._flushed_ns >= self._settings.flush_period_ns
+        return log_time_ns - self._flushed_ns >= FLUSH_PERIOD_NS
 
     def _fail(self, error: OSError) -> EpisodeLogError:
         self._description = None
@@ -337,11 +330,8 @@ class EpisodeDirectory:
     it, the others take the next number.
     """
 
-    def __init__(
-        self, path: Path | str, settings: LogSettings | None = None, namespace: str = '/'
-    ) -> None:
+    def __init__(self, path: Path | str, namespace: str = '/') -> None:
         self.path = Path(path)
-        self._settings = settings
         self._namespace = namespace
         self._next: dict[str, int] = {}
 
@@ -357,9 +347,7 @@ class EpisodeDirectory:
         while True:
             name = episode_name(task, index, seed)
             try:
-                writer = EpisodeWriter(
-                    self.path, name, metadata, attachments, self._settings, self._namespace
-                )
+                writer = EpisodeWriter(self.path, name, metadata, attachments, self._namespace)
             except EpisodeExistsError:
                 index += 1
             else:

@@ -48,12 +48,8 @@ class _Robot:
 class EpisodeGenerator:
     """Runs a policy in all robots of a simulation and logs every episode.
 
-    Args:
-        simulation: The robots.
-        directory: Where episodes are collected.
-        act: Returns actions (N, action size) in [-1, 1] for the observations of all robots.
-        context: Metadata and attachments.
-        on_start: Called with the seeds (N,) of the episodes that all robots begin.
+    `act` returns actions (N, action size) in [-1, 1]. `on_start` receives the seeds (N,) of the
+    episodes that begin.
     """
 
     def __init__(

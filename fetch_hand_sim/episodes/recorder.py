@@ -64,15 +64,8 @@ DIVERGED = 'diverged'
 class RecordingContext:
     """Makes metadata and attachments for the episodes of one simulation.
 
-    Args:
-        simulation: The simulation whose episodes are logged.
-        with_compiled_model: Whether to store the compiled model with its meshes, 3 MB per episode;
-            its MJCF text is always stored.
-        perturb_limit: Largest force of a push, N.
-
-    Attributes:
-        attachments: The model, stored with every episode.
-        checkpoint_sha256: Fingerprint of the actor that commands the robot, if known.
+    Every episode contains the MJCF text; `with_compiled_model` adds the compiled model, 3 MB. The
+    largest force of a push, `perturb_limit`, is in N.
     """
 
     def __init__(
@@ -115,14 +108,7 @@ class RecordingContext:
 
 @dataclass(frozen=True, slots=True)
 class LoggedEpisode:
-    """A completed file.
-
-    Attributes:
-        status: Status of the last tick.
-        path: The bag directory.
-        is_complete: Whether the episode ran to its end.
-        late_commands: See `Tick`.
-    """
+    """A completed file."""
 
     status: EpisodeStatus
     path: Path
@@ -142,10 +128,6 @@ class EpisodeRecorder:
         on_error: Called once, with one line, when the disk fails, by any thread.
         on_logged: Called for every completed file, by a thread of its own.
         on_slow: Called with one line, now and then, when the robot has to wait for the disk.
-
-    Attributes:
-        has_failed: Whether the disk failed, so that logging has stopped.
-        waited_s: Seconds that the robot has waited for the disk.
     """
 
     def __init__(

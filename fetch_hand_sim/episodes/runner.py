@@ -61,31 +61,12 @@ def sense(simulation: Simulation) -> Sensed:
 
 
 def has_ended(ticks: Any, episode_ticks: int, has_diverged: Any) -> Any:
-    """Return whether episodes are over: time is up or the simulation diverged.
-
-    Args:
-        ticks: Steps so far, a number or an array.
-        episode_ticks: Steps after which time is up.
-        has_diverged: Whether the simulation diverged in this step, likewise.
-    """
+    """Return whether episodes are over: time is up or the simulation diverged."""
     return has_diverged | (ticks >= episode_ticks)
 
 
 class RobotEpisode:
-    """One episode of one robot among N, from its reset until time is up or it diverges.
-
-    Args:
-        simulation: The robots.
-        episode: Number of the episode in its series.
-        seed: Seed of its reset.
-        first_stamp_ns: Simulated time of its reset.
-        joint_prefix: Beginning of the names of joints in messages.
-
-    Attributes:
-        tick: Steps so far.
-        has_diverged: Whether the simulation diverged, which ends the episode.
-        status: The last status; `waiting` before the reset.
-    """
+    """One episode of one robot among N, from its reset until time is up or it diverges."""
 
     def __init__(
         self,
@@ -121,12 +102,7 @@ class RobotEpisode:
         return self._make_tick('reset', sensed, index, None)
 
     def step(self, sensed: Sensed, index: int, command: Array, has_diverged: bool) -> Tick:
-        """Return the tick of robot `index` after a step.
-
-        Args:
-            command: (action size,), the applied command.
-            has_diverged: Whether the simulation diverged in this step.
-        """
+        """Return the tick of robot `index` after a step with the applied command (action size,)."""
         self.tick += 1
         self._return += float(sensed.reward[index])
         self.has_diverged = has_diverged
@@ -189,9 +165,6 @@ class EpisodeRunner:
         stamp_ns: Simulated time of the last tick; before the first tick one period less than its
             time.
         is_between_episodes: Whether the next tick is a reset.
-
-    Raises:
-        ValueError: If the simulation holds more than one robot.
     """
 
     def __init__(
@@ -275,8 +248,7 @@ class EpisodeRunner:
     def advance(self, command: Array) -> Tick:
         """Advance by one tick: the reset of the next episode, or one step of the running one.
 
-        Args:
-            command: (action size,) in command units and within limits; a reset ignores it.
+        `command` (action size,) is in command units and within limits; a reset ignores it.
         """
         tick = self._reset() if self.is_between_episodes else self._step(command)
         self.stamp_ns = tick.stamp_ns
@@ -355,11 +327,9 @@ def _check_stamp(runner: EpisodeRunner, stamp_ns: int) -> None:
 
 
 def bounded_wrench(wrench: Array, limit: float) -> Array:
-    """Return a wrench (6,) that is accepted: the same, or a weaker one along the same line.
+    """Return a wrench (6,), N and N m, that is accepted: the same, or a weaker one on its line.
 
-    Args:
-        wrench: N and N m.
-        limit: Largest force, N.
+    `limit` is the largest force, N.
     """
     force, torque = _sizes(wrench)
     share = max(force / limit, torque / (_LEVER * limit))

@@ -83,11 +83,7 @@ def check_kind(path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Check that the format can store pictures of a size, before they are drawn.
-
-    Raises:
-        ValueError: If the size exceeds the limit of the format.
-    """
+    """Raise ValueError unless the format can store pictures of a size."""
     kind = path.suffix.lower()
     largest = _LARGEST_SIDE.get(kind)
     if largest is not None and max(width, height) > largest:
@@ -121,11 +117,7 @@ def write_film(
 
 
 def write_picture(path: Path, picture: Picture) -> None:
-    """Write one picture (height, width, 3) as .png or .jpg; the file appears when it is complete.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Write one picture (height, width, 3) as .png or .jpg, which appears when it is complete."""
     with _appearing(path) as hidden:
         Image.fromarray(picture).save(hidden, quality=85, optimize=True)
 

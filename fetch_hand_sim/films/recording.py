@@ -24,14 +24,7 @@ from msgs_spec.topics import topic
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One episode of N steps, ready to be drawn.
-
-    Attributes:
-        arrays: The episode as arrays.
-        frames: N + 1 frames.
-        times: (N + 1,) seconds since the first frame.
-        title: Name of the file.
-    """
+    """One episode of N steps: N + 1 frames and their times (N + 1,), s since the first frame."""
 
     arrays: EpisodeArrays
     frames: list[Frame]
@@ -50,20 +43,12 @@ class Recording:
 
 
 def load_recording(path: Path) -> Recording:
-    """Read an episode.
-
-    Raises:
-        EpisodeReadError: If the episode cannot be read; the message is one line.
-    """
+    """Read an episode."""
     return recording_of(load_episode(path))
 
 
 def recording_of(arrays: EpisodeArrays) -> Recording:
-    """Add the joint positions and object poses of the file to an episode.
-
-    Raises:
-        EpisodeReadError: If a topic cannot be read; the message is one line.
-    """
+    """Add the joint positions and object poses of the file to an episode."""
     ticks = len(arrays) + 1
     task = arrays.record.task
     messages = read_episode(arrays.path)
@@ -164,11 +149,6 @@ class Studio:
 
     The methods that draw raise ValueError if the frame or the camera does not exist, and
     RuntimeError without OpenGL.
-
-    Args:
-        width: Pixels.
-        height: Pixels.
-        camera: Name of a camera of the model; None for the usual view.
     """
 
     def __init__(self, width: int, height: int, camera: str | None = None) -> None:
@@ -238,14 +218,7 @@ def tile(pictures: Sequence[Picture], columns: int) -> Picture:
 def grid(
     studio: Studio, recordings: Sequence[Recording], columns: int, hz: float
 ) -> Iterator[Picture]:
-    """Yield sheets of all recordings at the same time; finished episodes show their last frame.
-
-    Args:
-        studio: Draws the tiles.
-        recordings: Of any rates.
-        columns: Tiles in a row.
-        hz: Sheets per simulated second.
-    """
+    """Yield sheets of all recordings at the same time; finished episodes show their last frame."""
     shown = [-1] * len(recordings)
     pictures: list[Picture] = [np.zeros(0, np.uint8)] * len(recordings)
     for count in range(sheets(recordings, hz)):

@@ -95,9 +95,6 @@ class RobotEnv(FetchHandEnv, GoalEnv):
             all arrays of facts.
         initial_qvel: Joint velocities likewise.
         fullpath: The MJCF file.
-
-    Raises:
-        TypeError: If a subclass has a hook of the reference that is not called here.
     """
 
     metadata = {'render_modes': RENDER_MODES, 'render_fps': 25}  # noqa: RUF012
@@ -425,11 +422,7 @@ class ManipulateEnv(RobotEnv):
 
 
 def make_env(task: str, **arguments: Any) -> RobotEnv:
-    """Makes the environment of a task as the reference has it.
-
-    Raises:
-        ValueError: If the task is unknown or an argument is not allowed.
-    """
+    """Makes the environment of a task as the reference has it."""
     spec = task_spec(task)
     if task in FETCH_CONFIGS:
         return FetchEnv(task, **arguments)
@@ -480,22 +473,7 @@ def task_with_goals(task: str, position: str | None, rotation: str | None) -> st
 
 
 class GymnasiumRoboticsVectorEnv(FetchHandVectorEnv):
-    """N copies of a reference's task, as a `SyncVectorEnv` of single ones shows them.
-
-    Args:
-        task: The task.
-        num_envs: Number of copies N.
-        target_position: As `ManipulateEnv` has it.
-        target_rotation: As `ManipulateEnv` has it.
-        width: Pixels of a picture.
-        height: Pixels of a picture.
-        default_camera_config: Attributes of `mujoco.MjvCamera` that differ from the reference's.
-        **arguments: As `FetchHandVectorEnv` has them.
-
-    Raises:
-        ValueError: If an argument is not allowed.
-        TypeError: If the task has no such argument.
-    """
+    """N copies of a reference's task, as a `SyncVectorEnv` of single ones shows them."""
 
     def __init__(
         self,

@@ -38,12 +38,6 @@ def render_fps(control_hz: float) -> int | float:
 class Pictures:
     """Draws copies of a simulation; opens OpenGL or a window at the first picture.
 
-    Args:
-        simulation: What to draw.
-        width: Pixels.
-        height: Pixels.
-        camera: Attributes of `mujoco.MjvCamera`; None for the task's view.
-
     Raises:
         ValueError: If the size is not allowed, or the camera has no such attribute or value.
     """
@@ -78,10 +72,6 @@ class Pictures:
 
     def render(self, mode: str, index: int = 0) -> Image | None:
         """Draws one copy.
-
-        Args:
-            mode: One of `RENDER_MODES`.
-            index: Which copy.
 
         Returns:
             `rgb_array`: (height, width, 3). `depth_array`: (height, width), metres. `human`: None.
@@ -133,11 +123,7 @@ class Pictures:
 
 
 def _open_window(scene: Scene, width: int, height: int) -> Any:
-    """Opens a window on a scene.
-
-    Raises:
-        RuntimeError: If there is no display.
-    """
+    """Open a window on a scene; raise RuntimeError without a display."""
     try:
         from gymnasium.envs.mujoco.mujoco_rendering import WindowViewer
 
@@ -154,11 +140,7 @@ def _open_window(scene: Scene, width: int, height: int) -> Any:
 
 
 def check_render_mode(mode: str | None, known: Sequence[str] = RENDER_MODES) -> None:
-    """Reject an unknown render mode.
-
-    Raises:
-        ValueError: If the name is unknown.
-    """
+    """Raise ValueError for an unknown render mode."""
     if mode not in (None, *known):
         allowed = ', '.join(('None', *known))
         raise ValueError(f'render_mode {mode!r:.60} is not known; allowed: {allowed}')

@@ -88,15 +88,7 @@ def mujoco_renderer(
     width: int,
     height: int,
 ) -> Any:
-    """Return Gymnasium's `MujocoRenderer`, which also draws without a display.
-
-    Args:
-        model: The model.
-        data: The state to draw, live.
-        camera: Attributes of `mujoco.MjvCamera`.
-        width: Pixels.
-        height: Pixels.
-    """
+    """Return Gymnasium's `MujocoRenderer`, which also draws without a display."""
     from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
     class Renderer(MujocoRenderer):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import (
@@ -72,11 +72,7 @@ def make(name: str | EnvSpec, **arguments: Any) -> gymnasium.Env[Any, Any]:
 
 
 def _id_of(name: str | EnvSpec) -> str | EnvSpec:
-    """The id of a task that is called by its own name; any other id or a spec as it is.
-
-    Raises:
-        gymnasium.error.NameNotFound: If there is no such task or id; the message lists the tasks.
-    """
+    """Return the id of a task given by name, and other ids or specs unchanged; NameNotFound."""
     # A package of another task that imports this one before the tasks are known leaves it out.
     register_environments()
     if not isinstance(name, str) or '/' in name or ':' in name or name in gymnasium.registry:
@@ -183,15 +179,12 @@ def _wrapper_of_batches(wrapper: Any) -> Any:
 
 _REFERENCE_ENV = 'fetch_hand_sim.gym_envs.gymnasium_robotics_env:make_env'
 _REFERENCE_VECTOR_ENV = 'fetch_hand_sim.gym_envs.gymnasium_robotics_env:GymnasiumRoboticsVectorEnv'
-_WITHOUT_TOUCH = 'fetch_hand_sim.gym_envs.registration:refuse_touch_sensors'
-_TOUCH_SENSORS = ('_BooleanTouchSensors', '_ContinuousTouchSensors')
 
 
 def register_gymnasium_robotics(override: bool = False) -> None:
     """Registers the ids of Gymnasium-Robotics 1.4.2: `FetchPush-v4`, `HandReachDense-v3`, ...
 
-    Code written for them then runs on this package, without another change. Ids with touch sensors
-    say in one line that they are not there.
+    Code written for them then runs on this package, without another change.
 
     Args:
         override: Whether ids that Gymnasium-Robotics itself has registered are replaced. It is
@@ -216,11 +209,6 @@ def register_gymnasium_robotics(override: bool = False) -> None:
         gymnasium.registry.pop(name, None)
         both = _REFERENCE_ENV, _REFERENCE_VECTOR_ENV
         _register(name, *both, task=task, reward_type=reward_type)
-    for name, without in _touch_ids(ids).items():
-        if override or name not in gymnasium.registry:
-            gymnasium.registry.pop(name, None)
-            kwargs = {'name': name, 'without': without}
-            gymnasium.register(name, entry_point=_WITHOUT_TOUCH, kwargs=kwargs)
 
 
 def reference_ids() -> dict[str, tuple[str, str]]:
@@ -238,30 +226,6 @@ def reference_ids() -> dict[str, tuple[str, str]]:
             ids[f'{alias}-{version}'] = (task, 'sparse')
             ids[f'{alias}Dense-{version}'] = (task, 'dense')
     return ids
-
-
-def refuse_touch_sensors(name: str, without: str, **arguments: Any) -> NoReturn:
-    """Stands in for the environments with touch sensors.
-
-    Raises:
-        gymnasium.error.Error: Always, naming the environment without them.
-    """
-    raise gymnasium.error.Error(
-        f'{name} has touch sensors, which fetch_hand_sim does not simulate; '
-        f'without them it is {without}'
-    )
-
-
-def _touch_ids(ids: dict[str, tuple[str, str]]) -> dict[str, str]:
-    """For each id with touch sensors the one without; only the HandManipulate tasks have them."""
-    touch = {}
-    for name in ids:
-        if name.startswith('HandManipulate') and 'Full' not in name:
-            for sensors in _TOUCH_SENSORS:
-                task, version = name.split('-')
-                plain = task.removesuffix('Dense')
-                touch[f'{plain}{sensors}{task[len(plain) :]}-{version}'] = name
-    return touch
 
 
 def _is_foreign(name: str) -> bool:

@@ -136,12 +136,7 @@ class FetchHandVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Calls a method of the environments.
-
-        Raises:
-            AttributeError: If the name is unknown.
-            ValueError: If it is for all of them only: `reset`, `step` or `close`.
-        """
+        """Calls a method of the environments."""
         results = self.batch.call(method_name, *method_args, **method_kwargs)
         return [results[i] for i in self._get_indices(indices)]
 

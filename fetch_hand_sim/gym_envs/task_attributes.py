@@ -25,12 +25,7 @@ _LARGEST_THRESHOLD = 1e6
 
 
 class TaskAttributes:
-    """Rewards for any goals, and settings that may be changed between steps.
-
-    Attributes:
-        spec_of_task: The task as data.
-        simulation: The simulation behind it.
-    """
+    """Rewards for any goals, and settings that may be changed between steps."""
 
     spec_of_task: TaskSpec
     simulation: Simulation
@@ -123,11 +118,7 @@ class TaskAttributes:
         self._set_threshold('rotation_threshold', threshold)
 
     def set_thresholds(self, distance: float | None, rotation: float | None) -> None:
-        """Sets those that are not None.
-
-        Raises:
-            ValueError: If one is negative or no number, or the task has no rotations.
-        """
+        """Set the thresholds that are not None, m and rad, or raise ValueError."""
         if distance is not None:
             self.distance_threshold = distance
         if rotation is not None:
@@ -144,11 +135,7 @@ class TaskAttributes:
 
 
 def _check_task(spec: EnvSpec) -> None:
-    """Reject an argument `task` that differs from the task of the id.
-
-    Raises:
-        ValueError: If the argument `task` is not that of the id.
-    """
+    """Raise ValueError if the argument `task` is not the task of the id."""
     registered = gymnasium.registry.get(spec.id)
     task = spec.kwargs.get('task')
     if registered is not None and registered.kwargs.get('task', task) != task:
@@ -158,12 +145,7 @@ def _check_task(spec: EnvSpec) -> None:
 
 
 def check_reset_options(options: Any, allowed: tuple[str, ...]) -> None:
-    """Refuses options of `reset` that are not there, before anything has moved.
-
-    Raises:
-        TypeError: If options is neither a dictionary nor None.
-        ValueError: If an option is not allowed.
-    """
+    """Raise TypeError or ValueError for invalid options of `reset`."""
     if options is None:
         return
     if not isinstance(options, dict):
@@ -175,14 +157,9 @@ def check_reset_options(options: Any, allowed: tuple[str, ...]) -> None:
 
 
 def given_by_options(options: Any, mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return what options of `reset` give in place of drawn values, for `Simulation.reset`.
+    """Return `variation` and `start` in options of `reset`, for `Simulation.reset`.
 
-    Args:
-        options: A dictionary with `variation` or `start`, each one for all or a list of N, or None.
-        mask: (N,) which environments start.
-
-    Raises:
-        ValueError: If a list has another length.
+    Each is one for all or a list of N; `mask` (N,) marks the environments that start.
     """
     given = {}
     for name in ('variation', 'start'):

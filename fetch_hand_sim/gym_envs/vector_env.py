@@ -339,22 +339,13 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
         return (values[0](*args, **kwargs),) * self.num_envs
 
     def attributes(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every environment; of a method the method, which `get_attr` calls.
-
-        Raises:
-            AttributeError: If an environment has no such attribute.
-        """
+        """An attribute of every environment; of a method the method, which `get_attr` calls."""
         if name in _OF_EACH:
             return tuple(_OF_EACH[name](self))
         return (getattr(self, _SHARED.get(name, name)),) * self.num_envs
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every environment.
-
-        Raises:
-            AttributeError: If an environment has no such attribute.
-            ValueError: As `call`, since a method is called, as `SyncVectorEnv` does.
-        """
+        """An attribute of every environment."""
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:

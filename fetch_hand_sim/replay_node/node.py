@@ -36,11 +36,7 @@ _CLOCK = '/clock'
 
 
 class ReplayNode(Node):
-    """Publish an episode, once or in a loop.
-
-    Raises:
-        ValueError: If a parameter is not allowed or the episode cannot be read.
-    """
+    """Publish an episode, once or in a loop."""
 
     def __init__(self) -> None:
         super().__init__(NODE_NAME, start_parameter_services=False)
@@ -93,11 +89,7 @@ class ReplayNode(Node):
         return f'{namespace}/{name.removeprefix(recorded)}'
 
     def run(self, stop: StopSignals) -> None:
-        """Publish until the end of the episode or until a signal.
-
-        Raises:
-            UsageError: If a topic has another publisher, unless the parameter `force` is set.
-        """
+        """Publish until the end of the episode or a signal; UsageError for topics in use."""
         loop = EventLoop(self)
         self.get_logger().info(self._description())
         try:

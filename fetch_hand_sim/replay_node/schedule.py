@@ -23,13 +23,7 @@ _SHOWN = 80
 
 @dataclass(frozen=True, slots=True)
 class ReplayMessage:
-    """A message to publish.
-
-    Attributes:
-        time_ns: Log time.
-        name: Resolved name of the topic.
-        data: CDR bytes.
-    """
+    """A message to publish."""
 
     time_ns: int
     name: str
@@ -136,13 +130,9 @@ def _require_readable(path: Path, spec: TopicSpec, message: ReplayMessage) -> No
 
 
 class Playhead:
-    """Position in an episode over time. `now` is seconds of any steady clock.
+    """Position in an episode over time.
 
-    Args:
-        position_ns: Log time.
-        rate: Recorded seconds per second.
-        now: The time now.
-        is_paused: Whether to stand still until `resume`.
+    `now` is seconds of any steady clock, `rate` recorded seconds per second.
     """
 
     def __init__(self, position_ns: int, rate: float, now: float, is_paused: bool) -> None:

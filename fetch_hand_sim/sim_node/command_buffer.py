@@ -27,10 +27,7 @@ _FAR = 2.0
 class CommandBuffer:
     """The newest valid command of one robot.
 
-    Args:
-        robot: The robot.
-        timeout: Seconds after which the robot holds; 0 for never.
-        clock: A steady clock, seconds.
+    The robot holds after `timeout` seconds without a command; 0 means never.
 
     Attributes:
         accepted: Valid commands so far.

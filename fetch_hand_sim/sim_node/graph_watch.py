@@ -28,12 +28,7 @@ class Endpoint:
 
 
 class InputWatch:
-    """Publishers of the topics that a robot subscribes to, and what is wrong with them.
-
-    Args:
-        commands: Fully qualified topics of commands, with their types.
-        others: The other subscribed topics, likewise.
-    """
+    """Publishers of the topics that a robot subscribes to, and what is wrong with them."""
 
     def __init__(self, commands: Mapping[str, str], others: Mapping[str, str]) -> None:
         self._commands = commands
@@ -57,12 +52,7 @@ class InputWatch:
         return sorted(name for name, count in copies.items() for _ in range(count))
 
     def update(self, found: Iterable[Endpoint], now: float) -> bool:
-        """Replace the known publishers; return whether a publisher of commands is new.
-
-        Args:
-            found: Publishers of the watched topics.
-            now: Seconds of a steady clock.
-        """
+        """Replace the known publishers; return whether a publisher of commands is new."""
         known = self._since
         self._endpoints, self._now = list(found), now
         self._since = {each.gid: known.get(each.gid, now) for each in self._endpoints}
@@ -103,10 +93,6 @@ class InputWatch:
 
 class GraphWatch:
     """The state of the graph at the last `update`.
-
-    Args:
-        node: The simulator node.
-        publishers: Its publishers by topic.
 
     Attributes:
         inputs: Publishers of the subscribed topics.

@@ -56,11 +56,7 @@ _POLICY_STATUS_TIME = 1.0
 
 
 class SimNode(Node):
-    """Publishes the state of one robot at every tick and applies the commands it receives.
-
-    Raises:
-        ValueError: If a parameter is not allowed.
-    """
+    """Publishes the state of one robot at every tick and applies the commands it receives."""
 
     def __init__(self) -> None:
         super().__init__(NODE_NAME, start_parameter_services=False)
@@ -193,11 +189,7 @@ class SimNode(Node):
     # Running
 
     def run(self, stop: StopSignals) -> None:
-        """Run episodes until all are done or a signal.
-
-        Raises:
-            NodeFailure: If all episodes are done but not all were logged.
-        """
+        """Run episodes until all are done or a signal; NodeFailure if not all were logged."""
         loop = EventLoop(self)
         self.get_logger().info(self._description())
         try:

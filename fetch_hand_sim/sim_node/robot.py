@@ -59,13 +59,6 @@ class Counters:
 class Robot:
     """Ticks when they are due, and executes services and received goals.
 
-    Args:
-        runner: Computes the ticks.
-        buffer: Holds the command to apply.
-        schedule: Decides when ticks are due.
-        emit: Receives every tick with its messages.
-        clock: A steady clock, seconds.
-
     Attributes:
         counters: Counts since the start.
         perturb_limit: Largest force of a push, N; 0 rejects all.
@@ -192,11 +185,7 @@ class Robot:
     # Received messages
 
     def set_goal(self, topic: TopicSpec, message: Any) -> None:
-        """Replace the goal of the running episode from the next tick on.
-
-        Raises:
-            ValueError: If `accept_goal` rejects it.
-        """
+        """Replace the goal of the running episode from the next tick on."""
         try:
             accept_goal(self.runner, topic, message)
         except ValueError as error:
@@ -212,11 +201,7 @@ class Robot:
     # Services and parameters
 
     def reset(self, *, to_first_episode: bool = False) -> Answer:
-        """End the running episode; a robot that stands still starts the next one by itself.
-
-        Args:
-            to_first_episode: Whether to restart the whole series.
-        """
+        """End the running episode; a robot that stands still starts the next one by itself."""
         runner = self.runner
         episode, was_running = runner.episode, not runner.is_between_episodes
         if was_running:

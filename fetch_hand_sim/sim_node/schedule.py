@@ -127,13 +127,7 @@ class Output(Protocol):
 
 
 class LatestTick:
-    """Publishes the newest tick while the topic has subscribers.
-
-    Args:
-        output: Publisher of the topic.
-        encoder: Adds `episode_status` to ticks without it.
-        clock: A steady clock, seconds.
-    """
+    """Publishes the newest tick while the topic has subscribers."""
 
     def __init__(
         self, output: Output, encoder: TickEncoder, clock: Callable[[], float] = time.monotonic

@@ -66,12 +66,7 @@ def _callback(answer: Callable[[Any], Answer]) -> Callable[[Any, Any], Any]:
 
 
 class SimulationInterfaces:
-    """One method per service, with the signature of rclpy's service callbacks.
-
-    Args:
-        robot: The robot to control.
-        simulator_features: The class `simulation_interfaces.msg.SimulatorFeatures`.
-    """
+    """One method per service, with the signature of rclpy's service callbacks."""
 
     def __init__(self, robot: Robot, simulator_features: Any) -> None:
         self._robot = robot

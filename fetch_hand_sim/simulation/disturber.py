@@ -132,13 +132,7 @@ class Disturber:
         streams: Sequence[np.random.Generator],
         given: Mapping[int, Mapping[str, float]] | None = None,
     ) -> None:
-        """Begin episodes whose start state the task has set.
-
-        Args:
-            ids: The simulations, (n,).
-            streams: A random stream for each.
-            given: Variations that are not drawn, by simulation and the names in `VARIATIONS`.
-        """
+        """Begin episodes whose start state the task has set."""
         for index, stream in zip(ids.tolist(), streams, strict=True):
             self._streams[index] = stream
             self._draw_episode(index, stream, (given or {}).get(index, {}))

@@ -54,9 +54,6 @@ class GoalMetric:
         """Return a copy with other values of some fields.
 
         `dataclasses.replace` would call `__init__` and lose further attributes of subclasses.
-
-        Raises:
-            ValueError: If a success rule or reward type is unknown.
         """
         changed = copy.copy(self)
         for name, value in changes.items():

@@ -136,9 +136,6 @@ class Scene:
         spec: The task, whose thresholds the markers show; it may be replaced.
         model: The compiled `mujoco.MjModel`, for pictures only.
         data: Its `mujoco.MjData` in the pose of the last frame.
-
-    Raises:
-        ValueError: If the task is unknown.
     """
 
     def __init__(self, task: str) -> None:

@@ -86,14 +86,7 @@ class UrdfJoint:
 
 
 class RobotDescription:
-    """Links and joints of the robot of a task.
-
-    Attributes:
-        joints: Ordered from the root: parents come before their children.
-
-    Raises:
-        ValueError: If the task is unknown.
-    """
+    """Links and joints of the robot of a task."""
 
     def __init__(self, task: str) -> None:
         self._spec = task_spec(task)

@@ -20,10 +20,6 @@ class Camera:
         height: Pixels.
         hz: Largest number of pictures per second of the clock; 0 for none.
         clock: A steady clock, seconds.
-
-    Attributes:
-        pictures: Pictures so far.
-        picture_time: Seconds that each took.
     """
 
     def __init__(self, width: int, height: int, hz: float, clock: Callable[[], float]) -> None:
@@ -42,11 +38,7 @@ class Camera:
         return np.isfinite(self._period) and self._clock() >= self._due
 
     def render(self, scene: Scene, frame: Frame) -> Picture:
-        """Return a picture (height, width, 3); the first call opens OpenGL.
-
-        Raises:
-            RuntimeError: If OpenGL is missing.
-        """
+        """Return a picture (height, width, 3); the first call opens OpenGL."""
         began = self._clock()
         self._due = max(self._due + self._period, began)
         if self._renderer is None:

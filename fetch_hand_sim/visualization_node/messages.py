@@ -63,12 +63,7 @@ def transform_messages(transforms: Iterable[Transform], stamp_ns: int) -> list[T
 
 
 def marker_array(shapes: Mapping[str, Sequence[Shape]], stamp_ns: int) -> MarkerArray:
-    """Return shapes as markers, which replace those of earlier messages.
-
-    Args:
-        shapes: Shapes by the namespace of their markers. Meshes are left out.
-        stamp_ns: Stamp of the tick.
-    """
+    """Return shapes as markers, which replace those of earlier messages."""
     header = Header(stamp=stamp(stamp_ns), frame_id=ROOT)
     first = Marker(header=header, action=Marker.DELETEALL)
     markers = [first]

@@ -55,11 +55,7 @@ _SERVED_FIRST = 200
 
 
 class VisualizationNode(Node):
-    """Publishes `msgs_spec.topics.view_topics`.
-
-    Raises:
-        ValueError: If a parameter is not allowed.
-    """
+    """Publishes `msgs_spec.topics.view_topics`."""
 
     def __init__(self) -> None:
         super().__init__(NODE_NAME, start_parameter_services=False)

@@ -25,15 +25,7 @@ class Transform:
 
 
 class Transforms:
-    """The tree of frames of one robot.
-
-    Args:
-        task: Name of the task.
-        prefix: Prefix of all frames except `world`, such as `left/`.
-
-    Raises:
-        ValueError: If the task is unknown.
-    """
+    """The tree of frames of one robot."""
 
     def __init__(self, task: str, prefix: str = '') -> None:
         self.description = RobotDescription(task)

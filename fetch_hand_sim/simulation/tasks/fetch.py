@@ -61,9 +61,6 @@ class FetchConfig:
         target_range: Half width of the cube that contains the goals.
         target_offset: Added to goals.
         target_in_the_air: Whether half of the goals are above the table.
-
-    Raises:
-        ValueError: If `object_range` leaves no place for the object.
     """
 
     asset: str
@@ -128,9 +125,6 @@ class FetchTask(Task):
     """FetchReach, FetchPush, FetchSlide, FetchPickAndPlace.
 
     The robot settles once; every episode starts from that state.
-
-    Args:
-        config: Differences to the other Fetch tasks; needed for third-party tasks only.
 
     Attributes:
         gripper_start: (3,) position of the gripper at a reset, m, world.

@@ -92,9 +92,6 @@ MANIPULATE_CONFIGS = {
 class HandManipulateTask(HandTask):
     """HandManipulateBlock*, HandManipulateEgg*, HandManipulatePen*.
 
-    Args:
-        config: Differences to the other manipulation tasks; needed for third-party tasks only.
-
     Attributes:
         parallel_quaternions: (24, 4) wxyz, the rotations that map a cube to itself.
     """

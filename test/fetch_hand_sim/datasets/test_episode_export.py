@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from fetch_hand_sim.commands import episodes_export
-from fetch_hand_sim.datasets.writing import move_all
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes
 from policy_node.training import generate_episodes
 from support.episode_recorder import Recorder
@@ -179,34 +178,6 @@ def test_of_two_tasks_none_is_written_where_there_is_no_room_for_both(
     assert episodes_export.main(arguments) == 0
 
 
-@pytest.mark.parametrize('format_', ['parquet', 'minari'])
-def test_of_two_exports_at_once_one_writes_and_the_other_finds_it_there(
-    episodes, two_tasks, tmp_path, format_, monkeypatch
-):
-    """The other one begins before the first has written anything."""
-    module = {'parquet': 'pyarrow.parquet', 'minari': 'minari'}[format_]
-    write = {'parquet': 'write_table', 'minari': 'create_dataset_from_buffers'}[format_]
-    library = pytest.importorskip(module)
-    written, others = getattr(library, write), []
-    command = [sys.executable, '-m', 'fetch_hand_sim', 'episodes', 'export', str(two_tasks)]
-    options = ['--to', format_, '--output', str(tmp_path)]
-
-    def begin_another(*arguments, **more):
-        if not others:
-            others.append(subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True))
-            with pytest.raises(subprocess.TimeoutExpired):
-                others[0].wait(4.0)
-        return written(*arguments, **more)
-
-    monkeypatch.setattr(library, write, begin_another)
-    assert episodes_export.main([str(episodes), *options]) == 0
-    (line,) = others[0].communicate()[1].splitlines()
-    assert others[0].returncode == 1 and 'exists; nothing is overwritten' in line
-    first = {'parquet': f'{TASK}.parquet', 'minari': TASK}[format_]
-    second = {'parquet': [f'{TASK}_episodes.parquet'], 'minari': []}[format_]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [first, *second]
-
-
 def test_a_minari_dataset_has_episodes_of_one_environment(tmp_path, monkeypatch, capsys):
     minari = pytest.importorskip('minari')
     pytest.importorskip('pyarrow')
@@ -230,15 +201,6 @@ def test_a_dataset_name_that_no_disk_takes_is_one_line(episodes, tmp_path, capsy
     assert episodes_export.main(arguments) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert 'File name too long' in line
-
-
-def test_of_two_tables_none_is_written_beside_one_that_is_there(episodes, tmp_path, capsys):
-    pytest.importorskip('pyarrow')
-    there = tmp_path / f'{TASK}_episodes.parquet'
-    there.write_text('mine')
-    assert episodes_export.main([str(episodes), '--to', 'parquet', '--output', str(tmp_path)]) == 1
-    assert f'{there.name} exists' in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == [there] and there.read_text() == 'mine'
 
 
 def test_minari_datasets_in_folders_of_folders_stand_beside_each_other(
@@ -310,18 +272,6 @@ def test_of_a_folder_only_what_is_asked_for_is_exported(episodes, tmp_path, monk
     assert f'{tmp_path} holds no episode; there are some in {folder}' in capsys.readouterr().err
 
 
-def test_of_several_moves_all_are_made_or_none(tmp_path):
-    for name in ('a', 'b'):
-        (tmp_path / name).mkdir()
-    targets = {tmp_path / 'a': tmp_path / 'c', tmp_path / 'b': tmp_path / 'nowhere' / 'd'}
-    with pytest.raises(FileNotFoundError):
-        move_all(targets)
-    assert sorted(each.name for each in tmp_path.iterdir()) == ['a', 'b']
-    targets[tmp_path / 'b'] = tmp_path / 'd'
-    move_all(targets)
-    assert sorted(each.name for each in tmp_path.iterdir()) == ['c', 'd']
-
-
 @pytest.mark.parametrize('before', [None, '/data/mine'])
 def test_minari_looks_afterwards_where_it_looked_before(before, episodes, tmp_path, monkeypatch):
     pytest.importorskip('minari')
@@ -331,29 +281,3 @@ def test_minari_looks_afterwards_where_it_looked_before(before, episodes, tmp_pa
     arguments = [str(episodes), '--to', 'minari', '--output', str(tmp_path)]
     assert episodes_export.main(arguments) == 0
     assert os.environ.get('MINARI_DATASETS_PATH') == before
-
-
-def test_what_a_killed_export_left_goes(episodes, tmp_path, monkeypatch):
-    left = tmp_path / 'out' / '.minari.partial' / 'data'
-    left.mkdir(parents=True)
-    monkeypatch.chdir(tmp_path)
-    assert (
-        episodes_export.main([str(episodes), '--to', 'minari', '--output', str(tmp_path / 'out')])
-        == 0
-    )
-    assert not [path for path in (tmp_path / 'out').iterdir() if path.name.endswith('.partial')]
-
-
-def test_an_episode_and_a_link_to_it_are_one(episodes, tmp_path, capsys):
-    first, *_ = sorted(episodes.iterdir())
-    folder = tmp_path / 'linked'
-    folder.mkdir()
-    for name in ('a', 'b'):
-        (folder / name).symlink_to(first)
-    assert (
-        episodes_export.main([str(folder), '--to', 'parquet', '--output', str(tmp_path / 'out')])
-        == 0
-    )
-    printed = capsys.readouterr()
-    assert '1 episodes of ' in printed.out
-    assert f'{folder / "b"} is {folder / "a"}, which is exported once' in printed.err

@@ -12,20 +12,21 @@ from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeReadError,
     EpisodeWriter,
-    LogSettings,
     find_leftovers,
-    limits,
     load_episodes,
     read_episode,
     read_summary,
     recover_episode,
 )
+from fetch_hand_sim.episode_log import records as limits
 from fetch_hand_sim.episode_log.bag import offered_qos_text
 from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
 from msgs_spec.schemas import MAX_MESSAGE_BYTES, schema_text, type_hash
 from msgs_spec.topics import topic, topics
 from support.episode_recorder import Recorder
+
+LOG = 'fetch_hand_sim.episode_log'
 
 MIB = 2**20
 # Topics and sizes of messages that a robot receives while it is paused at its third tick.
@@ -57,9 +58,9 @@ def ticks(recorder):
     return recorder.ticks()
 
 
-def write(directory, recorder, ticks, flood, settings=None):
+def write(directory, recorder, ticks, flood):
     """Logs an episode whose robot is flooded at its third tick."""
-    writer = EpisodeWriter(directory, 'episode', recorder.metadata(), settings=settings)
+    writer = EpisodeWriter(directory, 'episode', recorder.metadata())
     for number, tick in enumerate(ticks):
         assert writer.write_tick(tick.stamp_ns, tick.messages)
         if number == 3:
@@ -133,9 +134,10 @@ def test_an_episode_that_is_too_long_is_one_line_and_can_be_recovered(tmp_path, 
     assert read_summary(recover_episode(leftover.path)).message_count == limits.MAX_MESSAGES
 
 
-def test_the_smallest_chunks_read_too(tmp_path, recorder, ticks):
-    eager = LogSettings(chunk_size=1, flush_period_ns=1)
-    assert load_episodes(write(tmp_path, recorder, ticks, FLOODS['all topics'], eager))
+def test_the_smallest_chunks_read_too(tmp_path, recorder, ticks, monkeypatch):
+    monkeypatch.setattr(f'{LOG}.bag.CHUNK_BYTES', 1)
+    monkeypatch.setattr(f'{LOG}.writer.FLUSH_PERIOD_NS', 1)
+    assert load_episodes(write(tmp_path, recorder, ticks, FLOODS['all topics']))
 
 
 def test_what_a_program_gives_is_refused_at_once(tmp_path, recorder, ticks):
@@ -145,8 +147,6 @@ def test_what_a_program_gives_is_refused_at_once(tmp_path, recorder, ticks):
     attachment = Attachment('a', 'b', bytes(limits.MAX_ATTACHMENT_BYTES + 1))
     with pytest.raises(ValueError, match='bytes attached; allowed'):
         EpisodeWriter(tmp_path, 'episode', {}, [attachment])
-    with pytest.raises(ValueError, match='chunk_size'):
-        LogSettings(chunk_size=limits.MAX_CHUNK_BYTES)
     writer = EpisodeWriter(tmp_path, 'episode', {})
     with pytest.raises(ValueError, match='no reader takes 65537 bytes in a message'):
         writer.write(ticks[0].messages[0][0], bytes(MAX_MESSAGE_BYTES + 1), 1)

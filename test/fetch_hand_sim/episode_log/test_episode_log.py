@@ -20,13 +20,12 @@ from ruamel.yaml import YAML
 from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
     EpisodeWriter,
-    LogSettings,
     files,
     find_leftovers,
     log_time,
     read_episode,
 )
-from fetch_hand_sim.episode_log.bag import offered_qos_text
+from fetch_hand_sim.episode_log.bag import CHUNK_BYTES, offered_qos_text
 from fetch_hand_sim.episodes.recorder import (
     compiled_attachment,
     compiled_bytes,
@@ -97,8 +96,8 @@ class Bag:
         ]
 
 
-def write_bag(recorder, ticks, directory, metadata, settings=None, attachments=()):
-    writer = EpisodeWriter(directory, 'episode', metadata, attachments, settings)
+def write_bag(recorder, ticks, directory, metadata, attachments=()):
+    writer = EpisodeWriter(directory, 'episode', metadata, attachments)
     recorder.write(writer, ticks)
     return writer.finish({'success': 'false', 'return': '-50.0'})
 
@@ -156,7 +155,7 @@ def test_profile_chunks_and_indexes(bag):
     assert isinstance(records[0], Header) and records[0].profile == 'ros2'
     assert all(chunk.uncompressed_crc for chunk in chunks)
     assert all(chunk.compression == 'lz4' for chunk in chunks)
-    assert all(chunk.uncompressed_size < 2 * LogSettings().chunk_size for chunk in chunks)
+    assert all(chunk.uncompressed_size < 2 * CHUNK_BYTES for chunk in chunks)
     assert len(indexes) == len(chunks)
     assert all(index.message_index_offsets for index in indexes)
     groups = [record for record in records if isinstance(record, SummaryOffset)]
@@ -359,17 +358,14 @@ def test_a_fingerprint_is_that_of_the_model_and_not_of_the_folder_it_lies_in(rea
     assert len(fingerprints) == 5
 
 
-@pytest.mark.parametrize('compression', ['none', 'lz4', 'zstd'])
-def test_settings_reach_the_file(reach, tmp_path, compression):
-    settings = LogSettings(chunk_size=4096, compression=compression, flush_period_ns=10**12)
-    path = write_bag(reach.recorder, reach.ticks, tmp_path, {}, settings)
+def test_a_chunk_ends_after_the_message_that_fills_it(reach, tmp_path, monkeypatch):
+    monkeypatch.setattr('fetch_hand_sim.episode_log.bag.CHUNK_BYTES', 4096)
+    monkeypatch.setattr('fetch_hand_sim.episode_log.writer.FLUSH_PERIOD_NS', 10**12)
+    path = write_bag(reach.recorder, reach.ticks, tmp_path, {})
     with (path / 'episode_0.mcap').open('rb') as stream:
         summary = make_reader(stream).get_summary()
     size = sum(len(data) for _, _, data in reach.written())
-    assert {index.compression for index in summary.chunk_indexes} == {
-        '' if compression == 'none' else compression
-    }
-    # A chunk ends after the message that fills it.
+    assert {index.compression for index in summary.chunk_indexes} == {'lz4'}
     assert size / (2 * 4096) < len(summary.chunk_indexes) < 2 * size / 4096
     episode = read_episode(path)
     assert sum(len(t.messages) for t in episode.topics.values()) == len(reach.written())
@@ -461,14 +457,6 @@ def test_metadata_must_be_strings(tmp_path):
     with pytest.raises(ValueError, match="not 'seed': 3"):
         EpisodeWriter(tmp_path, 'episode', {'seed': 3})
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    'bad', [{'compression': 'gzip'}, {'chunk_size': 0}, {'flush_period_ns': 0}]
-)
-def test_bad_settings_are_refused(bad):
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        LogSettings(**bad)
 
 
 @pytest.mark.parametrize('task', ['Fetch-Near', 'fetch.near v2', 'Näher_000001_seed1'])

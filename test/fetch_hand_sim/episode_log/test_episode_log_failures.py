@@ -27,7 +27,6 @@ from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeReadError,
     EpisodeWriter,
-    LogSettings,
     files,
     find_episodes,
     find_leftovers,
@@ -42,11 +41,12 @@ from support import SUPPORT, script_environment
 from support.episode_recorder import Recorder
 from support.full_disk import files_at_most
 
+LOG = 'fetch_hand_sim.episode_log'
+
 RECORDER_SCRIPT = SUPPORT / 'episode_recorder.py'
 NOBODY = 65534
 TICK_NS = 40_000_000
 # Every message goes to the disk at once, so that errors come where they are caused.
-EAGER = LogSettings(chunk_size=1, flush_period_ns=1, minimum_free_bytes=0)
 
 
 @pytest.fixture(scope='module')
@@ -336,8 +336,12 @@ def test_leftovers_of_a_directory_that_does_not_exist(tmp_path):
     assert find_leftovers(tmp_path / 'missing') == []
 
 
-def test_an_error_of_the_disk_is_raised_once_and_stops_the_log(tmp_path, recorder, ticks):
-    writer = EpisodeWriter(tmp_path, 'episode', {}, settings=EAGER)
+def test_an_error_of_the_disk_is_raised_once_and_stops_the_log(
+    tmp_path, recorder, ticks, monkeypatch
+):
+    monkeypatch.setattr(f'{LOG}.bag.CHUNK_BYTES', 1)
+    monkeypatch.setattr(f'{LOG}.writer.FLUSH_PERIOD_NS', 1)
+    writer = EpisodeWriter(tmp_path, 'episode', {})
     with files_at_most(20_000):
         error, taken = first_error(writer, recorder, ticks)
         assert_one_line(error)
@@ -353,8 +357,9 @@ def test_an_error_of_the_disk_is_raised_once_and_stops_the_log(tmp_path, recorde
     assert not (tmp_path / 'episode').exists()
 
 
-def test_an_error_at_the_end_never_shows_a_finished_episode(tmp_path, recorder, ticks):
-    writer = EpisodeWriter(tmp_path, 'episode', {}, settings=LogSettings(flush_period_ns=10**12))
+def test_an_error_at_the_end_never_shows_a_finished_episode(tmp_path, recorder, ticks, monkeypatch):
+    monkeypatch.setattr(f'{LOG}.writer.FLUSH_PERIOD_NS', 10**12)
+    writer = EpisodeWriter(tmp_path, 'episode', {})
     recorder.write(writer, ticks)
     with files_at_most(4000), pytest.raises(EpisodeLogError, match='File too large') as caught:
         writer.finish({'success': 'true'})
@@ -377,10 +382,10 @@ def test_the_next_episode_is_logged_again(tmp_path, ticks):
     assert recorder.record(directory).name == 'FetchReach_000001_seed0'
 
 
-def test_a_full_disk(mount, recorder, ticks):
+def test_a_full_disk(mount, recorder, ticks, monkeypatch):
     small_disk = mount('size=2m')
-    settings = LogSettings(minimum_free_bytes=1024 * 1024)
-    directory = EpisodeDirectory(small_disk, settings)
+    monkeypatch.setattr(f'{LOG}.writer.MINIMUM_FREE_BYTES', 1024 * 1024)
+    directory = EpisodeDirectory(small_disk)
     writer = directory.begin('FetchReach', 0, {})
     (small_disk / 'filler').write_bytes(bytes(2040 * 1024 - 16 * 1024))
     with pytest.raises(EpisodeLogError, match='No space left on device') as caught:
@@ -398,10 +403,10 @@ def test_a_full_disk(mount, recorder, ticks):
     ]
 
 
-def test_too_little_free_space_is_noticed_before(tmp_path):
-    settings = LogSettings(minimum_free_bytes=2**62)
+def test_too_little_free_space_is_noticed_before(tmp_path, monkeypatch):
+    monkeypatch.setattr(f'{LOG}.writer.MINIMUM_FREE_BYTES', 2**62)
     with pytest.raises(EpisodeLogError, match='MiB free on the disk') as caught:
-        EpisodeWriter(tmp_path, 'episode', {}, settings=settings)
+        EpisodeWriter(tmp_path, 'episode', {})
     assert_one_line(caught.value)
     assert list(tmp_path.iterdir()) == []
 

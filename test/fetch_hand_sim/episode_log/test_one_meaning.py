@@ -11,12 +11,11 @@ from pathlib import Path
 
 import pytest
 from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from fetch_hand_sim.episode_log import (
     EpisodeDirectory,
     EpisodeReadError,
-    LogSettings,
     load_episodes,
     read_episode,
     read_summary,
@@ -419,11 +418,13 @@ def test_a_file_of_one_meaning_is_read_sorted_by_time(parts, episodes, tmp_path,
     assert_same(path, episodes[0])
 
 
-@pytest.mark.parametrize('compression', ['none', 'lz4'])
-def test_files_without_chunks_and_of_all_compressions_are_read(episodes, tmp_path, compression):
+@pytest.mark.parametrize('compression', [CompressionType.NONE, CompressionType.LZ4])
+def test_files_without_chunks_and_of_all_compressions_are_read(
+    episodes, tmp_path, compression, monkeypatch
+):
     recorder = Recorder('FetchReach')
-    settings = LogSettings(compression=compression)
-    original = recorder.record(EpisodeDirectory(tmp_path, settings))
+    monkeypatch.setattr('fetch_hand_sim.episode_log.bag.COMPRESSION', compression)
+    original = recorder.record(EpisodeDirectory(tmp_path))
     assert_same(original, episodes[0])
     episode = read_episode(original)
     with (tmp_path / 'loose.mcap').open('wb') as stream:

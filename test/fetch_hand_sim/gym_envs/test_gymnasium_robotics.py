@@ -144,20 +144,6 @@ def test_a_worker_process_finds_the_ids_by_their_module():
     assert fetch_hand_sim.make(name, control_hz=50).spec.max_episode_steps == 100
 
 
-def test_touch_sensors_say_it_too_where_the_references_are_replaced(registry):
-    name = 'HandManipulatePenRotate_ContinuousTouchSensors-v1'
-    if name not in registry:
-        gymnasium.register(name, entry_point='gymnasium_robotics:stops_at_an_assert')
-    fetch_hand_sim.register_gymnasium_robotics(override=True)
-    with pytest.raises(gymnasium.error.Error, match='without them it is HandManipulatePenRotate'):
-        gymnasium.make(name)
-
-
-def test_touch_sensors_say_in_one_line_that_they_are_not_there(make):
-    with pytest.raises(gymnasium.error.Error, match='without them it is HandManipulateEggDense-v1'):
-        make('HandManipulateEgg_BooleanTouchSensorsDense-v1')
-
-
 def test_an_environment_is_a_goal_env_and_recomputes_its_step(make):
     env = make('FetchReach-v4')
     assert isinstance(env, import_goal_env())
