@@ -39,7 +39,7 @@ help:
 	@echo 'make bench-real-time  success in real time, with and without answer_wait, against lockstep'
 	@echo 'make bench-rate [SECONDS=$(SECONDS)]  rate of joint_states, idle and with all CPUs busy'
 	@echo 'make torture    100,000 hostile messages per test, an hour of memory at 20x, 50 killed'
-	@echo '                robots, 10,000 damaged and 2,000 crafted episode files'
+	@echo '                robots, 10,000 damaged episode files'
 	@echo 'make test-release  the long tests, also the tutorials and the page in an installed Chromium;'
 	@echo '                documentation; wheel and sdist, built, installed elsewhere and used;'
 	@echo '                the tests of Gymnasium-Robotics'
@@ -139,7 +139,7 @@ torture: env
 		test/fetch_hand_sim/sim_node/test_receivers.py \
 		test/policy_node/node/test_responder.py test/policy_node/policies/test_hostile_files.py \
 		test/nodes/test_nodes_hostile.py
-	EPISODE_KILLS=50 EPISODE_LIFE=3 EPISODE_MUTATIONS=10000 EPISODE_CRAFTED=2000 $(BIN)/python -m pytest --timeout 0 -s \
+	EPISODE_KILLS=50 EPISODE_LIFE=3 EPISODE_MUTATIONS=10000 $(BIN)/python -m pytest --timeout 0 -s \
 		test/fetch_hand_sim/episode_log/test_episode_endings.py \
 		test/fetch_hand_sim/episode_log/test_episode_untrusted.py
 

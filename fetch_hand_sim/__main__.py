@@ -29,7 +29,6 @@ class Command:
         module: Its `main` is the command; it is imported when the command runs.
         extras: Extras of this package that the module imports.
         is_node: Whether the command takes ROS parameters instead of options.
-        commands: Subcommands by name.
     """
 
     help: str

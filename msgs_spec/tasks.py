@@ -257,7 +257,6 @@ def task_spec(
     """Return a task, or raise ValueError, which lists all tasks.
 
     Args:
-        name: One of `TASKS`.
         joint_prefix: Prefix of the joint names on the network.
         control_hz: Action frequency, Hz. An episode keeps its duration; its steps are rounded.
     """

@@ -181,10 +181,6 @@ def given_command(name: str, arguments: Sequence[str] | None) -> str:
 def run_command(name: str, run: Callable[[], int]) -> int:
     """Run the body of a command and return the exit code of the process.
 
-    Args:
-        name: Name of the command, for error lines.
-        run: Returns the exit code; may raise `CommandError`.
-
     Returns:
         The result of `run`; 1 or 2 for a `CommandError`; 130, 143 or 129 for SIGINT, SIGTERM or
         SIGHUP, after the line `stopping`; 141 for a closed output.

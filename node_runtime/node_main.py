@@ -208,9 +208,7 @@ def run_node(
     """Initialise rclpy, run a node and return the exit code of the process.
 
     Args:
-        name: Name of the executable, for error lines.
         run: Runs until its work is done or a signal is recorded.
-        args: Command line; None means `sys.argv`.
         shared_memory: Whether to allow shared memory (see `transport`). For nodes that send
             pictures and that no robot waits for.
 

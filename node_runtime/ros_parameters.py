@@ -89,7 +89,6 @@ def set_callback(
     Parameters of ROS itself pass.
 
     Args:
-        specs: Parameters of the node.
         makes_time: Whether the node publishes `/clock` and therefore rejects `use_sim_time`.
     """
     from rcl_interfaces.msg import SetParametersResult

@@ -46,7 +46,6 @@ def export_lerobot(
     Args:
         by_task: Episodes, at least one of each task, each with a step and the settings of the first
             of its task, see `writing.why_apart`.
-        camera: Camera of the films; None for no films.
 
     Returns:
         The dataset of each task, `directory/<task>`, for `LeRobotDataset('me/<task>', root=...)`.

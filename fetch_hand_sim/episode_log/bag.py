@@ -105,10 +105,6 @@ class BagFile:
 
     `OSError`s of the stream are passed on and end the file. The records that identify the episode
     are written at once, so that a cut-off file contains them.
-
-    Attributes:
-        has_unflushed: Whether there are messages that the operating system does not have yet.
-        message_count: Number of messages so far.
     """
 
     def __init__(

@@ -50,9 +50,7 @@ class EpisodeRecord:
     Attributes:
         task: The task, with the joint names of its messages, `episode_ticks` at 25 Hz.
         episode: Number of the episode in its run, from 0.
-        seed: Seed of the reset.
         control_hz: Ticks per simulated second.
-        joint_prefix: Prefix of the joint names.
         interface_version: Meaning of the messages, see `INTERFACE_VERSION`.
         perturb_limit: Largest force of a push, N; 0 if pushes were off.
         timing: Quantities kept at rates other than 25 Hz, see `msgs_spec.tasks.Timing`.
@@ -101,11 +99,6 @@ class EpisodeOutcome:
     """The record `episode_result`, parsed. Missing values are None.
 
     Attributes:
-        is_complete: Whether the episode ran to its end.
-        reason: Reason of an interruption.
-        steps: Steps taken.
-        episode_return: Sum of rewards.
-        is_success: Whether the goal was reached at the end.
         received_not_logged: Number of received messages beyond the allowance, by topic.
         late_commands: Steps whose command did not answer the observation before; None in lockstep,
             in generated episodes and in files of version 1.
@@ -278,12 +271,10 @@ def episode_metadata(
 
     Args:
         episode: Number of the episode in this run, from 0; file names count over all runs.
-        control_hz: Ticks per simulated second.
         timing: Recorded only as `seconds` at another rate than 25 Hz; files without it mean
             `ticks`, because robots up to 1.0 recorded nothing.
         joint_prefix: Recorded only if it is not the usual one.
         model_sha256: Fingerprint of the compiled model, see `model_sha256`.
-        checkpoint_sha256: Fingerprint of the policy that gives the commands, if known.
         perturb_limit: Largest force of a push, N; recorded only if pushes are on.
         disturbances: Disturbances of the robot, JSON, or ''.
         variation: Values that the episode drew from them, JSON, or ''.

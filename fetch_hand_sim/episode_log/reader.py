@@ -73,8 +73,6 @@ class EpisodeSummary(HasOutcome):
     """An episode without its messages; `path` is the MCAP file.
 
     Attributes:
-        metadata: The metadata record `episode`.
-        result: The metadata record `episode_result`.
         duration_s: Simulated seconds from the first message to the last.
     """
 

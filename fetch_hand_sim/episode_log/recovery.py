@@ -58,8 +58,6 @@ class Leftover:
     """An episode that was not completed.
 
     Attributes:
-        path: Its hidden directory.
-        size_bytes: Size of its files.
         age_s: Seconds since the last write.
         problem: Reason why no robot can have left it, or ''.
     """

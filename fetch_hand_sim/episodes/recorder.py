@@ -120,9 +120,6 @@ class EpisodeRecorder:
     """Writes each episode of a robot to a bag of its own.
 
     Args:
-        directory: Where episodes are collected.
-        namespace: ROS namespace of relative topic names.
-        attachments: Files stored with every episode.
         metadata: Makes the metadata of an episode from the status of its first tick, when it is
             recorded.
         on_error: Called once, with one line, when the disk fails, by any thread.

@@ -152,11 +152,9 @@ class EpisodeRunner:
     Stamps grow by one period per tick and never go back.
 
     Args:
-        simulation: A simulation of one robot.
         episodes: Number of episodes to run; 0 for no end.
         first_episode: Index of the first episode, to repeat an episode from the middle of a series.
         first_stamp_ns: Simulated time of the first tick, likewise.
-        joint_prefix: Beginning of the names of joints in messages.
 
     Attributes:
         spec: The task, with the joint names of the messages.
@@ -296,8 +294,6 @@ def accept_goal(
     """Replace the goal of the running episode from the next tick on.
 
     Args:
-        topic: `set_goal` of the task.
-        message: The received message, of rclpy or of `schemas`.
         reads_header: Whether frame and stamp count; robots of interface version 1 ignored both.
 
     Raises:
@@ -343,8 +339,6 @@ def accept_perturbation(
     """Push a body of the running episode during its next tick.
 
     Args:
-        topic: `perturb` of the task.
-        message: The received message, of rclpy or of `schemas`.
         limit: Largest force, N; 0 rejects all.
 
     Raises:

@@ -98,8 +98,6 @@ def write_film(
     """Write pictures (height, width, 3) of one size; the file appears when it is complete.
 
     Args:
-        path: Ends in .mp4, .gif or .webp.
-        pictures: Drawn as they are written.
         fps: Pictures per second. GIF and WebP show at most 50, so above that every n-th picture
             is written and the duration stays the same.
         keyframe_every: Pictures between two keyframes of an .mp4, for programs that seek in it;

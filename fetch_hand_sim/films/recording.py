@@ -89,8 +89,6 @@ def load_recordings(
     """Read the first `count` episodes of a file or folder.
 
     Args:
-        path: An episode, or a folder of episodes.
-        count: Maximum number of episodes.
         on_skip: Called with the error of each unreadable episode, which is left out; None raises
             that error.
 

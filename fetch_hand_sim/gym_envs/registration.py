@@ -124,7 +124,6 @@ def make_vec(
 
     Args:
         name: The task, the id, or `spec` of an environment.
-        num_envs: Number of copies.
         wrappers: Wrappers of the batch, the innermost first: those of
             `gymnasium.wrappers.vector`, or those of single environments that exist there by the
             same name.
@@ -195,7 +194,7 @@ def register_gymnasium_robotics(override: bool = False) -> None:
             registered then.
     """
     if override:
-        from fetch_hand_sim.gym_envs.reference import import_goal_env
+        from fetch_hand_sim.gym_envs.gymnasium_robotics_env import import_goal_env
 
         import_goal_env()
     ids = reference_ids()

@@ -25,12 +25,7 @@ class FetchHandVecEnv(VecEnv):
     for the episodes' returns.
 
     Args:
-        task: One of the tasks (`msgs_spec.tasks.TASKS`).
-        num_envs: Number of copies N.
         **arguments: As `FetchHandVectorEnv` has them, but `autoreset_mode`.
-
-    Attributes:
-        batch: The environments.
 
     Raises:
         ValueError: If an argument is not allowed.

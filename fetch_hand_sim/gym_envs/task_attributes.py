@@ -178,7 +178,6 @@ def goals_of_options(options: Any, mask: NDArray[np.bool_], spec: TaskSpec) -> A
     Args:
         options: A dictionary with `goal`, (goal size,) for all or (N, goal size), or without.
         mask: (N,) which environments start.
-        spec: The task.
 
     Returns:
         (n, goal size), of the n that start, unit quaternions; None where goals are drawn.

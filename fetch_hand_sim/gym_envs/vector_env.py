@@ -47,26 +47,17 @@ class FetchHandVectorEnv(TaskAttributes, VectorEnv[Observation, NDArray[np.float
 
     Subclasses may bring `compute_reward`, `compute_terminated` and `compute_truncated` of
     (achieved_goal, desired_goal, info) for all N at once: goals (N, goal size), results (N,). The
-    other methods that count in `FetchHandEnv` are refused.
+    other methods that count in `FetchHandEnv` are refused. Arguments that are not listed here are
+    those of `FetchHandEnv`; for another rate than 25 Hz use `fetch_hand_sim.make_vec`.
 
     Args:
         task: One of the tasks (`msgs_spec.tasks.TASKS`).
         num_envs: Number of copies N.
         max_episode_steps: Steps per episode; None for the task's own number, -1 for no limit.
         num_threads: Threads that step them; 0 for all processors that the process may use.
-        reward_type: `sparse` (-1 or 0) or `dense` (minus the distance).
-        success_rule: `gymnasium` (released code) or `paper` (its text).
-        control_hz: Actions per simulated second: 500/n for n = 1 ... 40. With another than 25 use
-            `fetch_hand_sim.make_vec`: Gymnasium would end episodes after the steps of 25 Hz.
         autoreset_mode: When an ended episode is followed by the next.
         render_mode: `rgb_array`, `depth_array` or None.
-        width: Pixels of a picture.
-        height: Pixels of a picture.
-        default_camera_config: Attributes of `mujoco.MjvCamera`; None for the task's view.
-        distance_threshold: Success within this distance, metres; None for the task's own.
-        rotation_threshold: Success within this rotation, radians; None for the task's own.
         disable_env_checker: Ignored; `gymnasium.make_vec` passes it to batches too.
-        disturbances: As `FetchHandEnv` takes them.
 
     Raises:
         ValueError: If an argument is not allowed.

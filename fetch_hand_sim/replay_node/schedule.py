@@ -34,14 +34,9 @@ class ReplaySchedule:
     """The messages to publish, in order.
 
     Args:
-        path: Bag directory or MCAP file.
-        topics: Names of the topics to publish, resolved or not; empty for all topics that the
-            robot published.
         with_inputs: Whether to publish also the received commands and goals.
 
     Attributes:
-        topics: Published topics by resolved name.
-        messages: Their messages in order of log time.
         start_ns: Log time of the first message of the episode, published or not.
         end_ns: Log time of its last message.
         period_ns: Recorded nanoseconds per tick.

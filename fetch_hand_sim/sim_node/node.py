@@ -23,8 +23,7 @@ from fetch_hand_sim.sim_node import NODE_NAME
 from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
 from fetch_hand_sim.sim_node.health import WAITING_PERIOD, Reporter
-from fetch_hand_sim.sim_node.receivers import Receivers
-from fetch_hand_sim.sim_node.robot import Messages, Robot
+from fetch_hand_sim.sim_node.robot import Messages, Receivers, Robot
 from fetch_hand_sim.sim_node.schedule import LatestTick, TickSchedule
 from fetch_hand_sim.sim_node.services import open_services
 from fetch_hand_sim.simulation import Simulation

@@ -23,10 +23,8 @@ class TickSchedule:
         mode: `realtime` follows the clock, `lockstep` the commands.
         tick_duration: Simulated seconds per tick.
         real_time_factor: Simulated seconds per second; 0 is as fast as possible.
-        now: The present time.
 
     Attributes:
-        is_paused: Whether ticks are suspended.
         changes: Number of pauses, resumptions and changes of the pace.
         missed_ticks: Deadlines that passed without a tick.
         answer_wait: Seconds that a tick may wait for the command that answers the last tick.
@@ -70,7 +68,6 @@ class TickSchedule:
         """Return the seconds until the next tick; infinity while paused or without a command.
 
         Args:
-            now: The present time.
             has_command: Whether a command waits to be applied, or none is needed.
             lacks_answer: Whether the tick may wait for an answer.
         """

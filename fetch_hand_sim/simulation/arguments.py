@@ -168,7 +168,6 @@ def read_start(given: Any, task: Task) -> StartState:
         given: A mapping with some of `joints` and `joint_velocities`: numbers by joint name, or all
             in the order of `joint_states`, rad or m (/s); `object_pose`: (7,), m and quaternion
             wxyz, world; `object_velocity`: (6,), linear m/s and angular rad/s, world axes.
-        task: The task.
 
     Raises:
         ValueError: If a part is unknown or impossible; one line names it and what is allowed.

@@ -35,9 +35,9 @@ from fetch_hand_sim.simulation.arguments import (
     selected_simulations,
 )
 from fetch_hand_sim.simulation.disturber import Disturber
-from fetch_hand_sim.simulation.engine import DivergenceWatch
 from fetch_hand_sim.simulation.models import asset_path
 from fetch_hand_sim.simulation.tasks import Task, make_task
+from fetch_hand_sim.simulation.tasks.task import DivergenceWatch
 from msgs_spec.arrays import Array
 from msgs_spec.disturbances import Disturbances, read_disturbances
 from msgs_spec.observations import Readings, achieved_goal

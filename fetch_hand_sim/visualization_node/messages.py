@@ -113,7 +113,6 @@ def camera_info(width: int, height: int, fovy: float, frame_id: str, stamp_ns: i
         height: Pixels.
         fovy: Vertical field of view, degrees.
         frame_id: Optical frame of the camera.
-        stamp_ns: Stamp of the picture.
     """
     focal = height / 2.0 / np.tan(np.radians(fovy) / 2.0)
     x, y = width / 2.0, height / 2.0

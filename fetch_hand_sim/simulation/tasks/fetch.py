@@ -52,7 +52,6 @@ class FetchConfig:
     """Differences between the Fetch tasks; lengths in m.
 
     Attributes:
-        asset: MJCF file.
         start: Initial positions of robot0:slide0, slide1, slide2.
         object_start: Initial qpos of the object, or None.
         block_gripper: Whether the fingers are locked shut.

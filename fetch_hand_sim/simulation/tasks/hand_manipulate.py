@@ -17,11 +17,11 @@ import numpy as np
 from mujoco.batch import SimulationError
 from numpy.typing import NDArray
 
-from fetch_hand_sim.simulation.engine import DivergenceWatch
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from fetch_hand_sim.simulation.tasks.hand import HandTask, load_hand_model
 from fetch_hand_sim.simulation.tasks.task import (
     BatchConfig,
+    DivergenceWatch,
     Generators,
     Ids,
     integration_state,

@@ -24,7 +24,6 @@ from fetch_hand_sim.films.playing import Film, film_episode
 from fetch_hand_sim.films.recording import Studio, grid, load_recordings, sheets
 from fetch_hand_sim.gym_envs.env import FetchHandEnv
 from fetch_hand_sim.simulation.opengl import prepare_opengl
-from support.crafted_files import Crafter
 from support.episode_recorder import Recorder
 from support.full_disk import files_at_most
 
@@ -445,11 +444,13 @@ def test_film_episode_plays_to_the_end_with_a_policy_or_a_function(opengl):
 @pytest.mark.parametrize('lost', [0, 50, -1])
 def test_a_pose_of_the_object_that_is_missing_is_one_line(lost, tmp_path):
     """Poses are no part of what is observed, so that nothing else looks at their number."""
-    path = Recorder('HandManipulateEggRotate').record(EpisodeDirectory(tmp_path))
-    content = Crafter(path, 0, 0).whole()
-    poses = [each for each in content.messages if each.topic == '/object_pose']
-    content.messages.remove(poses[lost])
-    (path / f'{path.name}_0.mcap').write_bytes(content.to_bytes())
+    recorder = Recorder('HandManipulateEggRotate')
+    writer = EpisodeDirectory(tmp_path).begin(recorder.spec.name, 0, recorder.metadata())
+    ticks = recorder.ticks()
+    messages = ticks[lost].messages
+    messages.remove(next(each for each in messages if each[0].name == 'object_pose'))
+    recorder.write(writer, ticks)
+    path = writer.finish({})
     assert len(load_episodes(path)) == 1
     with pytest.raises(EpisodeReadError, match='object_pose is missing at some ticks'):
         load_recordings(path, 1)

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 import fetch_hand_sim
-from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv, ManipulateEnv
-from fetch_hand_sim.gym_envs.reference import import_goal_env
+from fetch_hand_sim.gym_envs.gymnasium_robotics_env import FetchEnv, ManipulateEnv, import_goal_env
 from fetch_hand_sim.gym_envs.registration import reference_ids
 from msgs_spec.tasks import TASKS
 from support import SUPPORT

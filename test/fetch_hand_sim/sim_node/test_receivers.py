@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fetch_hand_sim.sim_node.receivers import Receivers
+from fetch_hand_sim.sim_node.robot import Receivers
 from msgs_spec.codecs import TopicCodec, build_message
 from msgs_spec.schemas import MAX_MESSAGE_BYTES, message_class, serialize
 from msgs_spec.tasks import task_spec
