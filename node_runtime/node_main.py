@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 import os
+import pkgutil
 import signal
 import sys
 import tempfile
@@ -102,7 +103,7 @@ class RunnableNode(Protocol):
 def node_main(
     name: str,
     summary: str,
-    load: Callable[[], Callable[[], RunnableNode]],
+    node_class: str,
     args: list[str] | None = None,
     shared_memory: bool = False,
     second_signal_ends: bool = False,
@@ -114,7 +115,7 @@ def node_main(
 
     def run(stop: StopSignals) -> None:
         stop.second_ends = second_signal_ends
-        _run(load, stop)
+        _run(node_class, stop)
 
     return run_node(name, run, args, shared_memory)
 
@@ -124,8 +125,8 @@ def _print_usage(name: str, summary: str) -> int:
     return EXIT_SUCCESS
 
 
-def _run(load: Callable[[], Callable[[], RunnableNode]], stop: StopSignals) -> None:
-    make_node = load()
+def _run(node_class: str, stop: StopSignals) -> None:
+    make_node: Callable[[], RunnableNode] = pkgutil.resolve_name(node_class)
     if stop:
         return
     try:
@@ -209,7 +210,7 @@ def run_node(
 
     Args:
         run: Runs until its work is done or a signal is recorded.
-        shared_memory: Whether to allow shared memory (see `transport`). For nodes that send
+        shared_memory: Whether to allow shared memory (see `ros`). For nodes that send
             pictures and that no robot waits for.
 
     Returns:

@@ -7,9 +7,7 @@ the messages and their times, without ROS; `node.py` is the node.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from node_runtime.node_main import RunnableNode, node_main
+from node_runtime.node_main import node_main
 
 NODE_NAME = 'replay_node'
 SUMMARY = 'A recorded episode, published once more.'
@@ -17,10 +15,4 @@ SUMMARY = 'A recorded episode, published once more.'
 
 def main(args: list[str] | None = None) -> int:
     """Run `replay_node` and return the exit code."""
-
-    def load() -> Callable[[], RunnableNode]:
-        from fetch_hand_sim.replay_node.node import ReplayNode
-
-        return ReplayNode
-
-    return node_main(NODE_NAME, SUMMARY, load, args)
+    return node_main(NODE_NAME, SUMMARY, 'fetch_hand_sim.replay_node.node:ReplayNode', args)

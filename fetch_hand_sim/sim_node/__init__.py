@@ -6,9 +6,7 @@ after its handlers of signals.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from node_runtime.node_main import RunnableNode, node_main
+from node_runtime.node_main import node_main
 
 NODE_NAME = 'sim_node'
 SUMMARY = 'One simulated robot on the network.'
@@ -16,10 +14,4 @@ SUMMARY = 'One simulated robot on the network.'
 
 def main(args: list[str] | None = None) -> int:
     """Run `sim_node` and return the exit code."""
-
-    def load() -> Callable[[], RunnableNode]:
-        from fetch_hand_sim.sim_node.node import SimNode
-
-        return SimNode
-
-    return node_main(NODE_NAME, SUMMARY, load, args)
+    return node_main(NODE_NAME, SUMMARY, 'fetch_hand_sim.sim_node.node:SimNode', args)

@@ -6,9 +6,7 @@ is the node, a process beside the robot.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from node_runtime.node_main import RunnableNode, node_main
+from node_runtime.node_main import node_main
 
 NODE_NAME = 'visualization_node'
 SUMMARY = 'URDF, transforms, markers and a camera of a running robot, for standard tools.'
@@ -16,10 +14,10 @@ SUMMARY = 'URDF, transforms, markers and a camera of a running robot, for standa
 
 def main(args: list[str] | None = None) -> int:
     """Run `visualization_node` and return the exit code."""
-
-    def load() -> Callable[[], RunnableNode]:
-        from fetch_hand_sim.visualization_node.node import VisualizationNode
-
-        return VisualizationNode
-
-    return node_main(NODE_NAME, SUMMARY, load, args, shared_memory=True)
+    return node_main(
+        NODE_NAME,
+        SUMMARY,
+        'fetch_hand_sim.visualization_node.node:VisualizationNode',
+        args,
+        shared_memory=True,
+    )

@@ -7,9 +7,7 @@ is set.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from node_runtime.node_main import RunnableNode, node_main
+from node_runtime.node_main import node_main
 
 NODE_NAME = 'policy_node'
 SUMMARY = 'Command a robot with a policy, from its topics.'
@@ -17,11 +15,7 @@ SUMMARY = 'Command a robot with a policy, from its topics.'
 
 def main(args: list[str] | None = None) -> int:
     """Run `policy_node` and return the exit code."""
-
-    def load() -> Callable[[], RunnableNode]:
-        from policy_node.node.node import PolicyNode
-
-        return PolicyNode
-
     # The user's own code may hang.
-    return node_main(NODE_NAME, SUMMARY, load, args, second_signal_ends=True)
+    return node_main(
+        NODE_NAME, SUMMARY, 'policy_node.node.node:PolicyNode', args, second_signal_ends=True
+    )
