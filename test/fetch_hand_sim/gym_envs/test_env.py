@@ -297,15 +297,6 @@ def test_quaternions_of_given_goals_are_normalised_or_refused():
     assert state_of(env) == before
 
 
-def test_the_flat_view_is_the_concatenation():
-    env = gymnasium.wrappers.FlattenObservation(make('FetchPush'))
-    flat, _ = env.reset(seed=0)
-    parts, _ = make('FetchPush').reset(seed=0)
-    names = list(env.unwrapped.observation_space)
-    assert flat.shape == (31,)
-    assert flat.tobytes() == np.concatenate([parts[name] for name in names]).tobytes()
-
-
 @pytest.mark.release
 def test_stable_baselines3_learns_with_hindsight():
     library = pytest.importorskip('stable_baselines3')
@@ -340,13 +331,9 @@ def test_importing_the_package_registers_without_mujoco():
     [
         ({'render_mode': 'ansi'}, "'ansi' is not known; allowed: None, human, rgb_array, depth_"),
         ({'height': 0}, r'height must be 1 \.\.\. 4096 pixels, not 0'),
-        ({'width': 5000}, r'width must be 1 \.\.\. 4096 pixels, not 5000'),
         ({'width': 1.5}, 'width must be a whole number, not 1.5'),
-        ({'width': 'a'}, "width must be a whole number, not 'a'"),
         ({'default_camera_config': {'distance': 'a'}}, r"distance 'a'; allowed: as \d"),
-        ({'default_camera_config': {'lookat': [1, 2]}}, r'lookat \[1, 2\]; allowed: as array'),
         ({'default_camera_config': {'lookat': [np.nan] * 3}}, r'lookat \[nan nan nan\] is not fin'),
-        ({'default_camera_config': {'distance': np.inf}}, 'distance inf is not finite'),
         ({'default_camera_config': {'type': 3}}, r'type 3; allowed: 0 \(free\), 1 \(trac'),
         ({'default_camera_config': {'type': 2}}, r'type 2 with fixedcamid -1; allowed: 0 \.'),
         (
@@ -362,7 +349,6 @@ def test_importing_the_package_registers_without_mujoco():
         ({'default_camera_config': 5}, 'default_camera_config 5; allowed: a mapping or None'),
         ({'disturbances': 'x' * 1000}, 'is neither a file nor a preset'),
         ({'default_camera_config': {'zoom': 2}}, "'zoom' is not known; allowed: azimuth,"),
-        ({'distance_threshold': float('nan')}, r'must be 0 ... 1e\+06, not nan'),
     ],
 )
 def test_bad_pictures_are_refused_before_they_are_drawn(arguments, message):
@@ -496,15 +482,6 @@ def test_opengl_can_be_chosen_after_mujoco_was_imported(monkeypatch):
     assert before == after != ''
 
 
-def test_without_opengl_rendering_says_what_it_needs(monkeypatch):
-    monkeypatch.delenv('DISPLAY', raising=False)
-    monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
-    monkeypatch.setenv('MUJOCO_GL', 'disabled')
-    code = RENDER.format(task='FetchReach', arguments='render_mode="rgb_array"', spread=0)
-    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    assert result.stdout.startswith('rendering needs OpenGL'), result.stderr
-
-
 WITHOUT_PICTURES = """
 import os
 import fetch_hand_sim
@@ -532,22 +509,6 @@ def test_an_opengl_that_is_not_there_keeps_nothing_but_pictures(asked, monkeypat
         assert 'MUJOCO_GL=nonsense; allowed: egl' in reason[0]
     elif reason:
         assert reason[0].startswith('rendering needs OpenGL: apt install')
-
-
-def test_egl_without_a_device_leaves_the_drawing_to_osmesa(monkeypatch, tmp_path):
-    for name in ('MUJOCO_GL', 'DISPLAY', 'WAYLAND_DISPLAY'):
-        monkeypatch.delenv(name, raising=False)
-    # EGL looks for its drivers there.
-    monkeypatch.setenv('__EGL_VENDOR_LIBRARY_DIRS', str(tmp_path))
-    code = (
-        'import fetch_hand_sim.simulation.opengl as opengl\n'
-        'is_installed = opengl._is_installed\n'
-        'opengl._is_installed = lambda name: "OSMesa" in name or is_installed(name)\n'
-        'opengl._use = print\n'
-        'print(opengl.prepare_opengl())'
-    )
-    result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    assert result.stdout.splitlines() == ['osmesa', 'osmesa'], result.stderr
 
 
 RENDER_TWICE = RENDER.replace(
