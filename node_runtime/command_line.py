@@ -137,21 +137,6 @@ def two_numbers(largest: int) -> Callable[[str], tuple[int, int]]:
 picture_size = two_numbers(LARGEST_PICTURE_SIDE)
 
 
-class FormerOption(argparse.Action):
-    """An option under its former name: accepted, with a line about the new name."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> None:
-        """Print the new name and set the option."""
-        complain(parser.prog, f'{option_string} is now called --{self.dest}')
-        setattr(namespace, self.dest, values)
-
-
 def complain(name: str, text: object) -> None:
     """Print one line on stderr, after the name of the command.
 

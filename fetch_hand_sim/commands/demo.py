@@ -35,7 +35,6 @@ from node_runtime.command_line import (
     EXIT_SUCCESS,
     CommandError,
     CommandParser,
-    FormerOption,
     complain,
     require_extra,
     run_command,
@@ -284,7 +283,6 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         default='',
         help='a shipped actor, a file, random or resting; default: the shipped actor of the task',
     )
-    add('--checkpoint', dest='policy', action=FormerOption, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     try:
         task_spec(options.task)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from msgs_spec.tasks import TASKS
-from node_runtime.command_line import CommandParser, FormerOption, require_extra, run_command
+from node_runtime.command_line import CommandParser, require_extra, run_command
 
 _LOOPBACK = '127.0.0.1'
 _NAMESPACE = re.compile(r'(?:[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*)?', re.ASCII)
@@ -52,7 +52,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='one of the tasks')
     parser.add_argument('--robot', type=_namespace, default='', help='namespace of the robot')
     parser.add_argument('--policy', default='', help='policy to start with --task')
-    parser.add_argument('--checkpoint', dest='policy', action=FormerOption, help=argparse.SUPPRESS)
     parser.add_argument('--episode-dir', default='', help='log episodes of --task here')
     parser.add_argument('--port', type=int, default=0, help='default: the first free from 8080')
     parser.add_argument(
