@@ -388,26 +388,24 @@ STEP = ServiceSpec(
 STANDARD_SERVICES = (RESET, PAUSE, STEP)
 
 
-def _interface(name: str, type_name: str, description: str) -> ServiceSpec:
-    return ServiceSpec(name, f'simulation_interfaces/srv/{type_name}', description)
-
-
 # Only where the package simulation_interfaces is installed, which is not on PyPI.
-GET_FEATURES = _interface(
-    '~/get_simulator_features', 'GetSimulatorFeatures', 'Lists the features below.'
+INTERFACE_SERVICES = tuple(
+    ServiceSpec(f'~/{name}', f'simulation_interfaces/srv/{type_name}', description)
+    for name, type_name, description in (
+        ('get_simulator_features', 'GetSimulatorFeatures', 'Lists the features below.'),
+        ('get_simulation_state', 'GetSimulationState', 'Playing or paused.'),
+        ('set_simulation_state', 'SetSimulationState', 'As `~/pause`.'),
+        (
+            'reset_simulation',
+            'ResetSimulation',
+            'As `~/reset` (scope state), or begins the series again, with the `seed` as it is set '
+            'then; time is never set back.',
+        ),
+        (
+            'step_simulation',
+            'StepSimulation',
+            f'Runs the given number of ticks, 1 ... {MAX_STEPS}; while paused.',
+        ),
+    )
 )
-GET_STATE = _interface('~/get_simulation_state', 'GetSimulationState', 'Playing or paused.')
-SET_STATE = _interface('~/set_simulation_state', 'SetSimulationState', 'As `~/pause`.')
-RESET_SIMULATION = _interface(
-    '~/reset_simulation',
-    'ResetSimulation',
-    'As `~/reset` (scope state), or begins the series again, with the `seed` as it is set then; '
-    'time is never set back.',
-)
-STEP_SIMULATION = _interface(
-    '~/step_simulation',
-    'StepSimulation',
-    f'Runs the given number of ticks, 1 ... {MAX_STEPS}; while paused.',
-)
-INTERFACE_SERVICES = (GET_FEATURES, GET_STATE, SET_STATE, RESET_SIMULATION, STEP_SIMULATION)
 SERVICES = (*STANDARD_SERVICES, *INTERFACE_SERVICES)
