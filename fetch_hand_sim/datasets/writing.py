@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -49,6 +51,20 @@ def require_module(module: str) -> Any:
 
 
 @contextmanager
+def alone_in(directory: Path) -> Iterator[None]:
+    """Make a folder and lock it against other processes until the end of the block."""
+    directory.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        # Some file systems lack locks.
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
 def appearing(directory: Path, names: Iterable[str]) -> Iterator[Path]:
     """Yield a hidden folder; its entries `names` move to `directory` at the end of the block.
 
@@ -57,20 +73,14 @@ def appearing(directory: Path, names: Iterable[str]) -> Iterator[Path]:
     """
     targets = {name: directory / name for name in names}
     try:
-        directory.mkdir(parents=True, exist_ok=True)
-        _require_new(targets.values())
-        with TemporaryDirectory(prefix='.partial.', dir=directory) as hidden:
-            yield Path(hidden)
-            # Another export may have written them meanwhile.
-            _require_new(targets.values())
-            for name, target in targets.items():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                (Path(hidden) / name).rename(target)
+        with alone_in(directory):
+            for path in targets.values():
+                if path.exists():
+                    raise ExportError(f'{path} exists; nothing is overwritten')
+            with TemporaryDirectory(prefix='.partial.', dir=directory) as hidden:
+                yield Path(hidden)
+                for name, target in targets.items():
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    (Path(hidden) / name).rename(target)
     except OSError as error:
         raise ExportError(f'{directory}: {error.strerror or error}') from error
-
-
-def _require_new(paths: Iterable[Path]) -> None:
-    for path in paths:
-        if path.exists():
-            raise ExportError(f'{path} exists; nothing is overwritten')
