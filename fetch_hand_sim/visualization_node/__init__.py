@@ -1,7 +1,7 @@
 """`visualization_node`: a robot for rviz2, Foxglove and other standard tools.
 
-`transforms.py` computes the frames, `messages.py` the messages, `camera.py` the pictures. `node.py`
-is the node, a process beside the robot.
+`transforms.py` computes the frames, `messages.py` the messages and pictures. `node.py` is
+the node, a process beside the robot.
 """
 
 from __future__ import annotations

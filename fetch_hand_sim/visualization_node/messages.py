@@ -1,8 +1,8 @@
-"""Messages for standard tools: transforms, markers, pictures, numbers for plots."""
+"""Messages for standard tools: transforms, markers, numbers for plots, pictures of a camera."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from io import BytesIO
 
 import mujoco
@@ -14,7 +14,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from fetch_hand_sim.simulation.rendering import SceneRenderer
 from fetch_hand_sim.simulation.rewards import GoalMetric
+from fetch_hand_sim.simulation.scene import Frame, Scene
 from fetch_hand_sim.simulation.scene import Marker as Shape
 from fetch_hand_sim.simulation.urdf import ROOT
 from fetch_hand_sim.view.robot_watch import SeenTick
@@ -23,6 +25,7 @@ from msgs_spec.arrays import Array, Picture
 from msgs_spec.codecs import TopicCodec
 from msgs_spec.tasks import SuccessRule, TaskSpec
 from msgs_spec.topics import scalar_topics
+from node_runtime.diagnostics import Durations
 
 _GEOM = mujoco.mjtGeom
 _SHAPES = {
@@ -165,3 +168,56 @@ class Scalars:
             if number is not None:
                 found[name] = codec.encode(tick.stamp_ns, [number])
         return found
+
+
+class Camera:
+    """Pictures of one scene.
+
+    Args:
+        width: Pixels.
+        height: Pixels.
+        hz: Largest number of pictures per second of the clock; 0 for none.
+        clock: A steady clock, seconds.
+    """
+
+    def __init__(self, width: int, height: int, hz: float, clock: Callable[[], float]) -> None:
+        self.width, self.height = width, height
+        self.pictures = 0
+        self.picture_time = Durations()
+        self._hz = hz
+        self._period = 1.0 / hz if hz else np.inf
+        self._clock = clock
+        self._due = clock()
+        self._renderer: SceneRenderer | None = None
+
+    @property
+    def is_due(self) -> bool:
+        """True if it is time for the next picture."""
+        return np.isfinite(self._period) and self._clock() >= self._due
+
+    def render(self, scene: Scene, frame: Frame) -> Picture:
+        """Return a picture (height, width, 3); the first call opens OpenGL."""
+        began = self._clock()
+        self._due = max(self._due + self._period, began)
+        if self._renderer is None:
+            self._renderer = SceneRenderer(scene, self.width, self.height)
+        picture = self._renderer.render(frame)
+        self.pictures += 1
+        self.picture_time.add(self._clock() - began)
+        return picture
+
+    def problem(self) -> str:
+        """Return why pictures are fewer than requested, or ''."""
+        seconds = self.picture_time.median()
+        if seconds <= self._period:
+            return ''
+        return (
+            f'a picture takes {seconds:.2g} s, so that {1.0 / seconds:.2g} of the {self._hz:g} '
+            'pictures per second are possible; reduce camera_width and camera_height, or use a GPU'
+        )
+
+    def close(self) -> None:
+        """Free OpenGL; another scene may follow."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

@@ -11,8 +11,8 @@ from rclpy.node import Node
 from fetch_hand_sim.simulation.scene import Scene
 from fetch_hand_sim.view.robot_watch import RobotWatch, SeenTick
 from fetch_hand_sim.visualization_node import NODE_NAME
-from fetch_hand_sim.visualization_node.camera import Camera
 from fetch_hand_sim.visualization_node.messages import (
+    Camera,
     Scalars,
     camera_info,
     compressed_message,

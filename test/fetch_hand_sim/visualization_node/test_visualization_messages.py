@@ -19,8 +19,8 @@ from fetch_hand_sim.simulation.rendering import simulation_frame
 from fetch_hand_sim.simulation.scene import Scene, _dress
 from fetch_hand_sim.simulation.urdf import ROOT
 from fetch_hand_sim.view.page.ray import MousePlace, mouse_ray
-from fetch_hand_sim.visualization_node.camera import Camera
 from fetch_hand_sim.visualization_node.messages import (
+    Camera,
     camera_info,
     compressed_message,
     image_message,
@@ -187,7 +187,7 @@ def test_the_camera_has_a_rate_of_its_own(hz, due, monkeypatch):
     now = [0.0]
     camera = Camera(8, 8, hz, lambda: now[0])
     monkeypatch.setattr(
-        'fetch_hand_sim.visualization_node.camera.SceneRenderer',
+        'fetch_hand_sim.visualization_node.messages.SceneRenderer',
         lambda *_: type('R', (), {'render': lambda self, frame: None, 'close': lambda self: 0})(),
     )
     seen = []
