@@ -31,7 +31,7 @@ EXTRAS = {
     'cluster': [*ACTORS, 'matplotlib>=3.8', 'ray>=2.10'],
 }
 # `make docs`; docutils 0.23 is too new for Sphinx 9.0.
-DOCS = ['furo>=2025.12', 'myst-parser>=5', 'sphinx>=9,<10', 'sphinxcontrib-mermaid>=2']
+DOCS = ['furo>=2025.12', 'myst-parser>=5', 'sphinx>=9,<10']
 # Further packages for test/. An extra called `test` makes `colcon test` use pytest.
 TEST = [
     'colcon-core',

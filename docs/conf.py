@@ -19,7 +19,6 @@ extensions = [
     'myst_parser',
     'sphinx.ext.autodoc',
     'sphinx.ext.napoleon',
-    'sphinxcontrib.mermaid',
 ]
 html_theme = 'furo'
 html_title = project
@@ -27,8 +26,6 @@ exclude_patterns = ['benchmark/*/*.txt']
 
 # GitHub shows the same files: plain Markdown, links to headings, indented blocks are command lines.
 myst_heading_anchors = 4
-# GitHub draws these blocks as diagrams.
-myst_fence_as_directive = ['mermaid']
 highlight_language = 'text'
 
 # Docstrings name code in single backticks, and attributes of dataclasses under `Attributes:`.

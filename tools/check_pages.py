@@ -38,6 +38,8 @@ def findings(page: Path) -> Iterator[str]:
             yield f'link to {target}, which does not exist'
         if alt == '![':
             yield f'picture {target} has no alt text'
+    for address in re.findall(r'!\[[^\]]*\]\((https?:[^)]*)\)', text):
+        yield f'picture {address} is loaded from the internet'
     if 'lab_notes' not in page.parts:
         for cell in _cells(text):
             if len(cell) > _LONGEST_CELL:
