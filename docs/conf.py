@@ -22,6 +22,8 @@ extensions = [
 ]
 html_theme = 'furo'
 html_title = project
+html_static_path = ['_static']
+html_css_files = ['pages.css']
 exclude_patterns = ['benchmark/*/*.txt']
 
 # GitHub shows the same files: plain Markdown, links to headings, indented blocks are command lines.
