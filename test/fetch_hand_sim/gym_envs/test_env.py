@@ -460,6 +460,7 @@ def test_pictures_show_the_threshold_that_holds(monkeypatch):
     assert (before == env.render()).all()
 
 
+@pytest.mark.release
 def test_opengl_can_be_chosen_after_mujoco_was_imported(monkeypatch):
     monkeypatch.delenv('MUJOCO_GL', raising=False)
     choice, code = 'import os\nos.environ["MUJOCO_GL"] = "egl"\n', 'import mujoco\n'
@@ -506,6 +507,7 @@ RENDER_TWICE = RENDER.replace(
 )
 
 
+@pytest.mark.release
 def test_a_display_that_does_not_answer_is_none(monkeypatch):
     for name in ('MUJOCO_GL', 'DISPLAY', 'WAYLAND_DISPLAY'):
         monkeypatch.delenv(name, raising=False)

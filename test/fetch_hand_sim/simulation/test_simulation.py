@@ -357,7 +357,9 @@ def test_bad_goals_change_nothing(goal, message):
     assert state_of(simulation) == before
 
 
-@pytest.mark.parametrize('task', ['FetchPush', 'HandReach'])
+@pytest.mark.parametrize(
+    'task', [pytest.param('FetchPush', marks=pytest.mark.release), 'HandReach']
+)
 def test_memory_does_not_grow_with_episodes(task):
     simulation = Simulation(task, num_envs=8)
     played = actions(simulation, 2)

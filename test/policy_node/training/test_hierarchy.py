@@ -123,6 +123,7 @@ class Line:
         return SimpleNamespace(observation=self._seen(), success=success, diverged=never)
 
 
+@pytest.mark.release
 def test_both_levels_learn_a_line_together() -> None:
     """Collected through subgoals; reached with and without them at the end."""
     torch.manual_seed(0)

@@ -58,6 +58,7 @@ def on_a_line(generator: np.random.Generator, count: int) -> Transitions:
     return Transitions(state, state, goal, np.zeros((count, 4), np.float32), nothing, nothing)
 
 
+@pytest.mark.release
 def test_what_is_imagined_lies_halfway_by_value() -> None:
     learner, generator = learner_of(learning_rate=3e-3), np.random.default_rng(0)
     for _ in range(400):

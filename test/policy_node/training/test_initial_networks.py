@@ -111,6 +111,7 @@ def test_a_run_starts_from_the_mean_of_several(tmp_path: Path, block_run: Path) 
     assert steps_behind({'env_steps': 200, 'init_from': origin}) == 200 + 400 + 2 * 200
 
 
+@pytest.mark.release
 def test_a_mean_is_evaluated_and_shipped_as_it_is(tmp_path: Path, block_run: Path) -> None:
     """No update comes before `learning_starts`; the curve of the actor before it stays."""
     actors, runs = tmp_path / 'actors', [block_run, tmp_path / 'second', tmp_path / 'mean']
