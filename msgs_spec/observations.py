@@ -104,10 +104,9 @@ def achieved_goal(task: TaskSpec, readings: Readings) -> Array:
 
 
 class ObservationAssembler:
-    """Computes the dict observation of a task from its topics of one stamp.
+    """Computes the dict observation of a task from its topics of one stamp, or raises ValueError.
 
-    Args:
-        control_hz: Ticks per simulated second, from `episode_status`; ValueError if not allowed.
+    `control_hz` is in ticks per simulated second, as in `episode_status`.
     """
 
     def __init__(self, task: TaskSpec, control_hz: float) -> None:
@@ -121,9 +120,6 @@ class ObservationAssembler:
 
         Args:
             vectors: Vectors (..., topic.size) by topic, with any leading axes, such as ticks.
-
-        Raises:
-            ValueError: If a topic is missing or a value is not finite, except efforts.
         """
         for name in (spec.name for spec in self.topics):
             if name not in vectors:

@@ -249,11 +249,7 @@ def start_command(name: str, module: str, *extras: str) -> int:
 
 
 def require_extra(extra: str, *needed: str) -> None:
-    """Check that the packages of an extra are installed.
-
-    Raises:
-        UsageError: If a package is missing; the message names what to install.
-    """
+    """Raise UsageError, which names what to install, if packages of an extra are missing."""
     missing = [module for module in needed or EXTRAS[extra] if find_spec(module) is None]
     if missing:
         source = 'source a ROS 2 Jazzy installation or ' if extra == 'ros' else ''

@@ -87,9 +87,6 @@ def set_callback(
     """Return a callback for `Node.add_on_set_parameters_callback` that checks new values.
 
     Parameters of ROS itself pass.
-
-    Args:
-        makes_time: Whether the node publishes `/clock` and therefore rejects `use_sim_time`.
     """
     from rcl_interfaces.msg import SetParametersResult
 

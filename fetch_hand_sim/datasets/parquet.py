@@ -29,9 +29,6 @@ def export_parquet(by_task: ByTask, directory: Path) -> dict[str, list[Path]]:
     `action`, `command`, `reward`, `terminated`, `truncated`, `next_success`, all null in the last
     row. `<task>_episodes.parquet` has a row per episode with its metadata and result.
 
-    Returns:
-        The two files of each task.
-
     Raises:
         ExportError: If pyarrow is missing, or a file exists or cannot be written; none is created.
     """

@@ -190,7 +190,6 @@ class EpisodeRecorder:
         """Complete all files and wait for the disk.
 
         Args:
-            reason: Why the running episode, if any, is cut short.
             gives_up: Called during the wait. When it returns True, the unfinished files are left
                 for `fetch_hand_sim episodes recover`.
         """

@@ -291,13 +291,9 @@ _WITHIN = 1.0 - 1e-9
 def accept_goal(
     runner: EpisodeRunner, topic: TopicSpec, message: Any, *, reads_header: bool = True
 ) -> None:
-    """Replace the goal of the running episode from the next tick on.
+    """Replace the goal of the running episode from the next tick on, or raise ValueError.
 
-    Args:
-        reads_header: Whether frame and stamp count; robots of interface version 1 ignored both.
-
-    Raises:
-        ValueError: If the goal is rejected; the episode is unchanged.
+    Robots of interface version 1 ignored frame and stamp (`reads_header=False`).
     """
     if runner.is_between_episodes:
         raise ValueError('no episode is running')
@@ -336,13 +332,9 @@ def bounded_wrench(wrench: Array, limit: float) -> Array:
 def accept_perturbation(
     runner: EpisodeRunner, topic: TopicSpec, message: Any, limit: float
 ) -> None:
-    """Push a body of the running episode during its next tick.
+    """Push a body during the next tick of the episode, or raise ValueError.
 
-    Args:
-        limit: Largest force, N; 0 rejects all.
-
-    Raises:
-        ValueError: If the push is rejected; the episode is unchanged.
+    `limit` is the largest force, N; 0 rejects all.
     """
     if not limit:
         raise ValueError('perturbations are off; perturb_limit:=10.0 at the start allows 10 N')

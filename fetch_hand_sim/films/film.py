@@ -64,11 +64,7 @@ class Roll:
 
 
 def check_kind(path: Path) -> None:
-    """Check that a file can be written, before anything is drawn.
-
-    Raises:
-        ValueError: If the suffix is unknown, the folder does not exist, or ffmpeg is missing.
-    """
+    """Raise ValueError unless a film or picture can be written to the path."""
     kind = path.suffix.lower()
     if kind not in (*MOVING, *STILL):
         raise ValueError(

@@ -91,9 +91,6 @@ def load_recordings(
     Args:
         on_skip: Called with the error of each unreadable episode, which is left out; None raises
             that error.
-
-    Raises:
-        EpisodeReadError: If no episode is readable, or with `on_skip=None` one is not.
     """
     recordings: list[Recording] = []
     skipped: list[EpisodeReadError] = []
@@ -123,11 +120,7 @@ def none_readable(errors: Sequence[EpisodeReadError]) -> EpisodeReadError:
 
 
 def find_playable(path: Path) -> list[Path]:
-    """Return the episodes of a path, sorted by name, without reading them.
-
-    Raises:
-        EpisodeReadError: If the path holds no episode.
-    """
+    """Return the episodes of a path by name, without reading them, or raise EpisodeReadError."""
     paths = expand_episodes(path)
     if not paths:
         raise holds_no_episode(path)

@@ -38,8 +38,8 @@ def render_fps(control_hz: float) -> int | float:
 class Pictures:
     """Draws copies of a simulation; opens OpenGL or a window at the first picture.
 
-    Raises:
-        ValueError: If the size is not allowed, or the camera has no such attribute or value.
+    An invalid size (pixels) or attribute of the camera raises ValueError, missing OpenGL or, for
+    `human`, a missing display RuntimeError.
     """
 
     def __init__(
@@ -75,9 +75,6 @@ class Pictures:
 
         Returns:
             `rgb_array`: (height, width, 3). `depth_array`: (height, width), metres. `human`: None.
-
-        Raises:
-            RuntimeError: If there is no OpenGL or, for `human`, no display.
         """
         if self._scene is None:
             self._scene = Scene(self._simulation.spec.name)

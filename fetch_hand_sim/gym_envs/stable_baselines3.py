@@ -26,9 +26,6 @@ class FetchHandVecEnv(VecEnv):
 
     Args:
         **arguments: As `FetchHandVectorEnv` has them, but `autoreset_mode`.
-
-    Raises:
-        ValueError: If an argument is not allowed.
     """
 
     def __init__(self, task: str, num_envs: int = 1, **arguments: Any) -> None:
@@ -113,12 +110,7 @@ class FetchHandVecEnv(VecEnv):
         return [values[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Sets an attribute: `goal` of some environments, or one that all of them share.
-
-        Raises:
-            AttributeError: If there is no such attribute, or it cannot be set.
-            ValueError: If a shared one is set for some environments only.
-        """
+        """Set `goal` of some environments, or an attribute that all share."""
         values = list(self.batch.attributes(attr_name))
         for index in self._get_indices(indices):
             values[index] = value

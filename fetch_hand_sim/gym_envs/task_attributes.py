@@ -181,9 +181,6 @@ def goals_of_options(options: Any, mask: NDArray[np.bool_], spec: TaskSpec) -> A
 
     Returns:
         (n, goal size), of the n that start, unit quaternions; None where goals are drawn.
-
-    Raises:
-        ValueError: If the shape is another, a value is not finite or a quaternion is zero.
     """
     if not options or 'goal' not in options:
         return None

@@ -41,11 +41,6 @@ class ReplaySchedule:
         end_ns: Log time of its last message.
         period_ns: Recorded nanoseconds per tick.
         namespace: ROS namespace of the recorded robot; '' for the root.
-
-    Raises:
-        EpisodeReadError: If the file is damaged, a message does not match its type, or ROS rejects
-            the name of a topic.
-        ValueError: If the episode has no topic of a given name.
     """
 
     def __init__(self, path: Path, topics: Iterable[str] = (), with_inputs: bool = False) -> None:

@@ -30,10 +30,7 @@ class CommandBuffer:
     The robot holds after `timeout` seconds without a command; 0 means never.
 
     Attributes:
-        accepted: Valid commands so far.
-        clipped: Commands that were clipped.
         far_out: Clipped commands far out of range, probably in another unit.
-        rejected: Other commands, by reason.
         last_far_out: The value far out of range and its limits.
         last_rejection: Why the last command was rejected; empty if it was valid.
         has_fresh_command: Whether a command came since the last `take` or `start_episode`.
@@ -82,14 +79,11 @@ class CommandBuffer:
         self.has_fresh_command = False
 
     def accept(self, values: ArrayLike, answered_stamp: int | None = None) -> None:
-        """Store a whole command, in order.
+        """Store a whole command, in order, or raise ValueError and change nothing.
 
         Args:
             values: (action size,).
             answered_stamp: Stamp of the observation that it answers, nanoseconds, if known.
-
-        Raises:
-            ValueError: If its size is wrong or a value is not finite; the buffer is unchanged.
         """
         command = np.asarray(values, dtype=np.float64).ravel()
         size = self._robot.action_size
@@ -98,12 +92,7 @@ class CommandBuffer:
         self._store(command, answered_stamp)
 
     def accept_named(self, names: Sequence[str], positions: ArrayLike) -> None:
-        """Store joint positions by name, in any order; other joints keep their target.
-
-        Raises:
-            ValueError: If names and positions do not match, a name is unknown or given twice, or a
-                value is not finite; the buffer is unchanged.
-        """
+        """Store joint positions by name, or raise ValueError; other joints keep their target."""
         values = np.asarray(positions, dtype=np.float64).ravel()
         if len(names) != values.size:
             self._reject('wrong size', f'{len(names)} names but {values.size} positions given')
@@ -122,12 +111,7 @@ class CommandBuffer:
         self._store(command)
 
     def count_rejection(self, reason: str, line: str) -> None:
-        """Count a message that contains no command.
-
-        Args:
-            reason: Short, for counting: `wrong size`, `not finite`, `unknown joint`, ...
-            line: The given and the allowed values.
-        """
+        """Count a message that contains no command: a short reason, and a line with the values."""
         self.rejected[reason] += 1
         self.last_rejection = line
 

@@ -40,11 +40,8 @@ class Counters:
 
     Attributes:
         ticks: Published ticks, resets included.
-        episodes: Episodes that ran to their end.
-        successes: Episodes whose last tick was a success.
         given_up: Episodes ended by a reset.
         late_commands: Steps in real time whose command did not answer the last tick.
-        goals_set: Goals accepted from outside.
         tick_time: Wall time of a tick: command, physics, encoding, publishing, logging.
     """
 
@@ -275,12 +272,6 @@ class Receivers:
 
     The log contains every readable message, also rejected commands. Unreadable and oversized bytes
     are dropped.
-
-    Args:
-        robot: Executes commands and goals.
-        log: Records messages; None for no log.
-        on_commander: Receives the SHA-256 of the policy's checkpoint, or None.
-        warn: Receives the topic and a line about a rejected message; throttles.
     """
 
     def __init__(

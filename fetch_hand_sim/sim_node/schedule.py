@@ -65,12 +65,7 @@ class TickSchedule:
         return 1.0 / self.period if is_paced else None
 
     def wait(self, now: float, has_command: bool, lacks_answer: bool = False) -> float:
-        """Return the seconds until the next tick; infinity while paused or without a command.
-
-        Args:
-            has_command: Whether a command waits to be applied, or none is needed.
-            lacks_answer: Whether the tick may wait for an answer.
-        """
+        """Return the seconds until the next tick; infinity while paused or without a command."""
         if self.is_paused or (self.mode == 'lockstep' and not has_command):
             return math.inf
         if self.mode == 'lockstep':

@@ -168,9 +168,6 @@ def read_start(given: Any, task: Task) -> StartState:
         given: A mapping with some of `joints` and `joint_velocities`: numbers by joint name, or all
             in the order of `joint_states`, rad or m (/s); `object_pose`: (7,), m and quaternion
             wxyz, world; `object_velocity`: (6,), linear m/s and angular rad/s, world axes.
-
-    Raises:
-        ValueError: If a part is unknown or impossible; one line names it and what is allowed.
     """
     if not isinstance(given, Mapping):
         raise ValueError(f'start {one_line(given, 60)!r}; allowed: a mapping of {_listed(PARTS)}')

@@ -70,9 +70,6 @@ class SceneRenderer:
 
         Args:
             trail: Earlier positions of the object or gripper, (3,) each.
-
-        Raises:
-            RuntimeError: If the OpenGL context belongs to another thread.
         """
         self._update(frame)
         scene = self._renderer.scene

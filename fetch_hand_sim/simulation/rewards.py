@@ -69,10 +69,7 @@ class GoalMetric:
     def distances(self, achieved_goal: ArrayLike, desired_goal: ArrayLike) -> tuple[Array, Array]:
         """Return distance, m, and rotation, rad, (...) each, between goals (..., goal size).
 
-        A part that does not count for the task is zero.
-
-        Raises:
-            ValueError: If the goals have a wrong size or different shapes.
+        A part that does not count for the task is zero. Wrong sizes or shapes raise ValueError.
         """
         achieved = self._checked('achieved_goal', achieved_goal)
         desired = self._checked('desired_goal', desired_goal)

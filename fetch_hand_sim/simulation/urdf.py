@@ -62,8 +62,6 @@ class UrdfJoint:
         kind: Joint type of URDF.
         origin: Pose of the child in the parent at position 0.
         axis: (3,) in the child.
-        lower: Limit, rad or m.
-        upper: Limit, rad or m.
     """
 
     name: str

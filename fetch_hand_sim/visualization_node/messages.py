@@ -171,14 +171,7 @@ class Scalars:
 
 
 class Camera:
-    """Pictures of one scene.
-
-    Args:
-        width: Pixels.
-        height: Pixels.
-        hz: Largest number of pictures per second of the clock; 0 for none.
-        clock: A steady clock, seconds.
-    """
+    """Pictures of one scene, `width` x `height` pixels, at most `hz` per second; 0 for none."""
 
     def __init__(self, width: int, height: int, hz: float, clock: Callable[[], float]) -> None:
         self.width, self.height = width, height

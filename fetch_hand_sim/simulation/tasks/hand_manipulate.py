@@ -65,7 +65,6 @@ class ManipulateConfig:
     """Differences between the manipulation tasks.
 
     Attributes:
-        asset: MJCF file.
         target_rotation: Rotations of goals: about z, about z on any face, or any.
         randomizes_rotation: Whether the object starts with a random rotation.
     """
@@ -129,10 +128,7 @@ class HandManipulateTask(HandTask):
         """Drop the object on the palm until it stays there, then draw goals.
 
         A failed or diverged attempt is repeated with the same controls and warm start, as in the
-        reference.
-
-        Raises:
-            RuntimeError: If the object never stays, for example in a changed model.
+        reference. An object that never stays, as in a changed model, raises RuntimeError.
         """
         self.batch.state[ids] = self.start_state
         generator_of = dict(zip(ids.tolist(), generators, strict=True))

@@ -265,15 +265,12 @@ class Task(ABC):
         return self._outputs[name]
 
     def add_sensor(self, name: str, function: Callable[[], Array]) -> None:
-        """Set the function that measures a topic.
+        """Set the function that measures a topic, or raise ValueError for another name.
 
         Args:
             name: One of `msgs_spec.topics.sensor_topics`.
             function: Returns the present vectors (N, topic.size) in a new array. A method of the
                 task does not keep the task alive.
-
-        Raises:
-            ValueError: If the task has no such topic; the message lists all.
         """
         allowed = [topic.name for topic in sensor_topics(self.spec)]
         if name not in allowed:
