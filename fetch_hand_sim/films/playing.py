@@ -155,7 +155,7 @@ def _act(policy: Any) -> Callable[[Any], Any]:
 
         def predict(observation: Any) -> Any:
             nonlocal state
-            # A policy without memory may take only the observation.
+            # A policy without memory may take no state.
             memory = {} if state is None else {'state': state}
             action, state = policy.predict(observation, **memory, deterministic=True)
             return action

@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 
 from msgs_spec.tasks import TASKS, TaskSpec, substeps_per_tick, task_spec
 from msgs_spec.text import one_line
-from policy_node.policies.files import parse_tensors, read_file, sha256, tensor_bytes, write_file
+from policy_node.policies.files import (
+    LARGEST_HEADER,
+    parse_tensors,
+    read_file,
+    sha256,
+    tensor_bytes,
+    write_file,
+)
 from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.policy import LoadedPolicy, Policy
@@ -184,6 +191,8 @@ def parse_metadata(metadata: dict[str, str], path: str | Path) -> ActorInfo:
         ValueError: If they have another version or do not fit a task. `path` names the file.
     """
     _check_format(path, metadata)
+    if sum(map(len, metadata.values())) > LARGEST_HEADER:
+        raise ValueError(f'{path} has more than {LARGEST_HEADER} characters of metadata')
     # Older files lack these fields.
     metadata = {'goal_features': '"plain"', 'init_from': '{}', 'past_actions': '0', **metadata}
     fields = {field.name: field.type for field in dataclasses.fields(ActorInfo)}
@@ -225,7 +234,7 @@ def _check_sizes(path: str | Path, info: ActorInfo) -> None:
         raise ValueError(f'{path} has {one_line(error)}') from None
     if not 0 <= info.past_actions <= MOST_PAST_ACTIONS:
         raise ValueError(
-            f'{path} has past_actions {info.past_actions}; allowed: 0 ... {MOST_PAST_ACTIONS}'
+            f'{path} has past_actions {info.past_actions!s:.80}; allowed: 0 ... {MOST_PAST_ACTIONS}'
         )
     if len(info.hidden_sizes) > MOST_LAYERS:
         raise ValueError(
@@ -248,7 +257,7 @@ def _check_tensors(
             given, allowed = found.get(name, 'none'), wanted.get(name, 'none')
             raise ValueError(
                 f'{path} has tensor {one_line(name, 80)} {given!s:.80}; '
-                f'its metadata require {allowed}'
+                f'its metadata require {allowed!s:.80}'
             )
     for name, values in tensors.items():
         if values.dtype != np.float32:

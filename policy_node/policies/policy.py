@@ -74,7 +74,8 @@ class LoadedPolicy:
     ) -> tuple[NDArray[Any], Any]:
         """Return actions and state as `Policy.predict` does.
 
-        A policy without memory may take only the observation, and may return only the action.
+        A policy without memory may take only `observation` and `deterministic`, and may return
+        only the action.
 
         Raises:
             PolicyError: If the policy fails, or returns anything but finite numbers of the right

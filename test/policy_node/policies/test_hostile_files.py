@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from policy_node.policies.checkpoint import parse_metadata
 from policy_node.policies.loading import load_policy
 from support import peak_memory, reset_peak_memory
 from support.fresh_actor import fresh_actor
@@ -17,6 +18,7 @@ from support.fresh_actor import fresh_actor
 VALUES = [
     *('null', 'true', '-1', '0', '1e999', 'NaN', '""', '[]', '{}', '[[]]', '[-1]', '[null]'),
     *('[1e999]', '[40000, 40000]', '"FetchPush"', '"\\u001b[31m"', '[' * 50_000, '9' * 5_000),
+    *('9' * 4_000, '[' + '9' * 4_000 + ']'),
     *('{"a": ' * 20_000, '"' + 'x' * 100_000 + '"', '[1.5]', '[true]', '12.5', '[["a", -1]]', ''),
 ]
 
@@ -112,3 +114,11 @@ def test_damaged_and_crafted_onnx_files(actor, tmp_path, hostile_count) -> None:
             path.write_bytes(model.SerializeToString())
         outcomes.append(outcome(path))
     assert 'refused' in outcomes
+
+
+def test_actor_files_of_every_format_have_little_metadata(actor) -> None:
+    metadata = split(actor)[0]['__metadata__']
+    parse_metadata(metadata, 'a.onnx')
+    large = '{"a": [' + '{},' * 400_000 + '{}]}'
+    with pytest.raises(ValueError, match='1048576 characters'):
+        parse_metadata({**metadata, 'config': large}, 'a.onnx')
