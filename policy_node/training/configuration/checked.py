@@ -94,7 +94,7 @@ def require_within(name: str, value: Any, kind: Any) -> None:
     """
     choices, limits = choices_of(kind), range_of(kind)
     if choices and value not in choices:
-        raise ValueError(f'{name} {value!r}; allowed: {", ".join(choices)}')
+        raise ValueError(f'{name} {value!r:.80}; allowed: {", ".join(choices)}')
     if plain_type(kind) is int and abs(value) > LARGEST:
         raise ValueError(f'{name} is too large; allowed: up to {LARGEST}')
     if plain_type(kind) is float and not math.isfinite(value):
@@ -121,7 +121,7 @@ def typed(name: str, value: Any, kind: Any) -> Any:
     if plain is float and type(value) is int and abs(value) <= LARGEST:
         return float(value)
     if type(value) is not plain:
-        raise ValueError(f'{name} {value!r} is not of type {type_name(plain)}')
+        raise ValueError(f'{name} {value!r:.80} is not of type {type_name(plain)}')
     return value
 
 

@@ -214,6 +214,10 @@ class TrainConfig(Checked):
 MOST_UNITS = 65_536
 # Noise of this standard deviation leaves next to nothing of actions in [-1, 1].
 _NOISE_ALONE = 10.0
+# Adam moves a weight by at most about the learning rate; float32 loses smaller sums.
+_NO_CHANGE = 1e-7
+# What keeps a larger share of its first value has not moved.
+_KEPT = 0.99
 
 # Sources of goals. `real` keeps the goal of the episode.
 STRATEGIES = ('future', 'final', 'episode', 'random')
@@ -240,46 +244,67 @@ def unusual_networks(config: TrainConfig) -> list[str]:
     return found
 
 
-def idle_parts(config: TrainConfig) -> Iterator[str]:
+def idle_parts(config: TrainConfig, critic_first: int = 0) -> Iterator[str]:
     """Yield a line for each part of learning that never happens with these values.
 
     Three questions: will any update happen, will the targets ever move, will the policy ever act?
+
+    Args:
+        config: Configuration of the whole run.
+        critic_first: Updates before the actor learns, where the run has more than its field.
     """
-    learner, total = config.learner, config.run.total_steps
-    updates = _updates_of(config)
-    if updates == 0 or learner.learning_rate == 0:
+    learner, total, cycle = config.learner, config.run.total_steps, _cycle_steps(config)
+    cycles = -(-total // cycle)
+    updates = _updates_of(config, cycles)
+    first = max(learner.critic_first, critic_first)
+    delay = learner.policy_delay if isinstance(learner, OffPolicy) else 1
+    if learner.learning_rate * updates < _NO_CHANGE:
         yield (
             f'nothing will be learnt: {updates} updates with learning_starts '
             f'{config.replay.learning_starts}, updates_per_cycle {learner.updates_per_cycle}, '
             f'learning_rate {learner.learning_rate:g}, total_steps {total}'
         )
-    elif learner.critic_first >= updates:
-        yield f'the actor will not learn: critic_first {learner.critic_first} of {updates} updates'
-    if not isinstance(learner, OffPolicy):
-        return
-    interval = learner.target_update_interval
-    if learner.target == 'polyak' and updates and (learner.polyak == 1 or interval > updates):
+    elif -(-first // delay) * delay >= updates:
         yield (
-            f'the targets will not move: polyak {learner.polyak:g}, target_update_interval '
-            f'{interval} of {updates} updates'
+            f'the actor will not learn: critic_first {first}, policy_delay {delay} '
+            f'of {updates} updates'
         )
+    elif learner.actor_average**cycles > _KEPT:
+        yield (
+            f'the evaluated actor will not move: actor_average {learner.actor_average:g} '
+            f'over {cycles} cycles'
+        )
+    if isinstance(learner, OffPolicy) and learner.target == 'polyak' and updates:
+        interval = learner.target_update_interval
+        if learner.polyak ** (updates // interval) > _KEPT:
+            yield (
+                f'the targets will not move: polyak {learner.polyak:g}, target_update_interval '
+                f'{interval} of {updates} updates'
+            )
     noise = learner.exploration
-    constant = noise.final_exploration == 1 and noise.random_epsilon == 1
-    if noise.random_steps >= total or constant or noise.noise_std >= _NOISE_ALONE:
+    epsilon, spread = (
+        noise.final_exploration * each for each in (noise.random_epsilon, noise.noise_std)
+    )
+    if noise.random_steps > (cycles - 1) * cycle or epsilon > _KEPT or spread >= _NOISE_ALONE:
         yield (
             f'the policy will not act while it collects: random_steps {noise.random_steps} of '
             f'{total}, random_epsilon {noise.random_epsilon:g}, noise_std {noise.noise_std:g}'
         )
 
 
-def _updates_of(config: TrainConfig) -> int:
+def _cycle_steps(config: TrainConfig) -> int:
+    """Return the environment steps of a cycle."""
+    spec = task_spec(config.task, control_hz=config.collect.control_hz)
+    return config.collect.num_envs * spec.episode_ticks
+
+
+def _updates_of(config: TrainConfig, cycles: int) -> int:
     """Return the number of updates of a whole run; time limits and resumed runs apart."""
-    ticks = task_spec(config.task, control_hz=config.collect.control_hz).episode_ticks
-    cycle = config.collect.num_envs * ticks
+    cycle = _cycle_steps(config)
     # The replay holds whole episodes, at least those of one cycle.
     start = min(config.replay.learning_starts, max(config.replay.replay_transitions, cycle))
     waiting = max(-(-start // cycle) - 1, 0)
-    return max(-(-config.run.total_steps // cycle) - waiting, 0) * config.learner.updates_per_cycle
+    return max(cycles - waiting, 0) * config.learner.updates_per_cycle
 
 
 def _require_goals(config: TrainConfig) -> None:

@@ -257,7 +257,8 @@ def _prepare_folder(trainer: AnyTrainer, output: Path, command: str, resume: boo
         # One line for each part of the run.
         with (output / COMMAND_FILE).open('a' if resume else 'w') as file:
             file.write(command + '\n')
-    for line in idle_parts(trainer.config):
+    first = trainer.learner.critic_first if isinstance(trainer, Trainer) else 0
+    for line in idle_parts(trainer.config, first):
         complain(NAME, line)
 
 

@@ -226,11 +226,17 @@ def test_bad_values_are_refused(changes: dict[str, object], match: str) -> None:
         ({'learning_starts': 100_000}, ['nothing']),
         ({'updates_per_cycle': 0}, ['nothing']),
         ({'learning_rate': 0.0}, ['nothing']),
-        ({'critic_first': 10_000}, ['actor']),
+        ({'critic_first': 10_000}, ['the actor']),
+        ({'learning_rate': 1e-30}, ['nothing']),
+        ({'critic_first': 1401, 'policy_delay': 700}, ['the actor']),
+        ({'actor_average': 1 - 1e-6}, ['evaluated']),
         ({'polyak': 1.0}, ['targets']),
+        ({'polyak': 1 - 1e-9}, ['targets']),
         ({'target_update_interval': 10**9}, ['targets']),
-        ({'random_steps': 40_000}, ['policy']),
-        ({'noise_std': 1e9}, ['policy']),
+        ({'random_steps': 40_000}, ['policy will']),
+        ({'random_steps': 39_000}, ['policy will']),
+        ({'noise_std': 1e9}, ['policy will']),
+        ({**PPO, 'noise_std': 1e9}, ['policy will']),
         ({**PPO, 'learning_starts': 100_000}, ['nothing']),
     ],
 )
@@ -239,7 +245,9 @@ def test_idle_parts_of_learning_are_named_in_a_line(
 ) -> None:
     lines = [*idle_parts(recipe_config('FetchReach', 'best', **changes))]
     assert [
-        word for word in ('nothing', 'actor', 'targets', 'policy') if word in str(lines)
+        word
+        for word in ('nothing', 'the actor', 'evaluated', 'targets', 'policy will')
+        if word in str(lines)
     ] == idle
     assert len(lines) == len(idle)
 
