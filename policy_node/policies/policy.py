@@ -54,7 +54,7 @@ class LoadedPolicy:
         task: Name of the task.
         description: Format and file name, for logs and errors.
         control_hz: Action frequency of its training, Hz; None if any frequency is allowed.
-        sha256: SHA-256 of its file; empty without a file.
+        sha256: SHA-256 of its file, or files one after the other; empty without a file.
         is_bounded: Whether actions outside [-1, 1] are errors.
     """
 

@@ -2,14 +2,16 @@
 
 **Such a file contains pickles, and loading it can run code**: load only files of authors you trust.
 It contains neither task nor action frequency, so only sizes are checked. A model that was trained
-under `VecNormalize` needs its statistics in `vecnormalize.pkl` beside it.
+under `VecNormalize` needs the file of its statistics beside it.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import logging
 import pickle
+import re
 import zipfile
 from importlib import import_module
 from pathlib import Path
@@ -40,8 +42,9 @@ _WITHOUT_TRAINING: dict[str, Any] = {
 }
 # Networks of the paper's size have 10 MB with optimisers.
 _LARGEST_FILE = 256 * 2**20
-# Statistics of `VecNormalize` beside a model, as rl-zoo3 names them.
-_STATISTICS = 'vecnormalize.pkl'
+# Statistics of `VecNormalize` beside a model, as rl-zoo3 and the documentation of
+# Stable-Baselines3 name them.
+_STATISTICS = ('vecnormalize.pkl', 'vec_normalize.pkl')
 
 
 class StableBaselines3Policy:
@@ -85,10 +88,16 @@ def load_stable_baselines3(path: Path, task: str) -> LoadedPolicy:
         # Unpickling a file of another version can raise anything.
         raise ValueError(f'{path} cannot be loaded: {one_line(error)}') from None
     _check_sizes(path, task_spec(task), model.policy)
-    file = path.with_name(_STATISTICS)
-    statistics, ending = (
-        (_statistics(file), f' with {_STATISTICS}') if file.is_file() else (None, '')
-    )
+    statistics, ending = None, ''
+    if file := _statistics_file(path):
+        data += read_file(file)
+        statistics, ending = _statistics(file), f' with {file.name}'
+    else:
+        logging.getLogger(__name__).warning(
+            '%s has no %s beside it: if it was trained under VecNormalize, its actions are wrong',
+            path,
+            _STATISTICS[0],
+        )
     return LoadedPolicy(
         policy=StableBaselines3Policy(model.policy, statistics),
         task=task,
@@ -97,15 +106,25 @@ def load_stable_baselines3(path: Path, task: str) -> LoadedPolicy:
     )
 
 
+def _statistics_file(path: Path) -> Path | None:
+    """Return the file of `VecNormalize` beside a model, or None.
+
+    `CheckpointCallback` writes `a_vecnormalize_9_steps.pkl` for `a_9_steps.zip`.
+    """
+    of_checkpoint = re.sub(r'(\d+_steps)$', r'vecnormalize_\1', path.stem)
+    names = (f'{of_checkpoint}.pkl', f'{path.stem}_vecnormalize.pkl', *_STATISTICS)
+    files = [path.with_name(name) for name in names]
+    return next((file for file in files if file.is_file() and file.stem != path.stem), None)
+
+
 def _statistics(file: Path) -> Any:
     """Load the `VecNormalize` of a training; this can run code in its file."""
     try:
         statistics = pickle.loads(read_file(file))
-        is_right = type(statistics).__name__ == 'VecNormalize' and statistics.obs_rms is not None
     except Exception as error:
         # Unpickling a file of another version can raise anything.
         raise ValueError(f'{file} cannot be loaded: {one_line(error)}') from None
-    if not is_right:
+    if type(statistics).__name__ != 'VecNormalize':
         raise ValueError(f'{file} contains {type(statistics).__name__}; allowed: VecNormalize')
     return statistics
 

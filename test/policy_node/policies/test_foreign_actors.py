@@ -227,7 +227,7 @@ def test_stable_baselines3_model_answers_as_it_does_there(algorithm, tmp_path):
         load_policy(path, trust=True)
 
 
-def test_a_model_acts_with_the_statistics_beside_it(tmp_path):
+def test_a_model_acts_with_the_statistics_beside_it(tmp_path, caplog):
     library = pytest.importorskip('stable_baselines3')
     vec_env = pytest.importorskip('stable_baselines3.common.vec_env')
     env = vec_env.DummyVecEnv([lambda: gymnasium.make('fetch_hand_sim/FetchReach-v0')])
@@ -236,18 +236,32 @@ def test_a_model_acts_with_the_statistics_beside_it(tmp_path):
         'MultiInputPolicy', env, n_steps=64, policy_kwargs={'net_arch': [8]}, seed=1
     )
     model.learn(64)
-    path = tmp_path / 'model.zip'
+    path = tmp_path / 'model_64_steps.zip'
     model.save(path)
     observation = observations(REACH)
     plain = load_policy(path, 'FetchReach', trust=True)
-    env.save(tmp_path / 'vecnormalize.pkl')
-    found = load_policy(path, 'FetchReach', trust=True)
+    assert 'model_64_steps.zip has no vecnormalize.pkl' in caplog.text
+    caplog.clear()
     wanted, _ = model.predict(env.normalize_obs(observation), deterministic=True)
-    assert found.predict(observation)[0].tolist() == wanted.tolist()
     assert plain.predict(observation)[0].tolist() != wanted.tolist()
-    assert found.description.endswith('model.zip with vecnormalize.pkl')
-    (tmp_path / 'vecnormalize.pkl').write_bytes(pickle.dumps([1]))
-    with pytest.raises(ValueError, match=r'vecnormalize.pkl contains list'):
+    for name in (
+        'vec_normalize.pkl',
+        'vecnormalize.pkl',
+        'model_64_steps_vecnormalize.pkl',
+        'model_vecnormalize_64_steps.pkl',
+    ):
+        env.save(tmp_path / name)
+        found = load_policy(path, 'FetchReach', trust=True)
+        assert found.predict(observation)[0].tolist() == wanted.tolist()
+        assert found.description.endswith(f'model_64_steps.zip with {name}')
+        assert found.sha256 != plain.sha256
+    assert not caplog.text
+    statistics = tmp_path / name
+    vec_env.VecNormalize(env.venv, norm_obs=False).save(statistics)
+    found = load_policy(path, 'FetchReach', trust=True)
+    assert found.predict(observation)[0].tolist() == plain.predict(observation)[0].tolist()
+    statistics.write_bytes(pickle.dumps([1]))
+    with pytest.raises(ValueError, match=f'{name} contains list'):
         load_policy(path, 'FetchReach', trust=True)
 
 
