@@ -285,7 +285,9 @@ def validate(spec: ParameterSpec, value: object) -> None:
         if spec.type == 'string' and not spec.choices and isinstance(value, (int, float)):
             # ROS reads values as YAML, where 2026 is a number and off is false.
             hint = f'; a number or off is text in two pairs of quotes: "{spec.name}:=\'2026\'"'
-        raise ValueError(f'{spec.name}: {value!r} given; allowed: {spec.allowed}{hint}')
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        kind = 'a number, ' if spec.type == 'double' and not is_number else ''
+        raise ValueError(f'{spec.name}: {value!r:.80} given; allowed: {kind}{spec.allowed}{hint}')
 
 
 def _is_allowed(spec: ParameterSpec, value: object) -> bool:

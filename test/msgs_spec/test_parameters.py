@@ -62,8 +62,12 @@ def test_allowed_values_pass(name, value):
         ('sim.real_time_factor', -0.1, 'factor: -0.1 given; allowed: 0 or 0.01 ... 1000'),
         ('sim.real_time_factor', 0.005, 'factor: 0.005 given; allowed: 0 or 0.01 ... 1000'),
         ('sim.real_time_factor', math.nan, 'factor: nan given; allowed: 0 or 0.01 ... 1000'),
-        ('sim.real_time_factor', '2', "real_time_factor: '2' given; allowed: 0 or 0.01 ... 1000"),
-        ('sim.command_timeout', True, 'command_timeout: True given; allowed: 0 ... 3600'),
+        (
+            'sim.real_time_factor',
+            '2',
+            "real_time_factor: '2' given; allowed: a number, 0 or 0.01 ... 1000",
+        ),
+        ('sim.command_timeout', True, 'command_timeout: True given; allowed: a number, 0 ... 3600'),
         ('sim.joint_prefix', 'x' * 65, 'given; allowed: text of up to 64 characters$'),
         ('sim.episode_dir', 1, '1 given; allowed: text; .*: "episode_dir:=\'2026\'"$'),
         ('sim.wait_for_commands', 1, 'wait_for_commands: 1 given; allowed: true, false'),
@@ -232,7 +236,7 @@ def test_new_values_are_checked_while_the_node_runs(make_node):
     assert put('real_time_factor', 0.5) == (True, '')
     assert put('real_time_factor', 'fast') == (
         False,
-        "real_time_factor: 'fast' given; allowed: 0 or 0.01 ... 1000",
+        "real_time_factor: 'fast' given; allowed: a number, 0 or 0.01 ... 1000",
     )
     assert node.get_parameter('real_time_factor').value == 0.5
     assert put('task', 'FetchPush') == (False, 'Trying to set a read-only parameter: task.')
