@@ -50,6 +50,10 @@ _PAGE_START = (
 )
 
 
+# The page shows this to its first visitor. A text of equal length keeps the program valid.
+_ROLE, _READ_ONLY_ROLE = b'\0Controlling\0', b'\0Watching\0\0\0\0'
+
+
 class Attendance:
     """Records whether a visitor is at the page in control; any thread may call it.
 
@@ -181,12 +185,15 @@ def _is_same_origin(origins: Sequence[str], host: str) -> bool:
         return False
 
 
-def guarded_serve(guard: Guard, attendance: Attendance) -> Callable[..., Any]:
+def guarded_serve(
+    guard: Guard, attendance: Attendance, is_read_only: bool = False
+) -> Callable[..., Any]:
     """Return a replacement of `websockets.serve` that checks each request.
 
     Args:
         guard: Accepts or rejects requests.
         attendance: Records input and departure of the visitor in control.
+        is_read_only: Whether visitors can only watch.
     """
 
     def guarded(handler: Any, **options: Any) -> Any:
@@ -211,8 +218,7 @@ def guarded_serve(guard: Guard, attendance: Attendance) -> Callable[..., Any]:
                     del changed.headers[name]
             for name, value in _CLOSING_HEADERS.items():
                 changed.headers[name] = value
-            if changed.headers.get('Content-Type', '').startswith('text/html'):
-                _name_language(changed)
+            _adapt(changed, is_read_only)
             return changed
 
         attended = _attended(handler, attendance)
@@ -221,11 +227,16 @@ def guarded_serve(guard: Guard, attendance: Attendance) -> Callable[..., Any]:
     return guarded
 
 
-def _name_language(response: Response) -> None:
-    """Add the language and the viewport to the page."""
-    response.body = bytes(response.body or b'').replace(*_PAGE_START, 1)
-    del response.headers['Content-Length']
-    response.headers['Content-Length'] = str(len(response.body))
+def _adapt(response: Response, is_read_only: bool) -> None:
+    """Add language and viewport to the page; a page that can only watch says so."""
+    content = response.headers.get('Content-Type', '')
+    body = bytes(response.body or b'')
+    if content.startswith('text/html'):
+        response.body = body.replace(*_PAGE_START, 1)
+        del response.headers['Content-Length']
+        response.headers['Content-Length'] = str(len(response.body))
+    elif is_read_only and content == 'application/wasm':
+        response.body = body.replace(_ROLE, _READ_ONLY_ROLE)
 
 
 def _attended(handler: Any, attendance: Attendance) -> Callable[[Any], Awaitable[None]]:

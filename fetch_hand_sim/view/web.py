@@ -15,6 +15,7 @@ import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 from mujoco.studio import (
     endpoints,
@@ -207,7 +208,8 @@ def open_page(
     port = listening.getsockname()[1]
     guard = Guard(None if is_loopback(host) else new_token(), port)
     address = Address(host, port, guard.token, is_read_only)
-    _replace_server(listening, guard, attendance or Attendance())
+    attendance = attendance or Attendance()
+    _replace_server(listening, guarded_serve(guard, attendance, is_read_only))
     viewer_plugins, sim_plugins = plugin.split_plugins(plugins)
 
     def run(endpoint: endpoints.ViewerEndpoint) -> None:
@@ -226,14 +228,14 @@ def open_page(
     return handle, address
 
 
-def _replace_server(listening: socket.socket, guard: Guard, attendance: Attendance) -> None:
-    """Make the viewer use our socket and our guard.
+def _replace_server(listening: socket.socket, serve: Callable[..., Any]) -> None:
+    """Make the viewer use our socket and our guarded `serve`.
 
     MuJoCo 4.0 has no option for these: the viewer always binds all interfaces, calls
     `websockets.serve` itself and prints its own address.
     """
     web_server.bind_public_socket = lambda *_: listening
-    web_server.serve = guarded_serve(guard, attendance)
+    web_server.serve = serve
     web_viewer._print_url_banner = lambda *_: None
     logging.getLogger('WebServer').setLevel(logging.WARNING)
     logging.getLogger('asyncio').addFilter(is_no_farewell)

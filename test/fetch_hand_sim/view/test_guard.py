@@ -165,7 +165,8 @@ def test_loopback_is_told_from_the_rest():
 
 @pytest.fixture(scope='module')
 def address():
-    handle, address = open_page('127.0.0.1', 0, [Page(), Requests(lambda request: None)])
+    plugins = [Page(), Requests(lambda request: None)]
+    handle, address = open_page('127.0.0.1', 0, plugins, is_read_only=True)
     yield address
     handle.close()
 
@@ -187,6 +188,11 @@ def test_server_gives_the_page_and_opens_it_to_no_other_site(address):
     page = get(address, '/').read().decode()
     assert '<html lang="en">' in page and 'name="viewport"' in page and '</html>' in page
     assert get(address, '/drop').status == 403
+
+
+def test_a_page_that_can_only_watch_does_not_call_its_visitor_controlling(address):
+    program = get(address, '/web_client.wasm').read()
+    assert b'\0Watching\0' in program and b'Controlling' not in program
 
 
 def test_server_refuses_web_sockets_of_other_sites(address):
