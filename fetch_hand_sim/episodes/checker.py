@@ -23,6 +23,7 @@ from fetch_hand_sim.episode_log import (
 from fetch_hand_sim.episode_log.bag import offered_qos_text
 from fetch_hand_sim.episode_log.metadata import RECOVERED
 from fetch_hand_sim.episode_log.reader import LoggedTick, logged_topics, split_ticks
+from fetch_hand_sim.episodes.command_buffer import CommandBuffer
 from fetch_hand_sim.episodes.recorder import (
     episode_result,
     former_model_sha256,
@@ -43,6 +44,7 @@ from node_runtime.command_line import source_revision
 _LONGEST = 80
 # Keys of the record `episode` that name software; another value is a change, not a difference.
 _SOFTWARE = ('interface_version', 'model_sha256', 'source_revision')
+_COMMANDS = {'commands', 'joint_commands'}
 # Keys of the record `episode_result` that do not follow from the simulation.
 _NOT_SIMULATED = {'reason', 'received_not_logged', 'late_commands'}
 
@@ -251,6 +253,7 @@ def _compare(
     """Simulate the episode and note in `result` how far it equals the recorded one."""
     encoder = TickEncoder(runner.spec)
     is_recovered = episode.outcome.reason == RECOVERED
+    received = _Received(runner, episode, record)
     for number, logged in enumerate(ticks):
         command = _applied_command(logged) if number else runner.resting_command()
         if command is None:
@@ -273,6 +276,9 @@ def _compare(
             result.difference = _difference(
                 number, logged.stamp_ns, 'metadata variation', drawn, tick.status.variation
             )
+        else:
+            result.difference = received.difference(number, logged, command)
+        if result.difference is not None:
             return
         if record.interface_version == 1 and 'fingertip_poses' in tick.readings:
             tick = _without_orientations(tick)
@@ -286,7 +292,7 @@ def _compare(
             return
         result.ticks += 1
         result.messages += len(logged.published)
-        _take_received(runner, logged, record)
+        received.take(logged)
     result.difference = _result_difference(ticks[-1], tick.status, runner, episode)
 
 
@@ -332,17 +338,46 @@ def _applied_command(logged: LoggedTick) -> Array | None:
     return decode(message.topic, deserialize(message.topic.type_name, message.data))
 
 
-def _take_received(runner: EpisodeRunner, logged: LoggedTick, record: EpisodeRecord) -> None:
-    """Apply the received goals and pushes as the node did."""
-    for message in logged.received:
-        if message.topic.name == 'set_goal':
+class _Received:
+    """The commands, goals and pushes that the robot received, taken as the node takes them."""
+
+    def __init__(self, runner: EpisodeRunner, episode: Episode, record: EpisodeRecord) -> None:
+        self._runner = runner
+        self._record = record
+        self._commands = CommandBuffer(runner.spec.robot, timeout=0.0)
+        outcome = episode.outcome
+        is_recovered = outcome.reason == RECOVERED
+        self._lacks_commands = is_recovered or bool(_COMMANDS & outcome.received_not_logged.keys())
+
+    def difference(self, number: int, logged: LoggedTick, command: Array) -> Difference | None:
+        """Compare the applied command of a tick with the last valid one received before it."""
+        if not number:
+            self._commands.start_episode(self._runner.resting_command())
+        if self._lacks_commands or not self._commands.has_fresh_command:
+            return None
+        received = self._commands.take()
+        if np.array_equal(command, received):
+            return None
+        return _difference(
+            number, logged.stamp_ns, 'applied_command', command, f'{received} received'
+        )
+
+    def take(self, logged: LoggedTick) -> None:
+        """Take the messages received after a tick."""
+        for each in logged.received:
             with suppress(ValueError):
-                goal = deserialize(message.topic.type_name, message.data)
-                accept_goal(runner, message.topic, goal, reads_header=record.interface_version >= 2)
-        elif message.topic.name == 'perturb':
-            with suppress(ValueError):
-                push = deserialize(message.topic.type_name, message.data)
-                accept_perturbation(runner, message.topic, push, record.perturb_limit)
+                message = deserialize(each.topic.type_name, each.data)
+                match each.topic.name:
+                    case 'commands':
+                        self._commands.accept(message.data)
+                    case 'joint_commands':
+                        self._commands.accept_named(message.name, message.position)
+                    case 'set_goal':
+                        reads_header = self._record.interface_version >= 2
+                        accept_goal(self._runner, each.topic, message, reads_header=reads_header)
+                    case 'perturb':
+                        limit = self._record.perturb_limit
+                        accept_perturbation(self._runner, each.topic, message, limit)
 
 
 def _tick_difference(

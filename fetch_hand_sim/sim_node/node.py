@@ -17,10 +17,10 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
 from fetch_hand_sim.episode_log import EpisodeLogError, find_leftovers
+from fetch_hand_sim.episodes.command_buffer import CommandBuffer
 from fetch_hand_sim.episodes.recorder import EpisodeRecorder, LoggedEpisode, RecordingContext
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.sim_node import NODE_NAME
-from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.graph_watch import GraphWatch
 from fetch_hand_sim.sim_node.health import WAITING_PERIOD, Reporter
 from fetch_hand_sim.sim_node.robot import Messages, Receivers, Robot

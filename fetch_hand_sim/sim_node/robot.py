@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
+from fetch_hand_sim.episodes.command_buffer import CommandBuffer
 from fetch_hand_sim.episodes.runner import EpisodeRunner, accept_goal, accept_perturbation
-from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from msgs_spec.codecs import answered_stamp, decode_status
 from msgs_spec.schemas import deserialize, require_short, serialize

@@ -16,8 +16,8 @@ from std_srvs.srv import Trigger
 
 from fetch_hand_sim.episode_log import read_summary
 from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.command_buffer import CommandBuffer
 from fetch_hand_sim.episodes.runner import EpisodeRunner
-from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import decode_status, message_stamp
 from msgs_spec.schemas import deserialize

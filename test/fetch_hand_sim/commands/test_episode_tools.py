@@ -183,6 +183,16 @@ def test_check_detects_a_changed_command(reach, tmp_path):
     assert difference is not None and difference.tick == 20
 
 
+def test_check_compares_applied_commands_with_received_ones(tmp_path):
+    """The physics of FetchReach ignores the gripper, the last value."""
+    path = Recorder('FetchReach').record(EpisodeDirectory(tmp_path))
+    assert EpisodeChecker().check(path).difference is None
+    changed = rewrite(path, tmp_path / 'changed', flip('applied_command', 20, -3))
+    difference = EpisodeChecker().check(changed).difference
+    assert difference is not None
+    assert (difference.tick, difference.field) == (20, 'applied_command')
+
+
 @pytest.mark.parametrize(
     ('change', 'field'),
     [

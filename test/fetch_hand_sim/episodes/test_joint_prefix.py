@@ -9,10 +9,10 @@ import pytest
 
 from fetch_hand_sim.episode_log import EpisodeDirectory, load_episodes, read_episode
 from fetch_hand_sim.episodes.checker import EpisodeChecker
+from fetch_hand_sim.episodes.command_buffer import CommandBuffer
 from fetch_hand_sim.episodes.recorder import RecordingContext
 from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.films.recording import load_recording
-from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.codecs import decode_status
 from msgs_spec.robots import JOINT_PREFIX

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from fetch_hand_sim.episodes.command_buffer import CommandBuffer
 from fetch_hand_sim.episodes.runner import EpisodeRunner
-from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
 from fetch_hand_sim.sim_node.robot import Robot
 from fetch_hand_sim.sim_node.schedule import TickSchedule
 from fetch_hand_sim.simulation import Simulation

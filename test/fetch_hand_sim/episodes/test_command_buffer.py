@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fetch_hand_sim.sim_node.command_buffer import CommandBuffer
+from fetch_hand_sim.episodes.command_buffer import CommandBuffer
 from msgs_spec.robots import CommandPart
 from msgs_spec.tasks import task_spec
 
