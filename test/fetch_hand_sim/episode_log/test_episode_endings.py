@@ -107,14 +107,20 @@ def wait_for_episode_in_progress(listener, directory):
     )
 
 
+def wait_for_failed_log(listener):
+    listener.spin_until(
+        lambda: any('has failed' in report.message for report in listener.reports()), 'failed log'
+    )
+
+
 def test_a_disk_that_fills_up_stops_the_log_and_not_the_robot(start_process, mount):
     disk = mount('size=80m')
     robot = start_process(*SIM_NODE, *ros_args(episode_dir=disk / 'episodes', real_time_factor=2.0))
     with client(REACH) as listener:
-        listener.subscribe('joint_states')
+        listener.subscribe('joint_states', '/diagnostics')
         wait_for_episode_in_progress(listener, disk / 'episodes')
         fill(disk / 'filler')
-        ticks_after(listener, 160)
+        wait_for_failed_log(listener)
         (disk / 'filler').unlink()
         ticks_after(listener)
     errors = error_lines(stop(robot))
@@ -160,13 +166,14 @@ def test_a_read_only_disk(start_process, mount):
 
 def test_a_directory_that_is_removed_while_it_is_written(start_process, tmp_path):
     directory = tmp_path / 'episodes'
-    # Not faster: between two episodes nothing is written, and the directory would be made anew.
-    robot = start_process(*SIM_NODE, *ros_args(episode_dir=directory))
+    # Slow: between two episodes nothing is written, and the directory would be made anew.
+    robot = start_process(*SIM_NODE, *ros_args(episode_dir=directory, real_time_factor=0.3))
     with client(REACH) as listener:
-        listener.subscribe('joint_states')
+        listener.subscribe('joint_states', '/diagnostics')
         wait_for_episode_in_progress(listener, directory)
         shutil.rmtree(directory)
-        ticks_after(listener, 110)
+        wait_for_failed_log(listener)
+        ticks_after(listener, 5)
     errors = error_lines(stop(robot))
     assert len(errors) == 1 and 'No such file or directory' in errors[0]
 
