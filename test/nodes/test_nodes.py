@@ -306,11 +306,8 @@ def test_bad_parameters_end_with_one_line_and_code_2(start_process: Start) -> No
     lines: list[tuple[dict[str, object], str]] = [
         ({'task': 'FetchFly'}, "'FetchFly' given; allowed: 'FetchReach', 'FetchPush'"),
         ({'control_hz': 30.0}, 'nearest: 29.4117647 and 31.25'),
-        ({'seed': -1}, '0 ... 4294967295'),
         ({'seed': 'seven'}, '0 ... 4294967295'),
-        ({'mode': 'warp'}, "'realtime', 'lockstep'"),
         ({'episode_dir': '/proc/here'}, 'episode_dir: /proc/here: No such file or directory'),
-        ({'real_time_factor': -1.0}, '0 or 0.01 ... 1000'),
         ({'use_sim_time': 1}, "'use_sim_time' to '1' of type 'INTEGER', expecting type 'BOOL'"),
     ]
     nodes = [start_process(*SIM_NODE, *ros_args(**parameters)) for parameters, _ in lines]

@@ -422,7 +422,7 @@ def test_episodes_are_logged_to_the_same_bytes_whoever_watches(
     """A page with its visitor, markers, scalars and pictures leave no trace in them."""
 
     def start_robot(name: str) -> subprocess.Popen[str]:
-        settings = {'seed': 7, 'episodes': 8, 'episode_dir': tmp_path / name}
+        settings = {'seed': 7, 'episodes': 4, 'episode_dir': tmp_path / name}
         lockstep = ros_args(mode='lockstep', wait_for_commands=True, **settings)
         return start_process(*SIM_NODE, *lockstep)
 
@@ -451,7 +451,7 @@ def test_episodes_are_logged_to_the_same_bytes_whoever_watches(
     for process in (policy, view, node, robot):
         end(process)
     first, second = (episodes_in(tmp_path / name) for name in ('alone', 'watched'))
-    assert len(first) == len(second) == 8
+    assert len(first) == len(second) == 4
     for alone, watched in zip(first, second, strict=True):
         assert payload(alone) == payload(watched)
         # The one value that tells two runs apart.
