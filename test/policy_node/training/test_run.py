@@ -132,7 +132,8 @@ def test_a_run_that_is_stopped_while_its_replay_fills_has_learnt_nothing_from_a_
     assert [(row['env_steps'], row['updates']) for row in log.rows] == [(2_400, 24)]
 
 
-@pytest.mark.parametrize('damaged', [pytest.param(True, marks=pytest.mark.release), False])
+@pytest.mark.release
+@pytest.mark.parametrize('damaged', [True, False])
 def test_a_replay_that_is_no_multiple_of_an_episode_is_full_with_whole_ones(
     tmp_path: Path, damaged: bool
 ) -> None:
@@ -242,7 +243,7 @@ def test_the_actor_that_a_run_ends_with_is_evaluated(tmp_path: Path) -> None:
     assert trainer.counters.best_success == max(row.get('eval_success') or 0 for row in log.rows)
 
 
-@pytest.mark.parametrize('overlap', [True, False])
+@pytest.mark.parametrize('overlap', [True, pytest.param(False, marks=pytest.mark.release)])
 def test_the_last_evaluation_is_of_the_last_actor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overlap: bool
 ) -> None:
