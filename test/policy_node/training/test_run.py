@@ -359,7 +359,14 @@ def start_run(tmp_path: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
         process.communicate()
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    'number',
+    [
+        signal.SIGINT,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.release),
+        pytest.param(signal.SIGHUP, marks=pytest.mark.release),
+    ],
+)
 def test_a_signal_is_answered_at_once_and_keeps_the_run(
     tmp_path: Path, start_run: Callable[[], subprocess.Popen[str]], number: signal.Signals
 ) -> None:
