@@ -70,7 +70,7 @@ RESEARCH = (
     'parameter_noise target discount critics aggregate norm quantiles n_step correction '
     'cut_distance longest_hold advantage condition widest_threshold goal_choice subgoal_prior '
     'imagination_interval ticks_after_drop drop_is_lost reward_grades '
-    'critic_first'
+    'critic_first disturbance_scales'
 ).split()
 # Former and shorter names of options.
 _OTHER_NAMES = {'total_steps': ('--steps',), 'simulation_threads': ('--threads',)}
