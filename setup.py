@@ -129,6 +129,6 @@ setup(
             'view = fetch_hand_sim.view:main',
         ],
         # Functions that return the shipped actors by task; `fetch_hand_sim` imports no policy.
-        'fetch_hand_sim.actors': ['shipped = policy_node.policies.shipped:shipped_actors'],
+        'fetch_hand_sim.actors': ['shipped = policy_node.policies.loading:shipped_actors'],
     },
 )

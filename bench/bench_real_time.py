@@ -23,7 +23,7 @@ os.environ.setdefault('ROS_DOMAIN_ID', str(40 + os.getpid() % 62))
 
 from fetch_hand_sim.episode_log import EpisodeSummary, find_episodes, read_summary  # noqa: E402
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, TASKS  # noqa: E402
-from policy_node.training.machine.host import processor  # noqa: E402
+from policy_node.training.machine import processor  # noqa: E402
 
 FIRST_SEED = 10_000
 DEFAULT_TASKS = ('FetchPush', 'FetchSlide', 'HandReach', 'HandManipulateBlockRotateZ')

@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from msgs_spec.tasks import TASKS  # noqa: E402
-from policy_node.training.machine.host import processor  # noqa: E402
+from policy_node.training.machine import processor  # noqa: E402
 
 PEERS = ROOT / '.venv-bench'
 RESULTS = ROOT / 'bench' / 'results'

@@ -22,8 +22,8 @@ from policy_node import load_policy
 from policy_node.policies.policy import RandomPolicy
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.experience import Experience
-from policy_node.training.experience.transitions import Transitions
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.experience.replay import Transitions
+from policy_node.training.machine import Workers
 from policy_node.training.research.density_ratio import WeightedDDPG
 from policy_node.training.research.gamble import is_over
 from policy_node.training.research.registry import (

@@ -18,7 +18,7 @@ import numpy as np
 
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array
-from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
+from policy_node.training.evaluation import FIRST_SEED, wilson_interval
 
 _STARTS, _STEPS, _DAMPING = 6, 120, 1e-5
 

@@ -17,7 +17,7 @@ import numpy as np
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.robots import FINGERTIPS
 from policy_node import load_policy
-from policy_node.training.evaluation.episodes import FIRST_SEED, run_episodes
+from policy_node.training.evaluation import FIRST_SEED, run_episodes
 
 # A finger has to move if its goal is farther away than this, in metres.
 _ASKED = 0.02

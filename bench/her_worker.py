@@ -24,8 +24,8 @@ import torch  # noqa: E402
 from fetch_hand_sim.simulation import Simulation  # noqa: E402
 from policy_node.policies.policy import Policy  # noqa: E402
 from policy_node.training.configuration.recipes import recipe_config  # noqa: E402
-from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate  # noqa: E402
-from policy_node.training.machine.distributed import Workers  # noqa: E402
+from policy_node.training.evaluation import FIRST_SEED, evaluate  # noqa: E402
+from policy_node.training.machine import Workers  # noqa: E402
 from policy_node.training.runs.trainer import Trainer  # noqa: E402
 
 # Without end: the limit in seconds or the target ends a run.

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.arrays import Array
 from msgs_spec.rotations import euler_to_quaternion, quaternion_to_euler
-from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
+from policy_node.training.evaluation import FIRST_SEED, wilson_interval
 
 TASKS = ('HandManipulatePenRotate', 'HandManipulatePenFull')
 

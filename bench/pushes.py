@@ -19,7 +19,7 @@ from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tasks import task_spec
 from policy_node import load_policy
 from policy_node.policies.policy import Policy, RestingPolicy
-from policy_node.training.evaluation.episodes import FIRST_SEED
+from policy_node.training.evaluation import FIRST_SEED
 from policy_node.training.experience.replay import MOVED_DISTANCE
 
 _TASK = 'FetchPush'

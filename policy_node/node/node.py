@@ -26,9 +26,8 @@ from node_runtime.node_main import NodeFailure, StopSignals
 from node_runtime.ros import rclpy_profile, ros_message_class, seldom
 from node_runtime.ros_parameters import declare_parameters, set_callback
 from policy_node.node import NODE_NAME
-from policy_node.node.commander import Commander
 from policy_node.node.health import Health, Pace, read_pace
-from policy_node.node.responder import Responder
+from policy_node.node.responder import Commander, Responder
 from policy_node.policies.loading import TaskMissing, load_policy
 from policy_node.policies.policy import LoadedPolicy
 

@@ -52,7 +52,7 @@ def _linear(input_size: int, output_size: int) -> nn.Linear:
 class Normalizer(nn.Module):
     """Clip, centre and scale inputs with the statistics of a checkpoint.
 
-    During training, `policy_node.training.experience.statistics.RunningStatistics` sets them.
+    During training, `policy_node.training.experience.experience.RunningStatistics` sets them.
     """
 
     mean: Tensor

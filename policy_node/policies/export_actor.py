@@ -23,8 +23,8 @@ from node_runtime.command_line import (
     run_command,
     say,
 )
+from policy_node.policies.loading import actor_path
 from policy_node.policies.onnx import INPUTS, OUTPUT, OnnxActor
-from policy_node.policies.shipped import actor_path
 
 if TYPE_CHECKING:
     from policy_node.policies.actor import Actor

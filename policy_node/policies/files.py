@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import hashlib
+import io
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,9 +66,6 @@ def write_files(files: Mapping[Path, bytes]) -> None:
 
     If two processes write at once, the later file stays, whole.
 
-    Args:
-        files: Contents by path.
-
     Raises:
         OSError: If writing fails. The error names the file, and no partial file remains.
     """
@@ -103,6 +102,15 @@ def to_json(values: Mapping[str, Any]) -> bytes:
     return (json.dumps(values, indent=2) + '\n').encode()
 
 
+def to_csv(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
+    """Return the contents of a CSV file."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator='\n')
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return file.getvalue().encode()
+
+
 def sha256(data: bytes) -> str:
     """Return the SHA-256 of the contents of a file, hexadecimal."""
     return hashlib.sha256(data).hexdigest()
@@ -132,10 +140,6 @@ def read_tensors(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, s
 
 def parse_tensors(data: bytes, path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     """Return the arrays and the metadata of a safetensors file.
-
-    Args:
-        data: Contents of the file.
-        path: Its path, for errors.
 
     Raises:
         ValueError: If the contents are invalid, or the header is larger than 1 MiB.

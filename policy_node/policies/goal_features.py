@@ -48,8 +48,6 @@ class RelativeGoal:
     Parts that do not count for the task are zero. So tasks with the same object can share networks.
 
     Attributes:
-        goal: Kind of goal.
-        start: Index of the achieved goal in the observation.
         position_counts: Whether the position of a pose goal counts.
         ignores_z_rotation: Whether rotations about the object's own z axis do not count.
     """
@@ -69,12 +67,7 @@ class RelativeGoal:
         return observation_size + goal_size + self.difference_size
 
     def inputs(self, seen: Seen, normalized: Seen) -> Array:
-        """Return the inputs (..., size): normalised observation and goal, then the difference.
-
-        Args:
-            seen: Observation and goal in the units of the task.
-            normalized: Observation and goal, normalised.
-        """
+        """Return the inputs (..., size): normalised observation and goal, then the difference."""
         return _concatenate(*normalized, self.difference(*seen))
 
     def goal_position(self, observation_size: int, goal_size: int) -> list[int]:
@@ -109,7 +102,6 @@ class SymmetricObject:
     The angular velocity is in the world frame. The goal appears only in `RelativeGoal.difference`.
 
     Attributes:
-        relative: The difference to the goal.
         symmetry: `cube`, or `revolution` for a body of revolution that can be turned upside down.
     """
 

@@ -18,8 +18,6 @@ class NetworkShape:
     Attributes:
         observation_size: Length of `observation`.
         goal_size: Length of `desired_goal`.
-        action_size: Length of the action.
-        hidden_sizes: Width of each hidden layer.
         layer_norm: Whether a LayerNorm precedes each activation.
         goal_features: Inputs made from observation and goal; None for the plain ones.
         past_actions: Number of past actions among the inputs, after the observation.

@@ -41,7 +41,6 @@ class NumpyActor:
     """Deterministic policy: a multilayer perceptron with tanh output on normalised inputs.
 
     Args:
-        shape: Sizes of the network.
         tensors: Weights and normalisers by their names in `Actor`.
     """
 

@@ -47,13 +47,6 @@ _TRIAL_TIMEOUT = 30.0
 class OnnxActor(MemorylessPolicy):
     """Run an ONNX file on one thread.
 
-    Args:
-        data: Contents of the file.
-        path: Its path, for errors.
-
-    Attributes:
-        info: The metadata of the actor.
-
     Raises:
         ValueError: If onnxruntime is missing, or the file is invalid or does not fit its task. The
             message is one line.

@@ -51,7 +51,6 @@ class StableBaselines3Policy:
     """A policy of a model; by default it acts without exploration.
 
     Args:
-        policy: Policy of the model.
         statistics: `VecNormalize` of its training, or None.
     """
 

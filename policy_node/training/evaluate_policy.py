@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,15 +22,15 @@ from node_runtime.command_line import (
     whole_number,
 )
 from node_runtime.signals import EXIT_INTERRUPTED
-from policy_node.policies.files import to_json, write_file
+from policy_node.policies.files import to_csv, to_json, write_file
 from policy_node.policies.policy import Policy
-from policy_node.training.evaluation.episodes import (
+from policy_node.training.evaluation import (
     FIRST_SEED,
     EpisodeOutcomes,
     evaluate,
+    print_table,
     summarize,
 )
-from policy_node.training.evaluation.table import print_table
 from policy_node.training.policy_options import (
     add_batch_options,
     add_disturbances_option,
@@ -120,7 +118,7 @@ def _write(report: dict[str, Any], outcomes: EpisodeOutcomes, options: argparse.
     if options.json not in (None, _STDOUT):
         write_file(options.json, to_json(report))
     if options.csv is not None:
-        write_file(options.csv, to_csv(outcomes))
+        write_file(options.csv, _to_csv(outcomes))
 
 
 def _evaluate(
@@ -144,16 +142,12 @@ def _evaluate(
             return finished[-1], EXIT_INTERRUPTED
 
 
-def to_csv(outcomes: EpisodeOutcomes) -> bytes:
+def _to_csv(outcomes: EpisodeOutcomes) -> bytes:
     """Return a CSV file with a row per episode."""
     names = EpisodeOutcomes.__slots__
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator='\n')
-    writer.writerow(names)
     columns = [np.asarray(getattr(outcomes, name)) for name in names]
     integers = [c.astype(int) if c.dtype == np.bool_ else c for c in columns]
-    writer.writerows(zip(*(column.tolist() for column in integers), strict=True))
-    return file.getvalue().encode()
+    return to_csv(names, zip(*(column.tolist() for column in integers), strict=True))
 
 
 if __name__ == '__main__':

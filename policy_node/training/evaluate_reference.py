@@ -26,7 +26,7 @@ from node_runtime.command_line import (
 )
 from policy_node.policies.files import to_json, write_file
 from policy_node.policies.policy import Policy
-from policy_node.training.evaluation.episodes import FIRST_SEED, wilson_interval
+from policy_node.training.evaluation import FIRST_SEED, wilson_interval
 from policy_node.training.policy_options import (
     add_policy_options,
     load_chosen_policy,
@@ -56,10 +56,7 @@ def success_in_reference(
     episode to the next.
 
     Args:
-        policy: The policy.
         reference_id: Environment of Gymnasium-Robotics, for example `FetchPush-v4`.
-        ticks: Steps per episode.
-        seeds: Seed of each episode.
     """
     warnings.filterwarnings('ignore')
     import gymnasium

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import torch
@@ -112,7 +112,7 @@ def train(
     given: dict[str, Any] = {} if recipe is None else {'recipe': recipe}
     given |= {'resume': True} if resume else {}
     command = _command(task, folder, given | fields)
-    with _PROGRAM:
+    with _torch_restored():
         ending = _ending(config, folder, resume, command, Caller(on_cycle, quiet))
     if ending.signal == signal.SIGINT:
         raise KeyboardInterrupt(ending.reason)
@@ -142,29 +142,12 @@ def _ending(
         raise RuntimeError(str(error)) from error
 
 
-class _Program:
-    """Restore torch's threads and random numbers when the last run of the program ends.
-
-    Several runs may train at the same time, in threads.
-    """
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._runs = 0
-        self._kept = contextlib.ExitStack()
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if self._runs == 0:
-                self._kept.callback(torch.set_num_threads, torch.get_num_threads())
-                self._kept.enter_context(torch.random.fork_rng())
-            self._runs += 1
-
-    def __exit__(self, *exception: object) -> None:
-        with self._lock:
-            self._runs -= 1
-            if self._runs == 0:
-                self._kept.close()
-
-
-_PROGRAM = _Program()
+@contextlib.contextmanager
+def _torch_restored() -> Iterator[None]:
+    """Restore torch's threads and random numbers of the calling program."""
+    threads = torch.get_num_threads()
+    try:
+        with torch.random.fork_rng():
+            yield
+    finally:
+        torch.set_num_threads(threads)

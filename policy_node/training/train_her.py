@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace, command: str) -> int:
     require_extra('train')
-    from policy_node.training.machine.distributed import is_first_worker
+    from policy_node.training.machine import is_first_worker
     from policy_node.training.runs.run import train_run
     from policy_node.training.runs.run_folder import default_folder
 
@@ -141,7 +141,7 @@ def _read_experience(config: TrainConfig, directory: Path | None) -> Episodes | 
         raise ValueError('subgoal_every excludes --from-episodes: logged episodes have no subgoals')
     if config.collect.gamble:
         raise ValueError('gamble excludes --from-episodes: in logged episodes gambles end nothing')
-    from policy_node.training.experience.logged_episodes import read_experience
+    from policy_node.training.experience.episode_files import read_experience
 
     task = task_spec(config.task, control_hz=config.collect.control_hz)
     episodes, skipped = read_experience(directory, task, config.collect.control_hz)

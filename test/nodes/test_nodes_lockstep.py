@@ -23,8 +23,7 @@ from msgs_spec.codecs import decode_status, message_stamp
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TaskSpec, task_spec
 from msgs_spec.tick import TickEncoder
-from policy_node.node.commander import Commander
-from policy_node.node.responder import Responder
+from policy_node.node.responder import Commander, Responder
 from policy_node.policies.loading import load_policy
 from support.fresh_actor import fresh_actor
 from support.graph import (

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from policy_node.policies.shipped import shipped_actors
+from policy_node.policies.loading import shipped_actors
 from support import ROOT
 
 ACTORS = ROOT / 'policy_node' / 'actors'

@@ -7,7 +7,7 @@ import torch
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.learners.ddpg import DDPG
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 from policy_node.training.research.registry import make_ddpg
 
 SHAPE = NetworkShape(observation_size=1, goal_size=1, action_size=1, hidden_sizes=(32, 32))

@@ -15,10 +15,11 @@ from msgs_spec.disturbances import read_disturbances
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ, GoalKind, TaskSpec, task_spec
 from policy_node.policies.checkpoint import MOST_PAST_ACTIONS
 from policy_node.policies.goal_features import goal_features
-from policy_node.training.configuration.checked import Checked, Count, Range, Share, Total
 from policy_node.training.configuration.groups import (
     Advantages,
+    Checked,
     Chosen,
+    Count,
     Critics,
     Ddpg,
     Dense,
@@ -30,9 +31,12 @@ from policy_node.training.configuration.groups import (
     OffPolicy,
     OneStep,
     Ppo,
+    Range,
     Returns,
+    Share,
     Sparse,
     Threshold,
+    Total,
 )
 
 Recipe = Literal['paper', 'best', 'robust', 'finetune']
@@ -67,8 +71,8 @@ class Goals(Checked):
     number of goals of each episode."""
     goals: dict[str, float] = field(default_factory=dict)
     """Mixture of goal sources instead of `strategy`: `future=.4,actual=.3`. The rest keeps its
-    goal. Also `next` (achieved by this step), `near` (in the next ten steps), `displaced` (near
-    the goal achieved before) and with `ppo` `outcome` (achieved by other episodes)."""
+    goal. Also `displaced` (near the goal achieved before) and with `ppo` `outcome` (achieved by
+    other episodes)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +90,7 @@ class Network(Checked):
     """Number of past actions that the networks see."""
     init_from: str = ''
     """Networks and normalisers to start from: a run folder, a shipped actor or an actor file.
-    Several with commas: their mean. Empty: random networks."""
+    Without it, weights are random."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,10 +104,8 @@ class Replay(Checked):
     kept_transitions: Total = 300_000
     """Newest transitions stored beside the training state for `--resume`."""
     moved_share: Share = 0.0
-    """Share of a batch drawn by `episode_weights`; 0 draws uniformly."""
-    episode_weights: Literal['moved', 'energy'] = 'moved'
-    """Weights of episodes: `moved` (1 where the achieved goal moved, else 0) or `energy` (given to
-    the object). The landing of a `gamble` counts for neither."""
+    """Share of a batch from episodes whose achieved goal moved; 0 draws uniformly. The landing of a
+    `gamble` is no motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,9 +223,9 @@ _KEPT = 0.99
 
 # Sources of goals. `real` keeps the goal of the episode.
 STRATEGIES = ('future', 'final', 'episode', 'random')
-SOURCES = ('real', *STRATEGIES, 'actual', 'next', 'near', 'displaced', 'outcome')
+SOURCES = ('real', *STRATEGIES, 'actual', 'displaced', 'outcome')
 # Sources that depend on where the transition led.
-FROM_THE_EPISODE = ('future', 'final', 'episode', 'next', 'near')
+FROM_THE_EPISODE = ('future', 'final', 'episode')
 # Tasks that ignore their gripper action.
 GAMBLE_TASKS = ('FetchReach', 'FetchPush')
 
@@ -285,10 +287,10 @@ def idle_parts(config: TrainConfig, critic_first: int = 0) -> Iterator[str]:
     epsilon, spread = (
         noise.final_exploration * each for each in (noise.random_epsilon, noise.noise_std)
     )
-    if noise.random_steps > (cycles - 1) * cycle or epsilon > _KEPT or spread >= _NOISE_ALONE:
+    if epsilon > _KEPT or spread >= _NOISE_ALONE:
         yield (
-            f'the policy will not act while it collects: random_steps {noise.random_steps} of '
-            f'{total}, random_epsilon {noise.random_epsilon:g}, noise_std {noise.noise_std:g}'
+            f'the policy will not act while it collects: random_epsilon {noise.random_epsilon:g}, '
+            f'noise_std {noise.noise_std:g}'
         )
 
 
@@ -329,17 +331,10 @@ def _require_reward(config: TrainConfig, spec: TaskSpec) -> None:
         raise ValueError(
             f'reward_grades {grades}: allowed are rising numbers above 0 and below 1000'
         )
-    rotation = (sparse.reward_rotation, sparse.first_rotation)
-    if spec.rotation_threshold is None and rotation != (1.0, 1.0):
-        raise ValueError(
-            f'reward_rotation and first_rotation: goals of {spec.name} have no rotation'
-        )
-    distance = (sparse.reward_distance, sparse.first_distance)
-    if not spec.position_counts and distance != (1.0, 1.0):
-        raise ValueError(
-            f'reward_distance and first_distance: the position of goals of {spec.name} '
-            'does not count'
-        )
+    if spec.rotation_threshold is None and sparse.first_rotation != 1.0:
+        raise ValueError(f'first_rotation: goals of {spec.name} have no rotation')
+    if not spec.position_counts and sparse.first_distance != 1.0:
+        raise ValueError(f'first_distance: the position of goals of {spec.name} does not count')
 
 
 def _is_graded(reward: Sparse) -> bool:
@@ -443,8 +438,8 @@ def _contradictions_of_options(
         ('condition threshold needs reward_type sparse'),
     )
     if isinstance(values, Chosen):
-        later = {*(config.goals.goals or [config.goals.strategy[:6]])} & {'future', 'near'}
-        yield not later, f'goal_choice {values.goal_choice} needs future or near goals'
+        sources = config.goals.goals or [config.goals.strategy[:6]]
+        yield 'future' not in sources, f'goal_choice {values.goal_choice} needs future goals'
         yield (
             values.goal_choice == 'uncertain' and critic.critics == 1,
             'goal_choice uncertain needs critics above 1',

@@ -17,9 +17,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from msgs_spec.text import did_you_mean
-from policy_node.training.configuration.checked import (
+from policy_node.training.configuration.config import TrainConfig
+from policy_node.training.configuration.groups import (
     LARGEST,
     Checked,
+    Hierarchical,
+    Learner,
+    Ppo,
     Range,
     choices_of,
     plain_type,
@@ -28,11 +32,14 @@ from policy_node.training.configuration.checked import (
     typed,
     types_of,
 )
-from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.configuration.groups import Hierarchical, Learner, Ppo
 
 # Fields of earlier versions that no recipe and no study used, with their defaults.
-REMOVED = {
+REMOVED: dict[str, Any] = {
+    'cut_distance': 0.3,
+    'episode_weights': 'moved',
+    'random_steps': 0,
+    'reward_distance': 1.0,
+    'reward_rotation': 1.0,
     'noise_spread': 0.0,
     'retry_failed': 0.0,
     'narrow_above': 0.0,
@@ -65,12 +72,10 @@ _MARK_MEANINGS = {
 }
 # Fields for studies; `--help-research` shows them.
 RESEARCH = (
-    'algorithm subgoal_every trace importance first_value first_action_gain gamble reward_distance '
-    'reward_rotation first_distance first_rotation episode_weights random_steps noise_seconds '
-    'parameter_noise target discount critics aggregate norm quantiles n_step correction '
-    'cut_distance longest_hold advantage condition widest_threshold goal_choice subgoal_prior '
-    'imagination_interval ticks_after_drop drop_is_lost reward_grades '
-    'critic_first disturbance_scales'
+    'algorithm subgoal_every trace importance first_value first_action_gain gamble first_distance '
+    'first_rotation noise_seconds parameter_noise target discount critics aggregate norm quantiles '
+    'n_step correction longest_hold advantage condition widest_threshold goal_choice subgoal_prior '
+    'imagination_interval ticks_after_drop drop_is_lost reward_grades critic_first'
 ).split()
 # Former and shorter names of options.
 _OTHER_NAMES = {'total_steps': ('--steps',), 'simulation_threads': ('--threads',)}
@@ -87,10 +92,7 @@ class Field:
     """One flat field.
 
     Attributes:
-        name: Its name.
-        kind: Its annotated type.
         default: Its value where no group has it.
-        meaning: What it does, on one line.
         group: Title of the first group that has it.
     """
 
@@ -407,10 +409,6 @@ def add_field_options(parser: argparse.ArgumentParser, without: tuple[str, ...])
     """Add an option for each field, `--learning-rate` for `learning_rate`; by default None.
 
     `--help` shows the fields by group, `--help-research` those of studies.
-
-    Args:
-        parser: Parser of the command.
-        without: Fields that have options of the command.
     """
     research = argparse.ArgumentParser(
         prog=parser.prog, usage='fields for studies (docs/research)', add_help=False
@@ -485,9 +483,7 @@ def with_assignments(
     """Return the fields given by options and by `--set`.
 
     Args:
-        given: Fields given by options.
         assignments: Those of `--set`, `name=value`; the last one of a field counts.
-        options: Names of options that differ from their field.
 
     Raises:
         ValueError: If an assignment is invalid or contradicts the option of its field.

@@ -44,7 +44,6 @@ def recipe_config(task: str, recipe: str, **overrides: Any) -> TrainConfig:
     """Returns the configuration of a recipe for a task, with fields replaced.
 
     Args:
-        task: Task name.
         recipe: `paper` (Plappert et al. 2018, appendix B), `best` (the best measured here from
             nothing), `robust` (imitation of the shipped policy on a disturbed robot) or `finetune`
             (continues from a shipped policy with an object in the hand).

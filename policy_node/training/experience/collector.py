@@ -21,10 +21,7 @@ class ActionNoise:
     """Gaussian noise; with probability `epsilon` a uniformly random action instead.
 
     Args:
-        generator: Random generator.
         shape: (simulations, action size).
-        std: Standard deviation of the Gaussian noise.
-        epsilon: Probability of a random action.
         ticks: Number of ticks for which noise and random actions hold.
 
     Attributes:
@@ -47,17 +44,11 @@ class ActionNoise:
         self._uniform, self._noise = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self._replaced = np.zeros(shape[0], np.bool_)
 
-    def random(self, tick: int) -> Array32:
-        """Return uniformly random actions (N, action size) for a tick of an episode."""
-        if tick % self._ticks == 0:
-            self._uniform = self._generator.uniform(-1.0, 1.0, self._shape).astype(np.float32)
-        return self._uniform
-
     def around(self, action: NDArray[Any], tick: int) -> Array32:
         """Return actions (N, action size) with noise for a tick of an episode."""
         share = self.share
         if tick % self._ticks == 0:
-            self.random(tick)
+            self._uniform = self._generator.uniform(-1.0, 1.0, self._shape).astype(np.float32)
             self._noise = self._generator.standard_normal(self._shape, dtype=np.float32)
             self._replaced = self._generator.random(self._shape[0]) < share * self._epsilon
         noisy = action + np.float32(self._std * share) * self._noise
@@ -72,11 +63,7 @@ class Collector:
     and returns the same episodes for the same policy.
 
     Args:
-        simulation: The simulations.
         seeds: One seed per simulation for its resets; the first also seeds exploration.
-        config: The configuration.
-        extra_actions: Values that follow the action in what the policy returns.
-        extra_columns: Values stored after the action that no policy returns.
 
     Attributes:
         exploration: Factor on all noise, 0 ... 1.
@@ -107,12 +94,8 @@ class Collector:
         )
         self._seeds: list[int] | None = seeds
 
-    def collect(self, policy: Policy, random: bool = False) -> tuple[Episodes, float]:
+    def collect(self, policy: Policy) -> tuple[Episodes, float]:
         """Run one episode in every simulation.
-
-        Args:
-            policy: The policy to explore around.
-            random: Act uniformly at random instead.
 
         Returns:
             The episodes, without those whose simulation diverged, and their success rate.
@@ -135,7 +118,7 @@ class Collector:
         for tick in range(ticks):
             episodes.observation[:, tick] = np.concatenate([observation['observation'], past], 1)
             episodes.achieved_goal[:, tick] = observation['achieved_goal']
-            action = self._explore(acting, observation, past, random, tick)
+            action = self._explore(acting, observation, past, tick)
             episodes.action[:, tick] = action
             result = simulation.step(action[:, : self._action_size])
             if self._past_size:
@@ -144,8 +127,7 @@ class Collector:
             whole &= ~result.diverged
         episodes.observation[:, ticks] = np.concatenate([observation['observation'], past], 1)
         episodes.achieved_goal[:, ticks] = observation['achieved_goal']
-        if not random:
-            self._end(policy, acting, episodes)
+        self._end(policy, acting, episodes)
         return episodes.select(whole), float(success[whole].mean()) if whole.any() else 0.0
 
     def _begin(self, policy: Policy) -> Policy:
@@ -157,11 +139,9 @@ class Collector:
         """Adapt the noise to the collected episodes."""
 
     def _explore(
-        self, policy: Policy, observation: Observations, past: Array32, random: bool, tick: int
+        self, policy: Policy, observation: Observations, past: Array32, tick: int
     ) -> Array32:
         """Return the actions (N, columns) of a tick, with noise."""
-        if random:
-            return self._noise.random(tick)
         return self._noise.around(self._predict(policy, observation, past), tick)
 
     def _predict(self, policy: Policy, observation: Observations, past: Array32) -> NDArray[Any]:

@@ -17,7 +17,7 @@ from msgs_spec.arrays import Array32
 from msgs_spec.rotations import quaternion_conjugate, quaternion_multiply
 from msgs_spec.tasks import GoalKind
 from policy_node.training.configuration.config import STRATEGIES
-from policy_node.training.experience.transitions import Starts
+from policy_node.training.experience.replay import Starts
 
 RewardFunction = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 Source = Callable[[Starts, np.random.Generator], Array32]
@@ -31,7 +31,6 @@ def goal_mixture(strategy: str, k: int = 4) -> dict[str, float]:
     Args:
         strategy: `none`, `final`, `future`, `episode`, `random`: k relabelled goals for each real
             one. `futureactual`: k/2 future goals, k/2 desired goals of other episodes, 1 real goal.
-        k: Relabelled goals for each real one.
 
     Raises:
         ValueError: If the strategy is unknown.
@@ -76,7 +75,6 @@ def goals_of(
         starts: Where the transitions begin.
         source: Index of the source of each goal, (batch,).
         names: Names of the sources; `real` keeps the goal of the episode.
-        generator: Random generator.
         sources: Functions by name, by default `SOURCES`.
     """
     sources = SOURCES if sources is None else sources
@@ -91,18 +89,6 @@ def goals_of(
 def _future(starts: Starts, generator: np.random.Generator) -> Array32:
     """Achieved later in the episode. This includes the state that the transition leads to."""
     return _achieved(starts, generator.integers(starts.tick + 1, starts.last + 1))
-
-
-def _near(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Achieved within the next ten ticks."""
-    end = np.minimum(starts.tick + _NEAR_TICKS, starts.last)
-    return _achieved(starts, generator.integers(starts.tick + 1, end + 1))
-
-
-def _next(starts: Starts, generator: np.random.Generator) -> Array32:
-    """Achieved by the transition itself."""
-    del generator
-    return _achieved(starts, starts.tick + 1)
 
 
 def _final(starts: Starts, generator: np.random.Generator) -> Array32:
@@ -148,8 +134,6 @@ def _displaced(starts: Starts, generator: np.random.Generator) -> Array32:
 
 SOURCES: dict[str, Source] = {
     'future': _future,
-    'near': _near,
-    'next': _next,
     'final': _final,
     'episode': _episode,
     'random': _random,

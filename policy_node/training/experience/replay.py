@@ -1,4 +1,4 @@
-"""Replay of whole episodes: hindsight needs the later states of an episode."""
+"""Replay of whole episodes, because hindsight needs later states, and batches of transitions."""
 
 from __future__ import annotations
 
@@ -59,10 +59,6 @@ class EpisodeReplay:
 
     Args:
         capacity: Largest number of episodes.
-        ticks: Steps per episode.
-        observation_size: Length of an observation.
-        goal_size: Length of a goal.
-        action_size: Length of an action.
         weigh: Weights of episodes for `draw`.
         count_ticks: Number of ticks of each episode that may be drawn, from its first; None is
             all of them.
@@ -164,7 +160,6 @@ class EpisodeReplay:
             count: Number of episodes.
             weighted_share: Share drawn in proportion to weights as well; without effect if all
                 weights are 0.
-            generator: Random generator.
 
         Returns:
             Rows of `episodes`, (count,).
@@ -192,3 +187,52 @@ def has_moved(episodes: Episodes) -> NDArray[np.float64]:
     offset = episodes.achieved_goal - episodes.achieved_goal[:, :1]
     moved = np.square(offset).sum(axis=-1).max(axis=-1) > MOVED_DISTANCE**2
     return np.asarray(moved, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Starts:
+    """The states in which the transitions of a batch begin.
+
+    Attributes:
+        row: Episode of each transition, (batch,).
+        tick: Tick of its first state, (batch,).
+        valid_ticks: Number of ticks of each episode that count, from its first, (episodes,); None
+            is all.
+    """
+
+    episodes: Episodes
+    row: NDArray[np.int64]
+    tick: NDArray[np.int64]
+    valid_ticks: NDArray[np.int64] | None = None
+
+    @property
+    def last(self) -> NDArray[np.int64]:
+        """Last valid state of each episode, (batch,)."""
+        if self.valid_ticks is None:
+            return np.full(len(self.row), self.episodes.ticks)
+        return self.valid_ticks.take(self.row)
+
+    def select(self, chosen: NDArray[np.intp]) -> Starts:
+        """Return the transitions at these indices."""
+        return Starts(self.episodes, self.row[chosen], self.tick[chosen], self.valid_ticks)
+
+
+@dataclass(frozen=True, slots=True)
+class Transitions:
+    """A batch for one update, float32. A target is reward + discount * next value.
+
+    Attributes:
+        observation: (batch, observation_size).
+        next_observation: (batch, observation_size), at the end of the return.
+        goal: (batch, goal_size), after relabelling.
+        action: (batch, action_size).
+        reward: (batch,) for `goal`.
+        discount: (batch,) factor on the value of the next state.
+    """
+
+    observation: Array32
+    next_observation: Array32
+    goal: Array32
+    action: Array32
+    reward: Array32
+    discount: Array32

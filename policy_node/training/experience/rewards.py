@@ -25,7 +25,6 @@ class GradedReward:
     it forgets one of them while it never meets both.
 
     Attributes:
-        metric: Distances and thresholds of the task.
         grades: Multiples of its thresholds; 1 alone is the sparse reward.
     """
 
@@ -74,15 +73,7 @@ def own_reward(metric: GoalMetric) -> str:
 def narrowed(metric: GoalMetric, reward: Sparse, progress: float) -> GoalMetric:
     """Return the metric with the thresholds of a run's progress, 0 ... 1."""
     left = max(1.0 - 1.5 * progress, 0.0)
-    return scale_thresholds(
-        metric,
-        reward.reward_distance * reward.first_distance**left,
-        reward.reward_rotation * reward.first_rotation**left,
-    )
-
-
-def scale_thresholds(metric: GoalMetric, distance: float, rotation: float) -> GoalMetric:
-    """Return a metric with these shares of the success distance and rotation of `metric`."""
+    distance, rotation = reward.first_distance**left, reward.first_rotation**left
     spec = replace(metric.spec, distance_threshold=metric.spec.distance_threshold * distance)
     if spec.rotation_threshold is not None:
         spec = replace(spec, rotation_threshold=spec.rotation_threshold * rotation)

@@ -21,9 +21,8 @@ from policy_node.training.experience.hindsight import (
     flat,
     goals_of,
 )
-from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.replay import Episodes, Starts, Transitions
 from policy_node.training.experience.rewards import reward_schedule
-from policy_node.training.experience.transitions import Starts, Transitions
 
 RewardAfter = Callable[[Array32, NDArray[np.int64]], NDArray[np.float64]]
 """A function from achieved goals and the indices of their transitions to rewards."""
@@ -35,12 +34,8 @@ class TransitionSampler:
 
     Attributes:
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
-        gamma: Discount of one step.
-        most_steps: Longest return, in steps.
-        reward_scale: Factor on rewards.
         lost_value: Value after the last valid tick of an episode; None bootstraps as usual.
         reward_at: Progress, 0 ... 1 -> `compute_reward` at that time; None if it never changes.
-        sources: Functions that return goals, by name.
     """
 
     compute_reward: RewardFunction
@@ -68,10 +63,8 @@ class TransitionSampler:
         """Draw a transition of each chosen episode and relabel its goal.
 
         Args:
-            episodes: Episodes to draw from.
             row: Episode of each transition, (batch,).
             mixture: Probability of each goal source; adds up to 1.
-            generator: Random generator.
             valid_ticks: Number of ticks of each episode that count, from its first; None is all.
         """
         if valid_ticks is None:

@@ -15,8 +15,8 @@ from policy_node.policies.goal_features import goal_features
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.experience.transitions import Transitions
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.experience.replay import Transitions
+from policy_node.training.machine import Workers
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,20 +32,7 @@ class ActorCritic:
     """An actor, its critic and their optimizers; subclasses define an update.
 
     Args:
-        actor: The actor.
-        critic: The critic.
-        config: The configuration.
-        device: Device of the networks.
         workers: This worker among all; gradients are averaged over all.
-
-    Attributes:
-        actor: Contains the normalizers of all inputs.
-        critic: The critic.
-        average_actor: Network of the actor, averaged over cycles.
-        actor_parameters: Learned parameters of the actor, without normalizers.
-        critic_parameters: Learned parameters of the critic.
-        updates: Updates so far.
-        critic_first: Updates of the critic before the actor learns too.
     """
 
     def __init__(
@@ -138,12 +125,7 @@ class ActorCritic:
 
 
 def network_shape(config: TrainConfig, extra_actions: int = 0) -> NetworkShape:
-    """Return the shape of actor and critic.
-
-    Args:
-        config: The configuration.
-        extra_actions: Outputs of the actor beside the action.
-    """
+    """Return the shape of actor and critic."""
     spec = task_spec(config.task)
     return NetworkShape(
         observation_size=spec.observation_size,
@@ -154,3 +136,18 @@ def network_shape(config: TrainConfig, extra_actions: int = 0) -> NetworkShape:
         goal_features=goal_features(config.network.goal_features, spec),
         past_actions=config.network.past_actions,
     )
+
+
+def with_inputs(tensors: dict[str, Tensor], column: int, count: int) -> dict[str, Tensor]:
+    """Return networks with `count` more inputs from `column` on; their weights are zero."""
+    changed = {}
+    for name in first_weights(tensors):
+        weight = tensors[name]
+        zeros = weight.new_zeros((len(weight), count))
+        changed[name] = torch.cat([weight[:, :column], zeros, weight[:, column:]], dim=1)
+    return tensors | changed
+
+
+def first_weights(tensors: dict[str, Tensor]) -> list[str]:
+    """Return the names of the weights of layers that take the inputs."""
+    return [name for name in tensors if name.endswith('hidden.0.weight')]

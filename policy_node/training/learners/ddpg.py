@@ -14,10 +14,9 @@ from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import OffPolicy
-from policy_node.training.experience.transitions import Transitions
+from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
-from policy_node.training.machine.devices import uses_bfloat16
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers, uses_bfloat16
 
 # Fields of `Transitions` that every batch has.
 _ALWAYS = ('observation', 'next_observation', 'goal', 'action', 'reward', 'discount')
@@ -41,7 +40,6 @@ class Critic(nn.Module):
     """Action value of normalized features and an action in [-1, 1].
 
     Args:
-        inputs: Length of features and action together.
         shape: Shape of the actor; the hidden layers are the same.
         outputs: Number of outputs, whose mean is the value.
     """
@@ -85,12 +83,7 @@ class CriticLoss:
 
 
 class TargetNetworks:
-    """Slow copies of actor and critic, from which targets are computed.
-
-    Attributes:
-        actor: Copy of the actor's network.
-        critic: Copy of the critic.
-    """
+    """Slow copies of actor and critic, from which targets are computed."""
 
     def __init__(self, actor: MLP, critic: nn.Module) -> None:
         self.actor, self.critic = copy.deepcopy(actor), copy.deepcopy(critic)
@@ -111,12 +104,7 @@ class TargetNetworks:
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """Exchangeable parts of `DDPG`.
-
-    Attributes:
-        critic_loss: Makes the critic and computes its costs.
-        targets: Class of the target networks.
-    """
+    """Exchangeable parts of `DDPG`."""
 
     critic_loss: CriticLoss = field(default_factory=CriticLoss)
     targets: type[TargetNetworks] = TargetNetworks
@@ -126,9 +114,6 @@ class DDPG(ActorCritic):
     """Actor, critic, their slow copies, and one update.
 
     Args:
-        shape: Shape of both networks.
-        config: The configuration.
-        device: Device of the networks.
         workers: This worker among all; gradients are averaged over all.
         parts: Exchangeable parts; None is those of the paper.
     """

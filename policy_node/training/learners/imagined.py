@@ -24,7 +24,7 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Imagined
 from policy_node.training.learners.ddpg import DDPG, Parts, TensorBatch
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 
 # Candidate states of a subgoal, for every fourth transition of a batch. Their values are most of
 # the additional cost of an update.

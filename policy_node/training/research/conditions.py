@@ -22,11 +22,11 @@ from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration import groups
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.experience.rewards import narrowed, own_reward
+from policy_node.training.experience.replay import Starts, Transitions
+from policy_node.training.experience.rewards import own_reward
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.experience.transitions import Starts, Transitions
+from policy_node.training.learners.actor_critic import first_weights
 from policy_node.training.learners.ddpg import DDPG, TensorBatch
-from policy_node.training.learners.widening import first_weights
 
 Goals = NDArray[np.float64]
 # Smallest threshold drawn, as a share of the threshold of training.
@@ -41,7 +41,6 @@ class Threshold:
     threshold should be wider than the distance at the start of an episode.
 
     Attributes:
-        metric: Distances of the task, and the thresholds of training.
         widest: Largest multiple.
     """
 
@@ -80,7 +79,6 @@ class Horizon:
     """The number of steps left; values are sums of that many rewards (TDM, arXiv 1802.09081).
 
     Attributes:
-        ticks: Steps of an episode.
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
     """
 
@@ -129,7 +127,6 @@ def make_condition(config: TrainConfig, metric: GoalMetric) -> Condition:
     Raises:
         ValueError: If it would replace the own reward of a third-party task.
     """
-    metric = narrowed(metric, config.find(groups.Sparse) or groups.Sparse(), 1.0)
     threshold = config.find(groups.Threshold)
     if threshold is None:
         return Horizon(metric.spec.episode_ticks, metric.reward)
@@ -142,11 +139,7 @@ def make_condition(config: TrainConfig, metric: GoalMetric) -> Condition:
 
 @dataclass(frozen=True, kw_only=True)
 class ConditionedSampler(TransitionSampler):
-    """Draws a value of the condition for each transition.
-
-    Attributes:
-        condition: The condition.
-    """
+    """Draws a value of the condition for each transition."""
 
     condition: Condition
 
@@ -181,7 +174,6 @@ class ConditionedTransitions(Transitions):
 
     Attributes:
         condition: Input of the networks, (batch, 1).
-        next_condition: The same for the next state.
     """
 
     condition: Array32
@@ -233,8 +225,6 @@ def fold(network: MLP, shape: NetworkShape, value: float) -> MLP:
 
     Args:
         network: Its first layer has `shape.feature_size` + 1 inputs.
-        shape: Shape of the network to make.
-        value: That input.
     """
     # The new random weights are replaced, so the global generator must not move.
     with torch.random.fork_rng(devices=[]):

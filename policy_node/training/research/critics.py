@@ -147,7 +147,6 @@ def levels(count: int, like: Tensor) -> Tensor:
 
     Args:
         count: Number of quantiles.
-        like: A tensor on the device to use.
     """
     return (torch.arange(count, dtype=torch.float32, device=like.device) + 0.5) / count
 
@@ -258,7 +257,6 @@ class AdvantageCritic(nn.Module):
     A(s, pi(s))). A keeps its size at any dt, and the actor maximizes A.
 
     Args:
-        features: Length of the features.
         shape: Shape of the actor; the hidden layers are the same.
         duration: Duration dt of a tick in units of 40 ms.
     """

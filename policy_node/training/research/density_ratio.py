@@ -28,9 +28,9 @@ from msgs_spec.arrays import Array32
 from msgs_spec.tasks import task_spec
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
 from policy_node.training.configuration.config import TrainConfig
-from policy_node.training.experience.transitions import Transitions
+from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.ddpg import DDPG, Parts, TensorBatch
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 
 # Largest weight. Larger ones belong to goals that hindsight almost never chooses.
 MOST_WEIGHT = 10.0
@@ -43,15 +43,7 @@ _SMALLEST_DISTANCE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class GoalView:
-    """A batch of transitions with certain goals, each tensor (batch, size).
-
-    Attributes:
-        features: Network inputs of state and goal.
-        next_features: Network inputs of next state and goal.
-        achieved: Achieved goal of the state.
-        next_achieved: Achieved goal of the next state.
-        goal: The goal.
-    """
+    """A batch of transitions with certain goals, each tensor (batch, size)."""
 
     features: Tensor
     next_features: Tensor
@@ -61,13 +53,7 @@ class GoalView:
 
 
 class DensityRatio(nn.Module):
-    """The two classifiers and their optimizer.
-
-    Args:
-        feature_size: Length of the features of a state and a goal.
-        goal_size: Length of a goal.
-        action_size: Length of an action.
-    """
+    """The two classifiers and their optimizer."""
 
     def __init__(self, feature_size: int, goal_size: int, action_size: int) -> None:
         super().__init__()
@@ -80,8 +66,6 @@ class DensityRatio(nn.Module):
         """Improve the classifiers on a batch and return its weights (batch,), of mean 1.
 
         Args:
-            chosen: The batch with its goals.
-            shuffled: The batch with goals of other transitions.
             action: (batch, action_size).
         """
         logits = [self._logits(view, action) for view in (chosen, shuffled)]

@@ -19,9 +19,8 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.collector import Collector, Observations
-from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.replay import Episodes, Starts
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.experience.transitions import Starts
 from policy_node.training.learners.ddpg import DDPG, TensorBatch
 
 
@@ -45,9 +44,7 @@ class HoldingCollector(Collector):
     time, so each tick is stored with the ticks that are left.
 
     Args:
-        simulation: The simulations.
         seeds: As for `Collector`.
-        config: The configuration.
         most: Ticks of the longest action.
     """
 
@@ -58,9 +55,9 @@ class HoldingCollector(Collector):
         self._holder = Holder(most)
 
     def _explore(
-        self, policy: Policy, observation: Observations, past: Array32, random: bool, tick: int
+        self, policy: Policy, observation: Observations, past: Array32, tick: int
     ) -> Array32:
-        action = super()._explore(policy, observation, past, random, tick)
+        action = super()._explore(policy, observation, past, tick)
         return self._holder.take(action, self.simulation.spec.episode_ticks - tick)
 
 
@@ -149,13 +146,8 @@ class ParameterNoise:
     multiplied by wanted / measured distance, at most by 2 or 1/2. The paper takes steps of 1 %,
     which is too slow for a few dozen cycles of long episodes.
 
-    Args:
-        generator: Random generator.
-        distance: Wanted root mean square of the change of actions.
-
     Attributes:
         share: Factor on `distance`, 0 ... 1.
-        scale: Standard deviation of the noise on weights.
     """
 
     def __init__(self, generator: np.random.Generator, distance: float) -> None:
@@ -186,8 +178,6 @@ class ParameterNoise:
         """Adapt the scale to the distance between the actions of the copies and of the actor.
 
         Args:
-            actor: The actor.
-            perturbed: Its copies.
             states: Observations (states, ...) of the last cycle.
         """
         count = len(np.asarray(states['observation']))

@@ -26,7 +26,6 @@ GAMBLE_ABOVE = 0.9
 # Position of the locked fingers after a gamble, otherwise 0 m. Without it the state would not be
 # Markov: a landing would look like a state that the robot can leave.
 _OVER = 1.0
-_OWN_STATE = ('_over', '_landing', '_frozen')
 
 
 class GambleSimulation(Simulation):
@@ -46,26 +45,11 @@ class GambleSimulation(Simulation):
 
     def __init__(self, task: str, **options: Any) -> None:
         super().__init__(task, **options)
-        self._prepare()
-
-    def _prepare(self) -> None:
         count = self.num_envs
         self._over = np.zeros(count, np.bool_)
         self._landing = np.zeros((count, self.spec.goal.size))
         self._frozen = np.zeros((count, self.spec.observation_size))
         self._parts = _parts(self.spec)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state of `Simulation` and of the gambles."""
-        own = {name: getattr(self, name).copy() for name in _OWN_STATE}
-        return {**super().__getstate__(), 'gamble': own}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state; the simulation continues bit for bit."""
-        super().__setstate__(state)
-        self._prepare()
-        for name, values in state['gamble'].items():
-            setattr(self, name, values.copy())
 
     def reset(
         self, seed: Seeds = None, ids: ArrayLike | None = None, *given: Any, **options: Any

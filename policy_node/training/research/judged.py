@@ -18,14 +18,12 @@ from numpy.typing import NDArray
 from msgs_spec.arrays import Array32
 from policy_node.training.experience.experience import Experience
 from policy_node.training.experience.hindsight import draw_sources, goals_of
+from policy_node.training.experience.replay import Starts, Transitions
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.experience.transitions import Starts, Transitions
 from policy_node.training.learners.ddpg import DDPG, CriticLoss
 
 # Number of future goals to choose from.
 CANDIDATES = 8
-# Sources with a choice of goals.
-_LATER = ('future', 'near')
 
 
 class Judge:
@@ -88,41 +86,29 @@ class ChoosingSampler(JudgedSampler):
         goal = goals_of(starts, source, list(mixture), generator)
         if self.judge is None:
             return goal
-        names = np.array(list(mixture))[source]
-        rows = np.flatnonzero(np.isin(names, _LATER))
+        rows = np.flatnonzero(np.array(list(mixture))[source] == 'future')
         if len(rows):
-            chosen = starts.select(rows)
-            goal[rows] = self._best(self.judge, chosen, names[rows], goal[rows], generator)
+            goal[rows] = self._best(self.judge, starts.select(rows), goal[rows], generator)
         return goal
 
     def _best(
-        self,
-        judge: Judge,
-        starts: Starts,
-        names: NDArray[np.str_],
-        first: Array32,
-        generator: np.random.Generator,
+        self, judge: Judge, starts: Starts, first: Array32, generator: np.random.Generator
     ) -> Array32:
         """Return the best of several future goals of each transition, (batch, goal_size)."""
-        source = (names == _LATER[1]).astype(np.intp)
-        candidates = [first]
+        candidates, source = [first], np.zeros(len(first), np.intp)
         for _ in range(CANDIDATES - 1):
-            candidates.append(goals_of(starts, source, _LATER, generator))
-        repeated = starts.select(np.tile(np.arange(len(names)), CANDIDATES))
+            candidates.append(goals_of(starts, source, ['future'], generator))
+        repeated = starts.select(np.tile(np.arange(len(first)), CANDIDATES))
         batch = self.single(repeated, np.concatenate(candidates))
         score = judge.bellman(batch) if self.choice == 'bellman' else judge.uncertain(batch)
         # The first of equals.
         best: NDArray[np.intp] = score.reshape(CANDIDATES, -1).argmax(axis=0)
-        return np.stack(candidates)[best, np.arange(len(names))]
+        return np.stack(candidates)[best, np.arange(len(first))]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LambdaSampler(TransitionSampler):
-    """Returns with a random number of steps, whose mean is the truncated lambda-return.
-
-    Attributes:
-        trace: Probability of going on after each step.
-    """
+    """Returns with a random number of steps, whose mean is the truncated lambda-return."""
 
     trace: float = 0.7
 
@@ -166,11 +152,7 @@ class CuttingSampler(JudgedSampler):
 
 
 class JudgedExperience(Experience):
-    """Batches from a `JudgedSampler`. Statistics are collected without the judge.
-
-    Attributes:
-        judge: Scores of the learner.
-    """
+    """Batches from a `JudgedSampler`. Statistics are collected without the judge."""
 
     judge: Judge
 

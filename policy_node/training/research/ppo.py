@@ -18,9 +18,9 @@ from policy_node.policies.actor import MLP, Actor
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Ppo
-from policy_node.training.experience.transitions import Transitions
+from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.actor_critic import ActorCritic, Losses
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 from policy_node.training.research.rollouts import RolloutTransitions
 
 # Largest change of the probability of an action in an update (the paper's value).
@@ -34,9 +34,6 @@ class PPO(ActorCritic):
     """An actor, a critic of states, and one update.
 
     Args:
-        shape: Shape of both networks.
-        config: The configuration.
-        device: Device of the networks.
         workers: This worker among all; gradients are averaged over all.
     """
 
@@ -105,7 +102,6 @@ def log_probability(mean: Tensor, deviation: float, action: Tensor) -> Tensor:
 
     Args:
         mean: (..., action_size).
-        deviation: Standard deviation of the noise.
         action: (..., action_size), clipped.
     """
     inside = -0.5 * ((action - mean) / deviation).square() - math.log(deviation * _ROOT)

@@ -18,13 +18,13 @@ from policy_node.training.configuration import groups
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.experience.collector import Collector
 from policy_node.training.experience.experience import Experience
-from policy_node.training.experience.replay import Weigh
+from policy_node.training.experience.replay import Weigh, has_moved
 from policy_node.training.experience.sampling import TransitionSampler, sampler_fields
 from policy_node.training.learners import actor_critic
 from policy_node.training.learners.actor_critic import ActorCritic
 from policy_node.training.learners.ddpg import DDPG, Parts, TargetNetworks
 from policy_node.training.learners.imagined import ImaginingDDPG
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 from policy_node.training.research.conditions import (
     ConditionedDDPG,
     ConditionedSampler,
@@ -42,7 +42,6 @@ from policy_node.training.research.critics import (
     is_ensemble,
 )
 from policy_node.training.research.density_ratio import WeightedDDPG
-from policy_node.training.research.episode_weights import episode_weights
 from policy_node.training.research.frequent_actions import (
     HoldingCollector,
     HoldingDDPG,
@@ -50,11 +49,13 @@ from policy_node.training.research.frequent_actions import (
     PerturbingCollector,
     plain_actor,
 )
-from policy_node.training.research.gamble import GambleSimulation
+from policy_node.training.research.gamble import GambleSimulation, without_landings
 from policy_node.training.research.hierarchy import (
     LOW_SOURCES,
+    GuidedCollector,
     HierarchicalDDPG,
     HierarchicalExperience,
+    subgoal_columns,
 )
 from policy_node.training.research.judged import (
     ChoosingSampler,
@@ -66,7 +67,6 @@ from policy_node.training.research.judged import (
 )
 from policy_node.training.research.ppo import PPO
 from policy_node.training.research.rollouts import OnPolicyExperience, RolloutSampler
-from policy_node.training.research.subgoals import GuidedCollector, subgoal_columns
 
 __all__ = [
     'Ensemble',
@@ -122,10 +122,6 @@ def make_collector(simulation: Simulation, seeds: list[int], config: TrainConfig
 def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
     """Return what makes transitions.
 
-    Args:
-        config: The configuration.
-        metric: Distances, thresholds and reward of the task.
-
     Raises:
         ValueError: If the configuration replaces the own reward of a third-party task.
     """
@@ -140,7 +136,7 @@ def make_sampler(config: TrainConfig, metric: GoalMetric) -> TransitionSampler:
     if returns and returns.correction == 'lambda':
         return LambdaSampler(**fields, trace=returns.trace)
     if returns and returns.correction == 'cut':
-        return CuttingSampler(**fields, cut_distance=returns.cut_distance)
+        return CuttingSampler(**fields)
     if config.find(groups.Hierarchical):
         return TransitionSampler(**fields, sources=LOW_SOURCES)
     if config.find(groups.Ppo):
@@ -156,16 +152,7 @@ def make_learner(
     sampler: TransitionSampler,
     generator: np.random.Generator,
 ) -> tuple[ActorCritic, Experience]:
-    """Return the learner and its experience.
-
-    Args:
-        config: The configuration.
-        spec: The task.
-        device: Device of the networks.
-        workers: This worker among all.
-        sampler: Makes transitions.
-        generator: Random generator of drawing and relabelling.
-    """
+    """Return the learner and its experience."""
     common = config, spec, workers, sampler, generator
     weigh = _weights_of(config, spec)
     if config.find(groups.Ppo):
@@ -205,5 +192,7 @@ def _extra_actions(config: TrainConfig) -> int:
 
 
 def _weights_of(config: TrainConfig, spec: TaskSpec) -> Weigh:
-    kind, rate = config.replay.episode_weights, config.collect.control_hz
-    return episode_weights(kind, spec, rate, config.collect.gamble)
+    """Return the function that finds episodes with a motion; a landing of a gamble is none."""
+    if not config.collect.gamble:
+        return has_moved
+    return lambda episodes: has_moved(without_landings(episodes, spec))

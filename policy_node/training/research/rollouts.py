@@ -41,10 +41,16 @@ from policy_node.training.experience.hindsight import (
     draw_sources,
     goals_of,
 )
-from policy_node.training.experience.replay import Episodes, Weigh, draw_by, has_moved
+from policy_node.training.experience.replay import (
+    Episodes,
+    Starts,
+    Transitions,
+    Weigh,
+    draw_by,
+    has_moved,
+)
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.experience.transitions import Starts, Transitions
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 
 _OUTCOME = 'outcome'
 # Number of episodes whose outcomes are used, states of each, and outcomes to choose from.
@@ -92,7 +98,6 @@ class Rollouts:
     """Episodes of T steps with their rewards and advantages.
 
     Attributes:
-        episodes: The episodes.
         reward: (episodes, T).
         log_probability: (episodes, T) of the actions.
         advantage: (episodes, T).
@@ -132,10 +137,7 @@ class RolloutMaker:
     """Makes rollouts of episodes.
 
     Attributes:
-        critique: The learner that collected the episodes.
         compute_reward: (achieved_goal, desired_goal) -> reward, batched.
-        gamma: Discount of one step.
-        trace: Lambda of the advantages.
         corrects: Whether replayed episodes get per-decision weights.
     """
 
@@ -149,7 +151,6 @@ class RolloutMaker:
         """Return rollouts of episodes with their own goals, and with each of `goals`.
 
         Args:
-            episodes: The episodes as collected.
             goals: Goals (episodes, goal_size) to replay them for.
         """
         own = self._under(episodes)
@@ -168,7 +169,6 @@ class RolloutMaker:
         """Return rollouts for the goals that the episodes have.
 
         Args:
-            episodes: The episodes.
             meant: Log probabilities (episodes, T) of the actions for their original goals; None
                 treats the goals of the episodes as the original ones.
         """
@@ -203,8 +203,6 @@ def advantages(
     Args:
         reward: (episodes, T).
         value: (episodes, T + 1); episodes are cut, not terminated, so the last value counts.
-        gamma: Discount of one step.
-        trace: Lambda.
         log_ratio: (episodes, T) log pi(a | s, g') - log pi(a | s, g) of actions for another goal g;
             None if the actions were for this goal.
     """
@@ -259,7 +257,6 @@ class Outcomes:
     Attributes:
         before: (count, goal_size) achieved in first states.
         after: (count, goal_size) achieved in later states, each not met by `before`.
-        metric: Distances of the task.
     """
 
     before: Array32
@@ -300,9 +297,6 @@ def goals_in_hindsight(
     """Return a goal for each whole episode, (episodes, goal_size), from the sources of a mixture.
 
     Args:
-        episodes: The episodes.
-        mixture: Probability of each source.
-        generator: Random generator.
         outcomes: Outcomes of other episodes for the source `outcome`; without any the goal stays.
     """
     count, names = len(episodes), list(mixture)
@@ -319,11 +313,7 @@ def goals_in_hindsight(
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutSampler(TransitionSampler):
-    """A sampler with the metric of the task.
-
-    Attributes:
-        metric: Distances of the task.
-    """
+    """A sampler with the metric of the task."""
 
     metric: GoalMetric | None = None
 
@@ -333,11 +323,6 @@ class OnPolicyExperience(Experience):
 
     Args:
         config: The configuration; `trace` is the lambda of the advantages.
-        spec: The task.
-        workers: This worker among all.
-        sampler: Computes rewards, and makes transitions for the normalizers.
-        generator: Random generator.
-        critique: The learner.
         weigh: Weights of episodes for `moved_share`.
     """
 

@@ -7,8 +7,6 @@ with the missing points.
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import json
 import multiprocessing
 import os
@@ -33,9 +31,9 @@ from node_runtime.command_line import (
     say,
     whole_number,
 )
-from policy_node.policies.files import to_json, write_file
+from policy_node.policies.files import to_csv, to_json, write_file
 from policy_node.policies.policy import LoadedPolicy
-from policy_node.training.evaluation.episodes import (
+from policy_node.training.evaluation import (
     FIRST_SEED,
     EpisodeOutcomes,
     evaluate,
@@ -220,10 +218,19 @@ def _measured(point: Point, outcomes: EpisodeOutcomes) -> dict[str, Any]:
 
 def _to_csv(result: dict[str, Any]) -> bytes:
     """Return a CSV file with a row per point."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator='\n')
-    writer.writerow(['disturbance', 'level', 'success', 'low_95', 'high_95', 'dropped', 'diverged'])
-    for each in result['points'].values():
-        rest = (each['success'], *each['success_interval_95'], each['dropped'], each['diverged'])
-        writer.writerow([each['disturbance'], each['level'], *rest])
-    return file.getvalue().encode()
+    columns = ['disturbance', 'level', 'success', 'low_95', 'high_95', 'dropped', 'diverged']
+    points = result['points'].values()
+    return to_csv(
+        columns,
+        (
+            [
+                each['disturbance'],
+                each['level'],
+                each['success'],
+                *each['success_interval_95'],
+                each['dropped'],
+                each['diverged'],
+            ]
+            for each in points
+        ),
+    )

@@ -61,11 +61,7 @@ def _panel(axes: Any, labels: list[str], measured: list[Any], undisturbed: float
 
 
 def draw_overview(results: Sequence[Mapping[str, Any]]) -> bytes:
-    """Return a PNG with one row per policy: the level of each disturbance that it withstands.
-
-    Args:
-        results: What the command wrote, one per policy.
-    """
+    """Return a PNG with one row per policy: the level of each disturbance that it withstands."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12.0, 1.4 + 0.32 * len(results)), layout='constrained')

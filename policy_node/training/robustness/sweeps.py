@@ -18,8 +18,6 @@ class Sweep:
     """One disturbance at rising levels.
 
     Attributes:
-        name: Name in files and figures.
-        unit: Unit of the levels.
         levels: Levels, mildest first.
         at: Makes the disturbances of a level, as `Disturbances.from_dict` reads them.
         needs_object: Whether only tasks with an object have it.
@@ -108,9 +106,7 @@ def kept_up_to(sweep: Sweep, success: Mapping[str, float], undisturbed: float) -
     """Return the highest level up to which `KEPT` of the success is kept at every level.
 
     Args:
-        sweep: The disturbance.
         success: Success by `Point.key`.
-        undisturbed: Success without disturbances.
 
     Returns:
         The level; None if the success is lost at the first one.

@@ -22,11 +22,9 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.policy import past_after
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Imitation
-from policy_node.training.evaluation.episodes import EpisodeOutcomes
-from policy_node.training.evaluation.evaluator import Evaluator, training_seeds
+from policy_node.training.evaluation import EpisodeOutcomes, Evaluator, training_seeds
 from policy_node.training.learners.ddpg import Critic
-from policy_node.training.machine.distributed import Workers
-from policy_node.training.machine.host import split_threads
+from policy_node.training.machine import Workers, split_threads
 from policy_node.training.research.registry import make_simulation, network_shape
 from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.run_folder import LATEST_FILE, RunFolder

@@ -13,13 +13,7 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import to_flat
 from policy_node.training.configuration.groups import Critics
-from policy_node.training.learners.actor_critic import ActorCritic
-from policy_node.training.learners.widening import (
-    can_widen,
-    first_weights,
-    widened,
-    with_inputs,
-)
+from policy_node.training.learners.actor_critic import ActorCritic, first_weights, with_inputs
 from policy_node.training.research.registry import (
     Ensemble,
     acting_input,
@@ -41,29 +35,12 @@ _CRITICS = ('critic', 'target_critic')
 _PREFIXES = tuple(f'{part}.' for part in _CRITICS)
 
 
-def described(shape: NetworkShape, goal_features: str) -> dict[str, object]:
-    """Return sizes and inputs of networks by name, to compare two networks."""
-    return {
-        'observation': shape.observation_size,
-        'goal': shape.goal_size,
-        'action': shape.action_size,
-        'hidden_sizes': shape.hidden_sizes,
-        'layer_norm': shape.layer_norm,
-        'goal_features': goal_features,
-        'past_actions': shape.past_actions,
-        'inputs': shape.feature_size,
-    }
-
-
 @dataclass(frozen=True, slots=True)
 class InitialNetworks:
     """Weights and normalisers to start from.
 
     Attributes:
         tensors: Named as in a training state, without optimisers and generators.
-        shape: Shape of the actor.
-        goal_features: Kind of inputs.
-        norm: Normalisation of the hidden layers of the critic.
         origin: Name, task, environment steps and command of their training, for the record.
         valued_by: Fields of the run that give the values of its critic a meaning (`VALUED_BY`).
     """
@@ -82,15 +59,11 @@ class InitialNetworks:
 
     def require_fit(self, config: TrainConfig) -> None:
         """Raise ValueError if a run with this configuration cannot start from these networks."""
-        ours = described(network_shape(config), config.network.goal_features)
-        theirs = described(self._shape_in(config), self.goal_features)
-        if can_widen(self.shape.hidden_sizes, config.network.hidden_sizes):
-            theirs['hidden_sizes'] = config.network.hidden_sizes
+        ours = _described(network_shape(config), config.network.goal_features)
+        theirs = _described(self._shape_in(config), self.goal_features)
         differing = [
             f'{name} {old}, now {ours[name]}' for name, old in theirs.items() if old != ours[name]
         ]
-        if theirs['hidden_sizes'] != ours['hidden_sizes']:
-            differing.append('allowed hidden_sizes: as many, each a whole multiple')
         if differing:
             origin = f'{self.origin["name"]} ({self.origin["task"]})'
             raise ValueError(f'{config.task} cannot start from {origin}: {"; ".join(differing)}')
@@ -100,7 +73,7 @@ class InitialNetworks:
 
         - A critic is left out if its hidden layers have another normalisation, or its values
           another meaning. A critic with another `gamma` stays; `critic_first` lets it adapt.
-        - Hidden layers may become wider, and past actions may become inputs.
+        - Past actions may become inputs.
         - If the object's position counts only in the new task, the weights of the goal position
           become zero. In the old task it equalled that of the object, so the networks have learnt
           nothing from it. An actor that dropped 1 block in 200 would drop half.
@@ -126,14 +99,8 @@ class InitialNetworks:
         critic = config.find(Critics) or Critics()
         values = {name: to_flat(config)[name] for name in self.valued_by}
         if critic.norm != self.norm or values != self.valued_by:
-            fitted = fitted.without_critic()
-        else:
-            fitted = fitted.with_critics(critic.critics)
-        if config.network.hidden_sizes == shape.hidden_sizes:
-            return fitted
-        wider = replace(shape, hidden_sizes=config.network.hidden_sizes)
-        tensors = widened(fitted.tensors, config.network.hidden_sizes)
-        return replace(fitted, tensors=tensors, shape=wider)
+            return fitted.without_critic()
+        return fitted.with_critics(critic.critics)
 
     def _shape_in(self, config: TrainConfig) -> NetworkShape:
         """Return the shape with the past actions of a run, or with their own if they have some."""
@@ -192,3 +159,17 @@ class InitialNetworks:
                 completed = module.completed(given)
                 tensors |= {f'{part}.{name}': value for name, value in completed.items()}
         return tensors
+
+
+def _described(shape: NetworkShape, goal_features: str) -> dict[str, object]:
+    """Return sizes and inputs of networks by name."""
+    return {
+        'observation': shape.observation_size,
+        'goal': shape.goal_size,
+        'action': shape.action_size,
+        'hidden_sizes': shape.hidden_sizes,
+        'layer_norm': shape.layer_norm,
+        'goal_features': goal_features,
+        'past_actions': shape.past_actions,
+        'inputs': shape.feature_size,
+    }

@@ -1,24 +1,22 @@
-"""Read the networks that a run starts from: of another run, of an actor, or the mean of several."""
+"""Read the networks that a run starts from: those of another run or of an actor."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from msgs_spec.tasks import task_spec
 from policy_node.policies import checkpoint
 from policy_node.policies.checkpoint import ActorInfo
-from policy_node.policies.shipped import actor_path
+from policy_node.policies.loading import actor_path
 from policy_node.training.configuration.config import TrainConfig, unusual_networks
 from policy_node.training.configuration.flat import config_from_dict, to_flat
 from policy_node.training.configuration.groups import Critics
 from policy_node.training.research.registry import acting_input, network_shape, without_input
-from policy_node.training.runs.initial_networks import VALUED_BY, InitialNetworks, described
+from policy_node.training.runs.initial_networks import VALUED_BY, InitialNetworks
 from policy_node.training.runs.run_folder import STATE_FILE, companion_file
 from policy_node.training.runs.training_state import part_of, read_state
 
@@ -34,19 +32,14 @@ def read_initial_networks(name: str) -> InitialNetworks:
     Args:
         name: A run folder, for its latest networks; a shipped actor; or the file of an actor. The
             critic of an actor is in `<Task>.training.safetensors` beside it, or in the training
-            state of its run folder. Several names with commas: the mean of these networks.
+            state of its run folder.
 
     Raises:
-        ValueError: If an actor or run is missing or damaged, or several do not fit each other.
+        ValueError: If the actor or run is missing or damaged.
     """
     path = Path(os.path.expanduser(name))
     if path.is_dir():
         return _of_run(path)
-    if ',' in name and not path.exists():
-        names = [part.strip() for part in name.split(',')]
-        if not all(names):
-            raise ValueError(f'init_from {name!r} has an empty name')
-        return mean_of([read_initial_networks(part) for part in names])
     return _of_actor(name, actor_path(name))
 
 
@@ -151,85 +144,6 @@ def _sums(mean: Tensor, std: Tensor, count: int) -> dict[str, Tensor]:
     mean, std = mean.double(), std.double()
     square = (std.square() + mean.square()) * number
     return {'count': number, 'total': mean * number, 'total_square': square}
-
-
-# Means of networks.
-
-
-def mean_of(parts: list[InitialNetworks]) -> InitialNetworks:
-    """Return the mean, weight by weight, of networks that were trained from the same start.
-
-    The mean is often better than each of them (Wortsman et al. 2022, "Model soups", arXiv
-    2203.05482). Parts that only some have, such as a critic, are left out. Tasks may differ, as
-    RotateZ and RotateParallel do. The mean has the task of the first.
-
-    Raises:
-        ValueError: If sizes or inputs differ, or the position counts for only some of the tasks.
-    """
-    first = parts[0]
-    for part in parts:
-        ours, theirs = _described(first), _described(part)
-        differing = [
-            f'{name} {value} and {theirs[name]}'
-            for name, value in ours.items()
-            if name in theirs and theirs[name] != value
-        ]
-        if (part.shape, ours['position_counts']) != (first.shape, theirs['position_counts']):
-            names = f'{first.origin["name"]} and {part.origin["name"]}'
-            raise ValueError(f'no mean of {names}: {"; ".join(differing)}')
-    kinds = [(part.norm, part.valued_by) for part in parts]
-    if any(kind != kinds[0] for kind in kinds):
-        parts = [part.without_critic() for part in parts]
-    most = max(1, *(part.critics for part in parts))
-    first, *_ = parts = [part.with_critics(most) for part in parts]
-    shared = set.intersection(*(set(part.tensors) for part in parts))
-    tensors = {
-        name: _mean([part.tensors[name] for part in parts])
-        for name in first.tensors
-        if name in shared
-    }
-    origin = {
-        'name': ','.join(part.origin['name'] for part in parts),
-        'critic': any(name.startswith('critic.') for name in tensors),
-        'task': first.origin['task'],
-        'env_steps': 0,
-        'command': '',
-        'mean_of': [part.origin for part in parts],
-    }
-    return replace(first, tensors=tensors, origin=_shortened(origin, set()))
-
-
-def _mean(tensors: list[Tensor]) -> Tensor:
-    # Counts, such as the number of normalised batches, are whole numbers.
-    first = tensors[0]
-    return torch.stack(tensors).mean(dim=0) if first.is_floating_point() else first
-
-
-def _described(networks: InitialNetworks) -> dict[str, object]:
-    """Return what must agree between the parts of a mean, by name."""
-    spec = task_spec(networks.origin['task'])
-    found = described(networks.shape, networks.goal_features)
-    found['position_counts'] = spec.position_counts
-    if networks.goal_features != 'plain':
-        found['ignores_z_rotation'] = spec.ignores_z_rotation
-    if networks.goal_features == 'symmetric':
-        found['object_symmetry'] = spec.object_symmetry
-    return found
-
-
-def _shortened(origin: dict[str, Any], known: set[tuple[Any, ...]]) -> dict[str, Any]:
-    """Return an origin in which repeated origins have only name, task, steps and hash."""
-    key = origin.get('sha256', origin['name']), origin['env_steps']
-    if key in known:
-        short = ('name', 'task', 'env_steps', 'sha256')
-        return {name: origin[name] for name in short if name in origin}
-    known.add(key)
-    result = dict(origin)
-    if origin.get('init_from'):
-        result['init_from'] = _shortened(origin['init_from'], known)
-    if origin.get('mean_of'):
-        result['mean_of'] = [_shortened(part, known) for part in origin['mean_of']]
-    return result
 
 
 def steps_behind(run: dict[str, Any]) -> int:

@@ -27,10 +27,14 @@ from policy_node.training.configuration.config import TrainConfig, idle_parts
 from policy_node.training.configuration.flat import config_from_dict, removed_fields, to_flat
 from policy_node.training.configuration.groups import Imitation
 from policy_node.training.experience.replay import Episodes
-from policy_node.training.machine.devices import choose_device
-from policy_node.training.machine.distributed import is_first_worker, join_workers, leave_workers
-from policy_node.training.machine.host import available_memory, why_too_large
-from policy_node.training.runs.finite_checks import TrainingError
+from policy_node.training.machine import (
+    available_memory,
+    choose_device,
+    is_first_worker,
+    join_workers,
+    leave_workers,
+    why_too_large,
+)
 from policy_node.training.runs.imitation import ImitationTrainer
 from policy_node.training.runs.initial_networks import InitialNetworks
 from policy_node.training.runs.read_networks import read_initial_networks
@@ -45,7 +49,7 @@ from policy_node.training.runs.run_folder import (
 )
 from policy_node.training.runs.run_log import Row, RunLog, draw_curve, read_progress
 from policy_node.training.runs.trainer import Trainer
-from policy_node.training.runs.training_state import Counters, read_state
+from policy_node.training.runs.training_state import Counters, TrainingError, read_state
 
 # Called after each cycle with its row of `progress.csv`; the run ends if it returns False.
 OnCycle = Callable[[Row], object]
@@ -64,7 +68,6 @@ class Caller:
 
     Attributes:
         on_cycle: Called after each cycle, or None.
-        quiet: Show no progress.
         error: Exception of `on_cycle`; it ends the run.
     """
 
@@ -82,8 +85,6 @@ class Ending:
     """The end of a run, or of one part of it.
 
     Attributes:
-        reason: Reason in words.
-        counters: Progress of the run.
         signal: Number of the signal that stopped it; 0 without a signal.
     """
 
@@ -129,11 +130,7 @@ def train_run(
     """Train in this process until a limit is reached or a signal arrives.
 
     Args:
-        config: The configuration.
-        output: Folder of the run.
         resume: Continue the run in the folder; otherwise the folder must contain no run.
-        command: Command line, for the record.
-        experience: Logged episodes to learn from as well.
         caller: The calling Python program; None for a command.
 
     Raises:
@@ -310,7 +307,6 @@ def _stop_on_signals(trainer: AnyTrainer, is_guest: bool = False) -> Iterator[li
     """End the run after the cycle on Ctrl-C, SIGTERM or SIGHUP, and at once on a second signal.
 
     Args:
-        trainer: Trainer of the run.
         is_guest: A second Ctrl-C raises KeyboardInterrupt instead of ending the process.
 
     Yields:

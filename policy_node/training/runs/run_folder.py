@@ -15,12 +15,11 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.checkpoint import ActorInfo
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import to_flat
-from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
-from policy_node.training.evaluation.evaluator import success_rate
+from policy_node.training.evaluation import EpisodeOutcomes, diagnose, success_rate
+from policy_node.training.experience.episode_files import save_replay
 from policy_node.training.experience.experience import Experience
-from policy_node.training.experience.replay_file import save_replay
 from policy_node.training.learners.actor_critic import ActorCritic
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 from policy_node.training.research.registry import plain_actor
 from policy_node.training.runs.training_state import Counters, is_finite, save_state
 
@@ -74,11 +73,7 @@ class RunFolder:
     """Save the actors and the training state of a run, on one of several workers.
 
     Attributes:
-        path: The folder.
-        config: Configuration of the run.
         workers: This worker among all. Only the first one writes actors and the state.
-        command: Command line, for the metadata of actors.
-        source_revision: Git revision of the source, for the metadata of actors.
         init_from: Origin of the first networks; empty if they were random.
     """
 
@@ -96,21 +91,8 @@ class RunFolder:
         rank = self.workers.rank
         return self.path / (REPLAY_FILE if rank == 0 else f'{rank}.{REPLAY_FILE}')
 
-    def keep_best(
-        self,
-        outcomes: EpisodeOutcomes,
-        actor: Actor,
-        counters: Counters,
-        env_steps: int | None = None,
-    ) -> None:
-        """Save an evaluated actor if its success is higher, or equal with a higher return.
-
-        Args:
-            outcomes: Its evaluation.
-            actor: The actor.
-            counters: Progress of the run, with the best evaluation so far.
-            env_steps: Environment steps of the actor; None means those of the run.
-        """
+    def keep_best(self, outcomes: EpisodeOutcomes, actor: Actor, counters: Counters) -> None:
+        """Save an evaluated actor if its success is higher, or equal with a higher return."""
         rule = self.config.collect.success_rule
         success = success_rate(outcomes, rule)
         mean_return = float(outcomes.episode_return.mean())
@@ -120,46 +102,32 @@ class RunFolder:
         if self.workers.is_first:
             measured = {'last_step': success, 'episodes': len(outcomes), 'rule': rule}
             measured |= {'mean_return': mean_return, **diagnose(outcomes)}
-            steps = counters.env_steps if env_steps is None else env_steps
-            self.save_actor(BEST_FILE, actor, steps, measured)
+            self.save_actor(BEST_FILE, actor, counters.env_steps, measured)
 
-    def check_best(self, counters: Counters) -> tuple[Actor, ActorInfo] | None:
-        """Compare the counters of a resumed run with its best actor, which may be newer.
+    def read_best(self, counters: Counters) -> None:
+        """Take the best success of a resumed run from its best actor, which may be newer.
 
-        If the actor is missing, damaged or of another task, the next evaluated actor replaces it.
-
-        Returns:
-            The best actor if it must be evaluated again, because it was measured by another rule or
-            on fewer episodes; else None.
+        If the actor is missing, damaged, of another task or had another evaluation, the next
+        evaluated actor replaces it.
         """
-        file = self.path / BEST_FILE
+        file, rule = self.path / BEST_FILE, self.config.collect.success_rule
+        if counters.best_success < 0 and not file.is_file():
+            return
         try:
-            if not file.is_file():
-                if counters.best_success < 0:
-                    return None
-                raise ValueError(f'{file} is missing')
-            actor, info = checkpoint.load(file, self.config.task)
+            found = checkpoint.read(file, self.config.task).info.success
+            episodes, success = found.get('episodes'), found.get('last_step')
+            is_short = is_finite(episodes) and episodes < self.config.run.evaluation_episodes
+            if is_short or found.get('rule', rule) != rule:
+                raise ValueError(f'{file} had another evaluation')
         except ValueError as error:
-            self._forget_best(counters, f'{error}; the next evaluated actor replaces it')
-            return None
-        found, rule = info.success, self.config.collect.success_rule
-        episodes = found.get('episodes')
-        is_short = is_finite(episodes) and episodes < self.config.run.evaluation_episodes
-        if is_short or found.get('rule', rule) != rule:
-            self._forget_best(counters, f'{file} had another evaluation; it is evaluated again')
-            return actor, info
-        success, mean_return = found.get('last_step'), found.get('mean_return')
-        is_measured = 'rule' in found and is_finite(episodes)
-        if is_measured and is_finite(success) and is_finite(mean_return) and 0 <= success <= 1:
-            known = counters.best_success, counters.best_return
+            if self.workers.is_first:
+                complain(NAME, f'{error}; the next evaluated actor replaces it')
+            unknown = Counters()
+            counters.best_success, counters.best_return = unknown.best_success, unknown.best_return
+            return
+        known, mean_return = (counters.best_success, counters.best_return), found.get('mean_return')
+        if is_finite(success) and is_finite(mean_return) and 0 <= success <= 1:
             counters.best_success, counters.best_return = max(known, (success, mean_return))
-        return None
-
-    def _forget_best(self, counters: Counters, why: str) -> None:
-        if self.workers.is_first:
-            complain(NAME, why)
-        unknown = Counters()
-        counters.best_success, counters.best_return = unknown.best_success, unknown.best_return
 
     def save_when_due(
         self, learner: ActorCritic, experience: Experience, counters: Counters

@@ -18,8 +18,7 @@ from rich.live import Live
 from rich.text import Text
 
 from node_runtime.signals import discard_unread_output
-from policy_node.training.evaluation.episodes import EpisodeOutcomes, diagnose
-from policy_node.training.evaluation.evaluator import success_rate
+from policy_node.training.evaluation import EpisodeOutcomes, diagnose, success_rate
 from policy_node.training.learners.actor_critic import Losses
 from policy_node.training.runs.run_folder import BOARD_FOLDER, PROGRESS_FILE
 from policy_node.training.runs.training_state import Counters
@@ -58,13 +57,9 @@ class RunLog:
     """Write one row per cycle; a resumed run appends to the same file.
 
     Args:
-        output: Folder of the run.
-        total_steps: Environment steps of the whole run, for the ETA.
         time_limit: Time limit of the run, seconds; 0 means none.
         resumed_steps: Environment steps of the checkpoint that the run resumes from. Later rows are
             removed, because the run repeats these steps.
-        quiet: Show no progress.
-        on_row: Called with each written row.
     """
 
     def __init__(

@@ -23,24 +23,16 @@ from policy_node.policies.actor import Actor
 from policy_node.policies.policy import Policy
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.groups import Critics, Ppo
-from policy_node.training.evaluation.episodes import EpisodeOutcomes
-from policy_node.training.evaluation.evaluator import Evaluator, training_seeds
+from policy_node.training.evaluation import EpisodeOutcomes, Evaluator, training_seeds
+from policy_node.training.experience.episode_files import load_replay
 from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.replay_file import load_replay
 from policy_node.training.learners.actor_critic import Losses
-from policy_node.training.machine.devices import choose_device
-from policy_node.training.machine.distributed import Workers
-from policy_node.training.machine.host import split_threads
+from policy_node.training.machine import Workers, choose_device, split_threads
 from policy_node.training.research.registry import (
     make_collector,
     make_learner,
     make_sampler,
     make_simulation,
-)
-from policy_node.training.runs.finite_checks import (
-    require_finite_episodes,
-    require_finite_losses,
-    require_finite_networks,
 )
 from policy_node.training.runs.initial_networks import CRITIC_FIRST, InitialNetworks
 from policy_node.training.runs.run_folder import NAME, RunFolder
@@ -52,6 +44,9 @@ from policy_node.training.runs.training_state import (
     fitting,
     load_networks,
     load_state,
+    require_finite_episodes,
+    require_finite_losses,
+    require_finite_networks,
     require_readable,
 )
 
@@ -76,11 +71,6 @@ class Trainer:
     """One run of one configuration, on one of several workers.
 
     Args:
-        config: The configuration.
-        output: Folder for checkpoints and logs.
-        workers: This worker among all.
-        command: Command line, for the metadata of checkpoints.
-        source_revision: Git revision of the source, for the metadata of checkpoints.
         init_from: Networks to start from; None starts from random ones.
     """
 
@@ -169,11 +159,7 @@ class Trainer:
         origin = state.extra.get('init_from', {})
         self._folder.init_from = origin
         self._let_critic_learn_first()
-        unmeasured = self._folder.check_best(self.counters)
-        if unmeasured is not None and self.workers.is_first:
-            actor, info = unmeasured
-            outcomes = self._evaluator.evaluate(actor, self.counters.best_success)
-            self._folder.keep_best(outcomes, actor, self.counters, info.env_steps)
+        self._folder.read_best(self.counters)
         # The state contains no simulations. Use new seeds, so that no episode is repeated.
         self.experience.generator = self._seed(self.counters.env_steps)
         limits = (self.counters.env_steps, self.config.replay.replay_transitions, MOST_REFILLED)
@@ -282,8 +268,8 @@ class Trainer:
             The first cycle; None if the run is stopped before.
         """
         while True:
-            actor, random, _ = self._prepare_collection(may_evaluate=False)
-            collected = self._collect_or_explain(submit(self._collect, actor, random, None))
+            actor, _ = self._prepare_collection(may_evaluate=False)
+            collected = self._collect_or_explain(submit(self._collect, actor, None))
             filled = self.experience.transitions >= self._steps_to_refill
             if not self.workers.any(not filled):
                 return collected
@@ -291,15 +277,15 @@ class Trainer:
             if self.workers.any(bool(self._stop_reason)):
                 return None
 
-    def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Policy, bool, Actor | None]:
-        """Prepare collection; return policy, whether actions are random, and actor to evaluate."""
+    def _prepare_collection(self, may_evaluate: bool = True) -> tuple[Policy, Actor | None]:
+        """Prepare collection; return the policy that collects and the actor to evaluate."""
         counters, steps = self.counters, self.counters.env_steps
         self.collector.exploration = self._exploration()
         actor, evaluated = self.learner.acting_policy(), None
         if may_evaluate and counters.updates > 0 and steps >= counters.next_evaluation:
             counters.next_evaluation = steps + self.config.run.evaluate_every
             evaluated = self._actor_to_evaluate()
-        return actor, steps < self.config.learner.exploration.random_steps, evaluated
+        return actor, evaluated
 
     def _actor_to_evaluate(self) -> Actor | None:
         """Return the actor to evaluate; None on all workers but the first."""
@@ -308,8 +294,8 @@ class Trainer:
         self._evaluator.others = self.learner.other_policies()
         return self.learner.evaluation_actor()
 
-    def _collect(self, policy: Policy, random: bool, evaluated: Actor | None) -> Collected:
-        return self._evaluate(Collected(*self.collector.collect(policy, random)), evaluated)
+    def _collect(self, policy: Policy, evaluated: Actor | None) -> Collected:
+        return self._evaluate(Collected(*self.collector.collect(policy)), evaluated)
 
     def _evaluate(self, collected: Collected, actor: Actor | None) -> Collected:
         if actor is None:

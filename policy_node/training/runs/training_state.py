@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from policy_node.policies.files import (
     LARGEST_POLICY,
@@ -22,8 +23,9 @@ from policy_node.policies.files import (
     write_file,
 )
 from policy_node.training.configuration.config import Limits
-from policy_node.training.experience.statistics import RunningStatistics
-from policy_node.training.learners.actor_critic import ActorCritic
+from policy_node.training.experience.experience import RunningStatistics
+from policy_node.training.experience.replay import Episodes
+from policy_node.training.learners.actor_critic import ActorCritic, Losses
 
 FORMAT = 'fetch_hand_training'
 FORMAT_VERSION = 1
@@ -317,3 +319,40 @@ def _load_optimizer(optimizer: torch.optim.Adam, tensors: dict[str, Tensor]) -> 
                 raise ValueError(f'{name} of parameter {number} is {given}, not {needed}')
     groups = optimizer.state_dict()['param_groups']
     optimizer.load_state_dict({'state': state, 'param_groups': groups})
+
+
+class TrainingError(RuntimeError):
+    """Training cannot continue; the message contains the step and the cause."""
+
+
+def require_finite_episodes(episodes: Episodes, counters: Counters) -> None:
+    """Raise `TrainingError` if an episode has a value that is not finite."""
+    for name in ('observation', 'achieved_goal', 'desired_goal', 'action'):
+        if not np.isfinite(getattr(episodes, name)).all():
+            raise TrainingError(
+                f'{name} is not finite after {counters.env_steps} environment steps'
+            )
+
+
+def require_finite_losses(losses: Sequence[Losses], counters: Counters) -> None:
+    """Raise `TrainingError` if a loss of the newest updates is not finite."""
+    first = counters.updates - len(losses)
+    for name in ('critic', 'actor'):
+        values = [getattr(loss, name) for loss in losses]
+        finite = torch.isfinite(torch.stack(values)).tolist() if values else []
+        if not all(finite):
+            index = finite.index(False)
+            raise TrainingError(
+                f'{name} loss is {float(values[index])} in update {first + index + 1}, '
+                f'after {counters.env_steps} environment steps'
+            )
+
+
+def require_finite_networks(modules: Mapping[str, nn.Module], counters: Counters) -> None:
+    """Raise `TrainingError` if a weight is not finite; the loss may still have been finite."""
+    for name, module in modules.items():
+        if key := first_not_finite(module.state_dict()):
+            raise TrainingError(
+                f'{name}.{key} is not finite after update {counters.updates}, '
+                f'after {counters.env_steps} environment steps'
+            )

@@ -13,9 +13,8 @@ from msgs_spec.arrays import Array
 from msgs_spec.tasks import DEFAULT_CONTROL_HZ
 from policy_node.policies import checkpoint
 from policy_node.training.configuration.recipes import ticks_of_40_ms
-from policy_node.training.evaluation.episodes import FIRST_SEED, evaluate
-from policy_node.training.evaluation.evaluator import success_rate
-from policy_node.training.machine.host import processor
+from policy_node.training.evaluation import FIRST_SEED, evaluate, success_rate
+from policy_node.training.machine import processor
 from policy_node.training.research.registry import make_simulation
 from policy_node.training.runs.run_folder import COMMAND_FILE, LATEST_FILE, PROGRESS_FILE
 from policy_node.training.runs.run_log import read_progress
@@ -152,7 +151,8 @@ def sum_up(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     timed = [run for run in runs if run['area_in_time'] is not None]
     found = {'task': first['task'], 'arm': first['arm'], 'seeds': len(runs), 'timed': len(timed)}
     for name in ('area', 'final_success'):
-        found |= _quartiles(name, [float(run[name]) for run in runs])
+        known = [float(run[name]) for run in runs if run[name] is not None]
+        found |= _quartiles(name, known)
     for name in ('processor_seconds', 'area_in_time', 'samples_per_processor_second'):
         found |= _quartiles(name, [float(run[name]) for run in timed])
     # A censored run counts as slower than any other.

@@ -30,7 +30,6 @@ class Published:
     Attributes:
         success: Success at the last step, as text.
         kind: `exact`, `quoted` or `figure`.
-        source: Who, and after how much training.
     """
 
     success: str

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,13 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from fetch_hand_sim.datasets.writing import alone_in
 from msgs_spec.arrays import Array
-from msgs_spec.tasks import task_spec
-from policy_node.policies.files import write_files
+from policy_node.policies.files import to_csv, write_files
 from policy_node.training.studies.measures import (
     GOOD_SUCCESS,
     Curve,
@@ -25,18 +21,14 @@ from policy_node.training.studies.measures import (
     is_significant,
     sum_up,
 )
-from policy_node.training.studies.published import BEST, RERUN
 from policy_node.training.studies.store import Run, in_order, read_runs
-from policy_node.training.studies.study import Job, Study
+from policy_node.training.studies.study import Study
 
 # The page of a study keeps its table between these lines.
 BEGIN, END = '<!-- table: written by `benchmark` -->', '<!-- end of the table -->'
 ARMS, FIGURE, PAGE = 'arms.csv', 'figure.png', 'README.md'
 # Fewer seeds support no claim.
 _ENOUGH_SEEDS = 5
-# An epoch of the paper: 50 cycles of 2 episodes on each of 19 workers.
-EPISODES_PER_EPOCH = 1900
-FAST_SUCCESS = 0.95
 # Okabe and Ito 2008: safe for colour blindness. Further curves are dashed.
 _COLORS = ('#000000', '#0072B2', '#D55E00', '#009E73', '#CC79A7', '#56B4E9', '#E69F00')
 # Most curves of one panel.
@@ -73,8 +65,8 @@ def write_study(study: Study, output: Path) -> None:
         labels = {arm.name: arm.label for arm in study.arms}
         page, table = output / PAGE, format_study(study, arms)
         contents = {
-            ARMS: to_csv(arms),
-            FIGURE: draw(_bands(runs), labels, paper_epochs=False),
+            ARMS: arms_csv(arms),
+            FIGURE: draw(_bands(runs), labels),
             PAGE: _with_table(page.read_text() if page.is_file() else '', table),
         }
         write_files({output / name: content for name, content in contents.items()})
@@ -95,6 +87,11 @@ def sum_up_arms(study: Study, runs: Sequence[Run]) -> list[dict[str, Any]]:
         for name, group in measured.items():
             rows.append(sum_up(group) | compared(group, [] if name == first else baseline))
     return rows
+
+
+def arms_csv(arms: Sequence[Mapping[str, Any]]) -> bytes:
+    """Return the contents of `arms.csv`."""
+    return to_csv(list(arms[0]), (list(row.values()) for row in arms))
 
 
 def _grouped(runs: Sequence[Run], name: str) -> dict[str, list[Run]]:
@@ -197,8 +194,8 @@ def _against(study: Study, row: Mapping[str, Any], arms: Sequence[Mapping[str, A
 
 
 def _quartiles(row: Mapping[str, Any], name: str) -> str:
-    values = (row[f'{name}_{part}'] for part in ('median', 'lower', 'upper'))
-    return '{:.3f} ({:.3f} ... {:.3f})'.format(*values)
+    values = [row[f'{name}_{part}'] for part in ('median', 'lower', 'upper')]
+    return '-' if '' in values else '{:.3f} ({:.3f} ... {:.3f})'.format(*values)
 
 
 def _with_table(page: str, table: str) -> bytes:
@@ -210,90 +207,14 @@ def _with_table(page: str, table: str) -> bytes:
     return text.encode()
 
 
-def write_comparison(jobs: Sequence[Job], output: Path) -> None:
-    """Write and print figure and table of stored jobs of the studies `paper` and `best`.
-
-    Raises:
-        ValueError: If a stored run cannot be read.
-        OSError: If the report cannot be written; the earlier one stays.
-    """
-    stored = read_runs(output)
-    runs = [stored[job.key] for job in jobs if job.key in stored]
-    if not runs:
-        return
-    labels = {job.arm.name: job.arm.label for job in jobs}
-    table = [
-        _comparison_row(task, labels[arm], arm, group)
-        for task, of_task in _grouped(runs, 'task').items()
-        for arm, group in _grouped(of_task, 'arm').items()
-    ]
-    text = _format_comparison(table)
-    contents = {
-        'benchmark.csv': to_csv(table),
-        'benchmark.png': draw(_bands(runs), labels),
-        'benchmark.txt': text.encode(),
-    }
-    with alone_in(output):
-        write_files({output / name: content for name, content in contents.items()})
-    print(text, end='')
-    print(f'figure and tables in {output}')
-
-
-def _comparison_row(task: str, label: str, arm: str, runs: Sequence[Run]) -> dict[str, Any]:
-    """Return final success over seeds beside the published numbers: one row of the table."""
-    curves = [Curve.of(run) for run in runs]
-    lower, median, upper = np.percentile([curve.success[-1] for curve in curves], [25, 50, 75])
-    # The middle of an even number with an unreached one has no value: the slower one counts.
-    fast = sorted(curve.steps_to(FAST_SUCCESS) for curve in curves)[len(curves) // 2]
-    return {
-        'task': task,
-        'arm': arm,
-        'label': label,
-        'seeds': len(curves),
-        'env_steps': int(min(curve.env_steps[-1] for curve in curves)),
-        'final_median': float(median),
-        'final_lower_quartile': float(lower),
-        'final_upper_quartile': float(upper),
-        f'median_steps_to_{FAST_SUCCESS}': None if np.isinf(fast) else int(fast),
-        'published_rerun': str(RERUN.get((task, arm), 'none')),
-        'published_best': str(BEST.get(task, 'none')),
-    }
-
-
-def _format_comparison(table: Sequence[dict[str, Any]]) -> str:
-    """Return the results as text, and below them the published numbers with their sources."""
-    columns = ('task', 'arm', 'seeds', 'steps', 'median', 'quartiles', f'steps to {FAST_SUCCESS}')
-    results = Table(*columns, title='success at the last step, over seeds')
-    published = Table('task', 'arm', 'published success (kind; source)')
-    for row in table:
-        fast = row[f'median_steps_to_{FAST_SUCCESS}']
-        results.add_row(
-            row['task'],
-            row['label'],
-            str(row['seeds']),
-            f'{row["env_steps"]:,}',
-            f'{row["final_median"]:.3f}',
-            f'{row["final_lower_quartile"]:.3f} ... {row["final_upper_quartile"]:.3f}',
-            'not reached' if fast is None else f'{fast:,}',
-        )
-        published.add_row(row['task'], row['label'], row['published_rerun'])
-    for row in {row['task']: row for row in table}.values():
-        published.add_row(row['task'], 'best of any method', row['published_best'])
-    text = io.StringIO()
-    Console(file=text, width=110).print(results, published)
-    return text.getvalue()
-
-
-def draw(bands: Bands, labels: Mapping[str, str], paper_epochs: bool = True) -> bytes:
+def draw(bands: Bands, labels: Mapping[str, str]) -> bytes:
     """Return a PNG: the median of each variant over its quartiles.
 
     A task has one panel. A task with more than `_MOST_LINES` variants has one panel for each
     variant but the first, the baseline, which every one of these panels shows as well.
 
     Args:
-        bands: The curves.
         labels: By variant, in the order of their colours; the baseline first.
-        paper_epochs: Mark the epochs of the paper on a second axis.
     """
     from matplotlib.figure import Figure
 
@@ -314,7 +235,7 @@ def draw(bands: Bands, labels: Mapping[str, str], paper_epochs: bool = True) -> 
                 style = '--' if index >= len(_COLORS) else '-'
                 axes.fill_between(band.env_steps, band.lower, band.upper, color=color, alpha=0.2)
                 axes.plot(band.env_steps, band.median, style, color=color, label=label)
-        _label(axes, task, top, paper_epochs)
+        _label(axes, top)
         axes.set_title(title, fontsize='small' if is_small else 'medium')
     _add_legend(figure, list(panels[: len(shown)]), columns)
     file = io.BytesIO()
@@ -354,25 +275,10 @@ def _top_of_axis(bands: Bands) -> float:
     return 1.0 if highest > 0.4 else max(1.25 * highest, 0.05)
 
 
-def _label(axes: Any, task: str, top: float, paper_epochs: bool) -> None:
+def _label(axes: Any, top: float) -> None:
     from matplotlib.ticker import EngFormatter
 
-    unit = 'environment steps' if paper_epochs else 'environment steps (40 ms)'
-    axes.set(xlabel=unit, ylabel='success at the last step')
+    axes.set(xlabel='environment steps (40 ms)', ylabel='success at the last step')
     axes.set_ylim(-0.02 * top, 1.02 * top)
     axes.xaxis.set_major_formatter(EngFormatter(sep=''))
     axes.grid(alpha=0.3)
-    if not paper_epochs:
-        return
-    steps = EPISODES_PER_EPOCH * task_spec(task).episode_ticks
-    epochs = axes.secondary_xaxis('top', functions=(lambda x: x / steps, lambda x: x * steps))
-    epochs.set_xlabel("the paper's epochs")
-
-
-def to_csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """Return rows with equal columns as CSV."""
-    file = io.StringIO()
-    writer = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
-    writer.writeheader()
-    writer.writerows(rows)
-    return file.getvalue().encode()

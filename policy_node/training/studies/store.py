@@ -14,7 +14,7 @@ from typing import Any
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies.files import write_file
 from policy_node.training.configuration.recipes import STEP_COUNTS
-from policy_node.training.studies.study import Job, Study, differing_fields, run_name
+from policy_node.training.studies.study import Job, Study, differing_fields
 
 RUNS = 'runs.jsonl'
 
@@ -110,37 +110,3 @@ def require_alike(study: Study, jobs: Sequence[Job], folder: Path) -> None:
                     f'{folder} contains runs of {task}/{arm} with '
                     f'{"; ".join(differing.values())}. Choose another --report.'
                 )
-
-
-def take_from_other_studies(jobs: Sequence[Job], folder: Path) -> None:
-    """Copy runs with equal settings from the reports of other studies.
-
-    Equal settings give equal runs, so no run is trained twice. Jobs with a run folder or a stored
-    run are left alone.
-
-    Args:
-        jobs: Jobs of one study.
-        folder: Its report, beside the reports of the other studies.
-    """
-    here = read_runs(folder)
-    beside = [path.parent for path in sorted(folder.parent.glob(f'*/{RUNS}'))]
-    others = {path: read_runs(path) for path in beside if path != folder}
-    for job in jobs:
-        if job.folder.exists() or holds(here, job):
-            continue
-        for path, runs in others.items():
-            if (run := _equal_run(runs, job)) is not None:
-                name = f'{run_name(run["task"], run["arm"], run["seed"])} of {path}'
-                add_run(folder, {**run, 'arm': job.arm.name, 'command': f'as {name}'})
-                print(f'{job.name} is {name}', flush=True)
-                break
-
-
-def _equal_run(runs: Runs, job: Job) -> Run | None:
-    """Return a run of any variant that is configured and measured like a job, or None."""
-    wanted = (job.config.task, job.config.seed, job.final_episodes)
-    for run in runs.values():
-        if (run['task'], run['seed'], run['final_episodes']) == wanted:
-            if not _differing_runs(run, job):
-                return run
-    return None

@@ -53,11 +53,7 @@ class Outcome(Enum):
 
 
 class JobsStopped(KeyboardInterrupt):
-    """A signal stopped jobs.
-
-    Attributes:
-        exit_code: Exit code of the command.
-    """
+    """A signal stopped jobs."""
 
     def __init__(self, outcome: Outcome) -> None:
         super().__init__()
@@ -88,15 +84,13 @@ def run_jobs(
     jobs: Sequence[Job],
     place: Place,
     report: Path,
-    when_finished: Callable[[], object] | None = None,
+    when_finished: Callable[[], object],
 ) -> bool:
     """Run all unfinished jobs, each after the job it starts from; return whether all finished.
 
     Args:
         jobs: All jobs, the most important first.
         place: The place where they run.
-        report: Folder that stores their measures.
-        when_finished: Called after each finished job.
 
     Raises:
         JobsStopped: If a signal stopped a job; no further job starts then.
@@ -119,8 +113,7 @@ def run_jobs(
         if outcome is Outcome.FINISHED:
             left -= 1
             _print(f'{job.name} is finished; {left} to go')
-            if when_finished is not None:
-                _try_to_report(when_finished)
+            _try_to_report(when_finished)
     for outcome in outcomes:
         if outcome.is_stopped:
             raise JobsStopped(outcome)
@@ -142,13 +135,7 @@ def _print(text: str) -> None:
 
 
 def attempt(job: Job, report: Path, command: str) -> Outcome:
-    """Train or continue a job in this process, measure it and store the measures.
-
-    Args:
-        job: The job.
-        report: Folder that stores the measures.
-        command: Command line of the benchmark, for the record.
-    """
+    """Train or continue a job in this process, measure it and store the measures."""
     try:
         # Another process may have finished the job meanwhile.
         if is_finished(job, report):

@@ -38,7 +38,7 @@ from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.topics import topic
 from policy_node.policies.policy import RandomPolicy
 from policy_node.training import generate_episodes
-from policy_node.training.experience.logged_episodes import read_experience
+from policy_node.training.experience.episode_files import read_experience
 from support.episode_recorder import Recorder
 
 # One of each kind of goal and robot.

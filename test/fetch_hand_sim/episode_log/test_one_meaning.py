@@ -25,7 +25,7 @@ from fetch_hand_sim.films.recording import load_recording
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
 from msgs_spec.schemas import schema_text
 from msgs_spec.tasks import TASKS
-from policy_node.training.experience.logged_episodes import read_experience
+from policy_node.training.experience.episode_files import read_experience
 from support.episode_recorder import Recorder
 
 PYMCAP_CLI = Path(sys.executable).with_name('pymcap-cli')

@@ -19,8 +19,7 @@ from msgs_spec.robots import JOINT_PREFIX
 from msgs_spec.schemas import deserialize
 from msgs_spec.tasks import TASKS, task_spec
 from msgs_spec.tick import EpisodeStatus, TickEncoder
-from policy_node.node.commander import Commander
-from policy_node.node.responder import Responder
+from policy_node.node.responder import Commander, Responder
 from policy_node.policies.loading import load_policy
 
 TICKS = 5

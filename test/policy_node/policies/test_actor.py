@@ -12,8 +12,8 @@ import torch
 
 from policy_node import load_actor
 from policy_node.policies.actor import Actor, Normalizer
+from policy_node.policies.loading import actor_path, shipped_actors
 from policy_node.policies.network_shape import NetworkShape
-from policy_node.policies.shipped import actor_path, shipped_actors
 
 SHAPE = NetworkShape(observation_size=10, goal_size=3, action_size=4, hidden_sizes=(16, 16))
 
@@ -62,17 +62,6 @@ def test_predict_is_the_network_written_out() -> None:
     assert state is None
     assert action.dtype == np.float32 and action.shape == (7, 4)
     np.testing.assert_allclose(action, layer, atol=1e-5)
-
-
-@pytest.mark.parametrize('layer_norm', [False, True])
-def test_one_observation_gives_the_row_of_the_batch(layer_norm: bool) -> None:
-    actor = make_actor(layer_norm)
-    observation = make_observation(5)
-    batch, _ = actor.predict(observation)
-    for row in range(5):
-        single, _ = actor.predict({key: value[row] for key, value in observation.items()})
-        assert single.shape == (4,)
-        np.testing.assert_allclose(single, batch[row], atol=1e-6)
 
 
 def test_layer_norm_changes_the_function_and_the_parameters() -> None:

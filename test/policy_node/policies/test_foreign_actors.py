@@ -20,11 +20,10 @@ from fetch_hand_sim.episodes.runner import EpisodeRunner
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.robots import command_from_action
 from msgs_spec.tasks import task_spec
-from policy_node.node.commander import Commander
+from policy_node.node.responder import Commander
 from policy_node.policies import checkpoint
 from policy_node.policies.export_actor import main as export_actor
-from policy_node.policies.loading import TaskMissing, load_actor, load_policy
-from policy_node.policies.shipped import shipped_actors
+from policy_node.policies.loading import TaskMissing, load_actor, load_policy, shipped_actors
 from support.fresh_actor import fresh_actor, observations
 
 onnx = pytest.importorskip('onnx')

@@ -15,10 +15,9 @@ from threadpoolctl import threadpool_info
 from msgs_spec.tasks import TASKS, task_spec
 from policy_node import load_actor, load_policy
 from policy_node.policies import checkpoint, loading
-from policy_node.policies.loading import TaskMissing
+from policy_node.policies.loading import TaskMissing, shipped_actors
 from policy_node.policies.numpy_actor import NumpyActor
 from policy_node.policies.policy import Policy, RandomPolicy
-from policy_node.policies.shipped import actor_path, shipped_actors
 from support.fresh_actor import fresh_actor, observations
 
 
@@ -143,14 +142,6 @@ def test_no_name_is_the_shipped_actor_of_the_task(monkeypatch: pytest.MonkeyPatc
 def test_a_missing_task_has_its_own_error(name: str) -> None:
     with pytest.raises(TaskMissing, match='FetchReach, '):
         load_policy(name)
-
-
-def test_a_file_in_the_home_directory_is_found_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv('HOME', str(tmp_path))
-    (tmp_path / 'reach.safetensors').write_bytes(actor_path('FetchReach').read_bytes())
-    assert load_policy('~/reach.safetensors').task == 'FetchReach'
 
 
 def test_unknown_and_unfitting_names_are_refused_in_one_line(tmp_path: Path) -> None:

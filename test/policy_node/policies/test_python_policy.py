@@ -10,7 +10,7 @@ import pytest
 
 from msgs_spec.tasks import task_spec
 from policy_node import load_policy
-from policy_node.node.commander import Commander
+from policy_node.node.responder import Commander
 from policy_node.training.evaluate_policy import main as evaluate
 from support.fresh_actor import observations
 

@@ -19,12 +19,10 @@ from policy_node.policies import checkpoint
 from policy_node.training.configuration.flat import to_flat
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.runs.read_networks import steps_behind
-from policy_node.training.runs.run import Ending
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.training_state import Counters, TrainingState, state_bytes
-from policy_node.training.studies import command, workers
+from policy_node.training.studies.best import BEST_ORDER, STARTS_FROM, start_from
 from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
-from policy_node.training.studies.paper import BEST_ORDER, STARTS_FROM, start_from
 from policy_node.training.studies.store import add_run
 from policy_node.training.studies.study import Job, to_settings
 from policy_node.training.studies.workers import LOG_FILE, Outcome, run_jobs
@@ -78,6 +76,9 @@ def test_the_status_of_a_job_says_how_far_it_is_and_how_long_it_will_take(tmp_pa
     assert job.status == f'{name}: 280,000 of 1,000,000 steps, eval 0.250, ETA 2.0 h'
 
 
+def nothing() -> None: ...
+
+
 class Recorder:
     """A place where jobs take no time; some of them fail."""
 
@@ -108,7 +109,7 @@ class Recorder:
 
 def test_jobs_run_as_many_at_once_as_allowed_and_after_what_they_need(tmp_path: Path) -> None:
     place = Recorder(tmp_path, limit=3)
-    assert run_jobs(jobs_of('--output', str(tmp_path)), place, tmp_path)
+    assert run_jobs(jobs_of('--output', str(tmp_path)), place, tmp_path, nothing)
     assert place.most == 3 and sorted(place.order) == sorted(TASKS)
     for task, start in STARTS_FROM.items():
         assert place.order.index(start) < place.order.index(task)
@@ -117,14 +118,14 @@ def test_jobs_run_as_many_at_once_as_allowed_and_after_what_they_need(tmp_path: 
 def test_a_job_that_fails_stops_only_what_starts_from_it(tmp_path: Path) -> None:
     place = Recorder(tmp_path, limit=2, failing=('HandManipulateBlockRotateXYZ',))
     jobs = jobs_of('--output', str(tmp_path))
-    assert not run_jobs(jobs, place, tmp_path)
+    assert not run_jobs(jobs, place, tmp_path, nothing)
     lost: set[str] = set()
     for task in BEST_ORDER:
         if STARTS_FROM.get(task) in lost | set(place.failing):
             lost.add(task)
     assert set(place.order) == set(TASKS) - lost
     again = Recorder(tmp_path, limit=2)
-    assert run_jobs(jobs, again, tmp_path)
+    assert run_jobs(jobs, again, tmp_path, nothing)
     assert set(again.order) == lost | set(place.failing)
 
 
@@ -141,37 +142,6 @@ def test_a_report_that_cannot_be_written_ends_no_job(
         "fetch_hand_sim benchmark: no report yet: [Errno 28] No space left on device: 'runs.csv'"
         in (capsys.readouterr().err)
     )
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_who_stops_jobs_does_not_wait_for_actors_to_be_evaluated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
-) -> None:
-    shipped: list[object] = []
-    ending = Ending('stopped', Counters(), number)
-    monkeypatch.setattr(workers, 'train_run', lambda *_, **__: ending)
-    monkeypatch.setattr(command, '_ship_all', lambda *given: bool(shipped.append(given)))
-    arguments = [*TINY, '--tasks', 'FetchReach', '--jobs', '1', '--output', str(tmp_path)]
-    assert main(arguments) == 128 + number
-    assert shipped == []
-
-
-def test_processes_end_by_the_signal_that_came_though_all_get_sigterm(tmp_path: Path) -> None:
-    class Ended:
-        exitcode = 128 + signal.SIGTERM
-
-        def terminate(self) -> None:
-            os.close(writer)
-
-        def join(self) -> None: ...
-
-    (job,) = jobs_of('--tasks', 'FetchReach', '--output', str(tmp_path))
-    (reader, writer), place = os.pipe(), workers.Processes(1, tmp_path, '')
-    with place:
-        place._running[reader] = job, Ended()  # type: ignore[assignment]
-        os.kill(os.getpid(), signal.SIGINT)
-        assert place.wait() == (job, Outcome.INTERRUPTED)
-    os.close(reader)
 
 
 # Nine processes that load torch: on a busy machine that takes its time.
@@ -214,7 +184,7 @@ def test_two_at_once_are_stopped_resumed_and_shipped(tmp_path: Path) -> None:
     assert names <= {path.name for path in (tmp_path / 'actors').iterdir()}
     table = (tmp_path / 'actors.md').read_text()
     assert all(f'| {task} | **' in table for task in (*EGGS, 'FetchReach'))
-    assert (tmp_path / 'benchmark.png').is_file()
+    assert (tmp_path / 'figure.png').is_file()
 
     shutil.rmtree(tmp_path / 'actors')
     before = {path: path.read_bytes() for path in tmp_path.rglob('progress.csv')}

@@ -78,11 +78,6 @@ def test_noise_has_the_spread_and_the_share_asked_for(epsilon: float) -> None:
     assert inside.std() == pytest.approx(0.1, abs=0.012)
 
 
-def test_random_actions_ignore_the_policy() -> None:
-    episodes, _ = make_collector(0.0, 0.0).collect(RestingPolicy(4), random=True)
-    assert episodes.action.std() == pytest.approx(1 / np.sqrt(3), abs=0.03)
-
-
 def test_the_second_cycle_has_new_goals() -> None:
     collector = make_collector()
     first, _ = collector.collect(make_actor())

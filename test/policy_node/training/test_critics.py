@@ -11,7 +11,7 @@ import torch
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.groups import Critics
-from policy_node.training.experience.transitions import Transitions
+from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.ddpg import DDPG
 from policy_node.training.research.critics import AGGREGATES, Ensemble, critic_loss
 from policy_node.training.research.judged import Judge
@@ -154,14 +154,6 @@ def test_surprise_is_how_far_a_value_is_from_its_clipped_target() -> None:
     assert (target == -2.0).any() and (target == 0.0).any(), 'both limits matter'
     found = Judge(linear_learner(1)).bellman(batch)
     np.testing.assert_allclose(found, np.abs(value[0] - target), atol=1e-5)
-
-
-def test_surprise_of_several_critics_is_their_mean() -> None:
-    batch = scattered()
-    value, following = values_by_hand(3, batch)
-    target = np.clip(batch.reward + batch.discount * following.min(axis=0), -2.0, 0.0)
-    found = Judge(linear_learner(3, aggregate='min')).bellman(batch)
-    np.testing.assert_allclose(found, np.abs(value - target).mean(axis=0), atol=1e-5)
 
 
 def test_disagreement_is_the_deviation_of_values_over_critics() -> None:

@@ -15,10 +15,9 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from policy_node.policies.files import read_tensors, write_tensors
-from policy_node.policies.shipped import shipped_actors
+from policy_node.policies.loading import shipped_actors
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.machine.distributed import Workers
-from policy_node.training.machine.host import available_memory
+from policy_node.training.machine import Workers, available_memory
 from policy_node.training.runs import run as run_module
 from policy_node.training.runs.read_networks import read_initial_networks
 from policy_node.training.runs.run_log import read_progress
@@ -224,11 +223,6 @@ def test_a_curve_with_no_place_does_not_fail_the_run(
 def test_a_folder_without_a_run_is_rejected(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert 'best.safetensors is not the folder of a run' in refusal(run / BEST, capsys)
     assert 'nothere is not the folder of a run' in refusal(run / 'nothere', capsys)
-
-
-def test_an_empty_name_is_no_origin() -> None:
-    with pytest.raises(ValueError, match='FetchReach,'):
-        read_initial_networks('FetchReach,')
 
 
 @pytest.mark.parametrize('resumed', [True, False])

@@ -11,10 +11,9 @@ import torch
 from policy_node.policies.actor import MLP
 from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.transitions import Transitions
+from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.ddpg import DDPG
-from policy_node.training.machine.devices import choose_device, uses_bfloat16
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers, choose_device, uses_bfloat16
 from policy_node.training.research.judged import Judge
 from policy_node.training.research.registry import make_ddpg
 

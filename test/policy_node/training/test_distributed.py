@@ -9,13 +9,13 @@ import sys
 import pytest
 import torch
 
-from policy_node.training.machine.distributed import Workers, join_workers
+from policy_node.training.machine import Workers, join_workers
 
 PROGRAM = """
 import pytest
 import torch
-from policy_node.training.machine.distributed import join_workers, leave_workers
-from policy_node.training.experience.statistics import RunningStatistics
+from policy_node.training.machine import join_workers, leave_workers
+from policy_node.training.experience.experience import RunningStatistics
 from policy_node.policies.actor import Normalizer
 
 workers = join_workers(torch.device('cpu'))

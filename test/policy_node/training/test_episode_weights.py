@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from msgs_spec.tasks import GoalKind, task_spec
+from msgs_spec.tasks import task_spec
 from policy_node.training.configuration.recipes import recipe_config
 from policy_node.training.experience.experience import Experience, ticks_until_dropped
-from policy_node.training.experience.replay import EpisodeReplay, Episodes
+from policy_node.training.experience.replay import EpisodeReplay, Episodes, has_moved
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.machine.distributed import Workers
-from policy_node.training.research.episode_weights import episode_energy, episode_weights
+from policy_node.training.machine import Workers
 
 PEN = task_spec('HandManipulatePenRotate')
 TICKS = 10
@@ -31,34 +30,6 @@ def poses(heights: np.ndarray) -> np.ndarray:
     achieved = np.zeros((*heights.shape, 7))
     achieved[..., 2], achieved[..., 3] = heights, 1.0
     return achieved
-
-
-def test_energy_is_what_lifting_throwing_and_turning_give() -> None:
-    time = np.arange(TICKS + 1) / 25.0
-    lifted = poses(np.minimum(np.arange(TICKS + 1), 3)[None] * 0.01)
-    at_rest = poses(np.full((1, TICKS + 1), 0.2))
-    turned = at_rest.copy()
-    # At rest for three ticks, then turning at 1 rad/s: half a joule for unit inertia.
-    angle = np.maximum(time - time[3], 0.0)
-    turned[..., 3], turned[..., 4] = np.cos(angle / 2), np.sin(angle / 2)
-    everything = episodes_of(np.concatenate([lifted, at_rest, turned, -turned]))
-    energy = episode_energy(everything, GoalKind.POSE, 25.0)
-    # 3 cm higher, and 0.25 m/s from the first tick on.
-    assert energy[0] == pytest.approx(9.81 * 0.03 + 0.5 * 0.25**2, abs=1e-3)
-    assert energy[1] == 0.0
-    assert energy[2:] == pytest.approx(0.5, abs=1e-3)
-    slide = np.zeros((1, TICKS + 1, 3))
-    # 0.5 m/s from the second tick on: an eighth of a joule.
-    slide[0, :, 0] = 0.5 * np.maximum(time - time[1], 0.0)
-    assert episode_energy(episodes_of(slide), GoalKind.POINT, 25.0) == pytest.approx(
-        0.125, abs=1e-4
-    )
-
-
-def test_the_clip_bounds_what_one_tick_may_add() -> None:
-    thrown = np.zeros((1, TICKS + 1, 3))
-    thrown[0, 5:, 0] = 1.0
-    assert episode_energy(episodes_of(thrown), GoalKind.POINT, 25.0) == pytest.approx(0.5)
 
 
 def test_ticks_count_until_some_after_the_drop() -> None:
@@ -112,10 +83,10 @@ def pen_episodes(achieved: np.ndarray) -> Episodes:
 
 
 def test_a_batch_follows_the_configuration() -> None:
-    """Energy alone draws the one episode that was lifted, and only until its drop."""
-    changes = {'moved_share': 1.0, 'episode_weights': 'energy', 'ticks_after_drop': 1}
+    """A batch has only the one episode that was lifted, and only until its drop."""
+    changes = {'moved_share': 1.0, 'ticks_after_drop': 1}
     config = recipe_config(
-        'HandManipulatePenRotate', 'best', batch_size=500, num_envs=3, goals='next=1', **changes
+        'HandManipulatePenRotate', 'best', batch_size=500, num_envs=3, goals='final=1', **changes
     )
     heights = np.full((3, PEN.episode_ticks + 1), 0.2)
     heights[1, 3:] += 0.01 * np.arange(PEN.episode_ticks - 2)
@@ -125,16 +96,13 @@ def test_a_batch_follows_the_configuration() -> None:
     episodes = pen_episodes(achieved)
     reward = lambda achieved, desired: -np.ones(len(achieved))  # noqa: E731
     sampler = TransitionSampler(reward, config.learner.gamma)
-    weigh = episode_weights('energy', PEN, 25.0)
     parts = sampler, np.random.default_rng(0)
-    experience = Experience(config, PEN, Workers(), *parts, weigh=weigh)
+    experience = Experience(config, PEN, Workers(), *parts)
     experience.replay.add(episodes)
     batch = experience.batch(env_steps=0)
     assert set(batch.observation[:, -7]) == {1.0}
     assert set(batch.observation[:, 0]) == set(range(21))
-    assert (batch.goal == batch.next_observation[:, -7:]).all()
-    weights = episode_weights('moved', PEN, 25.0)(episodes)
-    assert weights.tolist() == [0.0, 1.0, 0.0]
+    assert has_moved(episodes).tolist() == [0.0, 1.0, 0.0]
 
 
 def sideways(achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:

@@ -12,10 +12,9 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import from_flat, to_flat
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.replay import Episodes
-from policy_node.training.experience.transitions import Starts, Transitions
+from policy_node.training.experience.replay import Episodes, Starts, Transitions
 from policy_node.training.learners.ddpg import DDPG
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 from policy_node.training.research.frequent_actions import (
     Holder,
     HoldingSampler,
@@ -135,13 +134,6 @@ def test_noise_on_weights_moves_actions_as_far_as_asked() -> None:
     assert moved == pytest.approx(0.2, rel=0.3)
     np.testing.assert_array_equal(perturbed.predict(states)[0], perturbed.predict(states)[0])
     np.testing.assert_array_equal(actor.predict(states)[0], own)
-
-
-def test_episodes_under_noise_on_weights_are_consistent() -> None:
-    """Weights are drawn once for an episode: alike states give alike actions."""
-    episodes = collected(parameter_noise=True)
-    change = np.abs(np.diff(episodes.action, axis=1)).mean()
-    assert 0.0 < change < 0.1 * np.abs(episodes.action).mean()
 
 
 def test_lengths_mean_ticks_and_ticks_lengths() -> None:
@@ -293,9 +285,3 @@ def test_the_best_recipe_counts_time_as_time_at_high_rates() -> None:
     assert values('best', 'n_step', *counts, control_hz=12.5) == [1, *(n // 2 for n in usual)]
     paper = values('paper', 'n_step', *counts, control_hz=250.0)
     assert paper == values('paper', 'n_step', *counts)
-
-
-def test_the_best_recipe_adds_no_longer_returns_to_what_is_of_one_tick() -> None:
-    changes = {'goal_choice': 'bellman', 'critics': 2}
-    flat = to_flat(recipe_config('FetchPush', 'best', control_hz=250.0, **changes))
-    assert (flat['discount'], flat['noise_seconds'], flat['n_step']) == ('tick', 0.0, 1)

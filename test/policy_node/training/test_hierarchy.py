@@ -14,17 +14,18 @@ from policy_node.policies.files import read_tensors
 from policy_node.policies.network_shape import NORMALIZED_CLIP, NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.replay import Episodes, Transitions
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.experience.transitions import Transitions
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 from policy_node.training.research.hierarchy import (
     LOW_SOURCES,
+    GuidedCollector,
+    GuidedPolicy,
     HierarchicalDDPG,
     HierarchicalExperience,
     SubgoalSampler,
+    subgoal_columns,
 )
-from policy_node.training.research.subgoals import GuidedCollector, GuidedPolicy, subgoal_columns
 from policy_node.training.runs.run_log import RunLog, read_progress
 from policy_node.training.runs.trainer import Trainer
 
@@ -75,7 +76,7 @@ def proposals(tested: float, updates: int) -> np.ndarray:
     learner.actor.goal_normalizer.std.fill_(1.0 / NORMALIZED_CLIP)
     sampler = SubgoalSampler(TransitionSampler(reached, 0.95), 10, config.lowest_value)
     episodes = walks(2_000, tested, generator)
-    mixture = {'near': 0.6, 'future': 0.2, 'actual': 0.2}
+    mixture = {'future': 0.8, 'actual': 0.2}
     for _ in range(updates):
         row = generator.integers(len(episodes), size=256)
         learner.high.update(sampler.sample(episodes, row, mixture, generator))

@@ -17,9 +17,8 @@ from policy_node.training.experience.hindsight import (
     goal_mixture,
     goals_of,
 )
-from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.replay import Episodes, Starts
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.experience.transitions import Starts
 
 COUNT, TICKS = 6, 10
 
@@ -53,19 +52,6 @@ def draw(episodes: Episodes, strategy: str, k: int = 4) -> tuple[np.ndarray, ...
     goal = relabelled(episodes, row, tick, goal_mixture(strategy, k), generator)
     is_desired = goal[:, 0] >= 100
     return row, tick, goal, is_desired
-
-
-@pytest.mark.parametrize(
-    ('strategy', 'k', 'mixture'),
-    [
-        ('none', 4, {'real': 1.0}),
-        ('future', 4, {'future': 0.8, 'real': 0.2}),
-        ('final', 1, {'final': 0.5, 'real': 0.5}),
-        ('futureactual', 4, {'future': 0.4, 'actual': 0.4, 'real': 0.2}),
-    ],
-)
-def test_mixtures(strategy: str, k: int, mixture: dict[str, float]) -> None:
-    assert goal_mixture(strategy, k) == pytest.approx(mixture)
 
 
 def test_an_unknown_strategy_is_refused() -> None:
@@ -182,8 +168,8 @@ def test_displaced_poses_are_turned_as_another_episode_turned() -> None:
     ('text', 'mixture'),
     [
         ('future=.4,actual=.4', {'future': 0.4, 'actual': 0.4, 'real': 0.2}),
-        ('near=1', {'near': 1.0}),
-        ('real=.5, next=.25', {'real': 0.75, 'next': 0.25}),
+        ('final=1', {'final': 1.0}),
+        ('real=.5, random=.25', {'real': 0.75, 'random': 0.25}),
     ],
 )
 def test_goal_sources_can_be_mixed(text: str, mixture: dict[str, float]) -> None:
@@ -213,18 +199,7 @@ def numbered(count: int, ticks: int) -> Episodes:
     return Episodes(achieved, achieved, np.full((count, 2), -1, np.float32), achieved[:, :ticks])
 
 
-def test_next_and_near_goals_are_what_holding_needs() -> None:
-    episodes, generator = numbered(3, 40), np.random.default_rng(1)
-    row, tick = generator.integers(3, size=20_000), generator.integers(40, size=20_000)
-    goal = relabelled(episodes, row, tick, {'next': 1.0}, generator)
-    assert (goal == np.stack([row, tick + 1], axis=-1)).all()
-    goal = relabelled(episodes, row, tick, {'near': 1.0}, generator)
-    ahead = goal[:, 1] - tick
-    assert (goal[:, 0] == row).all() and set(ahead[tick < 30]) == set(range(1, 11))
-    assert (goal[:, 1] <= 40).all() and set(ahead[tick == 37]) == {1, 2, 3}
-
-
-@pytest.mark.parametrize('source', ['future', 'final', 'episode', 'random', 'next', 'near'])
+@pytest.mark.parametrize('source', ['future', 'final', 'episode', 'random'])
 def test_nothing_is_drawn_from_after_the_last_valid_tick(source: str) -> None:
     """Neither transitions nor goals: episode 0 is worth 5 ticks, 1 is worth 20, 2 all 40."""
     episodes, valid = numbered(3, 40), np.array([5, 20, 40])
@@ -261,14 +236,3 @@ def test_batches_are_consistent_transitions_with_recomputed_rewards(episodes: Ep
     assert (batch.reward == np.where(reached, 0.0, -1.0)).all()
     for name in ('observation', 'next_observation', 'goal', 'action', 'reward', 'discount'):
         assert getattr(batch, name).dtype == np.float32
-
-
-def test_the_same_generator_gives_the_same_batch(episodes: Episodes) -> None:
-    def sample() -> np.ndarray:
-        generator = np.random.default_rng(5)
-        reward = lambda achieved, desired: np.zeros(len(achieved))  # noqa: E731
-        row = np.arange(COUNT)
-        sampler = TransitionSampler(reward, 0.9)
-        return sampler.sample(episodes, row, goal_mixture('random'), generator).goal
-
-    assert (sample() == sample()).all()

@@ -12,9 +12,9 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.flat import to_flat
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.experience.transitions import Transitions
+from policy_node.training.experience.replay import Transitions
 from policy_node.training.learners.imagined import ImaginingDDPG
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 from policy_node.training.runs.trainer import Trainer
 
 torch.set_num_threads(1)

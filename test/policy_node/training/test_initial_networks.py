@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +13,13 @@ import torch
 from msgs_spec.tasks import TASKS
 from policy_node.policies import checkpoint
 from policy_node.policies.files import read_tensors, write_tensors
-from policy_node.policies.loading import load_actor
-from policy_node.policies.shipped import shipped_actors
+from policy_node.policies.loading import load_actor, shipped_actors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 from policy_node.training.research.registry import network_shape
 from policy_node.training.runs.initial_networks import CRITIC_FIRST
-from policy_node.training.runs.read_networks import mean_of, read_initial_networks, steps_behind
+from policy_node.training.runs.read_networks import read_initial_networks, steps_behind
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.trainer import Trainer
@@ -74,80 +72,6 @@ def test_a_run_starts_with_all_networks_of_another(tmp_path: Path, block_run: Pa
     assert source.learner.critic_optimizer.state_dict()['state'] != {}
 
 
-@pytest.mark.release
-def test_a_run_starts_from_the_mean_of_several(tmp_path: Path, block_run: Path) -> None:
-    task, runs = 'HandManipulateBlockRotateXYZ', [block_run]
-    for seed in (1, 2):
-        runs.append(tmp_path / str(seed))
-        arguments = ['--task', task, '--init-from', str(block_run), '--steps', '200', *SET]
-        assert main([*arguments, '--seed', str(seed), '--output', str(runs[-1])]) == 0
-    parts = [read_initial_networks(str(run)) for run in runs]
-    together = ','.join(map(str, runs))
-    networks = read_initial_networks(together)
-    assert networks.has_critic
-    for name, value in networks.tensors.items():
-        mean = sum(part.tensors[name].double() for part in parts) / 3
-        torch.testing.assert_close(value.double(), mean, rtol=1e-5, atol=1e-6)
-    name = 'actor.network.output.weight'
-    assert not torch.equal(parts[1].tensors[name], parts[2].tensors[name])
-    mixed = [f'{block_run}/best.safetensors', str(runs[1])]
-    assert read_initial_networks(','.join(mixed)).origin['critic']
-    output = tmp_path / 'on'
-    arguments = ['--task', task, '--init-from', together, '--steps', '200', *SET]
-    assert main([*arguments, '--output', str(output)]) == 0
-    origin = checkpoint.read_info(output / 'latest.safetensors').init_from
-    assert [part['name'] for part in origin['mean_of']] == [str(run) for run in runs]
-    before = [part.get('init_from') for part in origin['mean_of']]
-    assert before == [{}, *[{'name': str(block_run), 'task': task, 'env_steps': 400}] * 2]
-    parts = [
-        {'name': f'runs/a/{name}.safetensors', 'env_steps': 300} for name in ('best', 'latest')
-    ]
-    parts[0]['env_steps'] = 250
-    assert steps_behind({'env_steps': 5, 'init_from': {'env_steps': 0, 'mean_of': parts}}) == 305
-    # A run that is named by its folder is the run of the actors in it.
-    parts.append({'name': './runs/a', 'env_steps': 320})
-    assert steps_behind({'env_steps': 5, 'init_from': {'env_steps': 0, 'mean_of': parts}}) == 325
-    # 200 steps each, all from one run of 400, which counts once.
-    assert steps_behind({'env_steps': 200, 'init_from': origin}) == 200 + 400 + 2 * 200
-
-
-@pytest.mark.release
-def test_a_mean_is_evaluated_and_shipped_as_it_is(tmp_path: Path, block_run: Path) -> None:
-    """No update comes before `learning_starts`; the curve of the actor before it stays."""
-    actors, runs = tmp_path / 'actors', [block_run, tmp_path / 'second', tmp_path / 'mean']
-    actors.mkdir()
-    arguments = ['--task', 'HandManipulateBlockRotateXYZ', '--steps', '200', *SET]
-    for run, start in ((runs[1], str(block_run)), (runs[2], f'{block_run},{runs[1]}')):
-        given = ['--set', 'learning_starts=100000', '--init-from', start, '--output', str(run)]
-        assert main([*arguments, *given]) == 0
-    assert [row['updates'] for row in read_progress(runs[2] / 'progress.csv')] == [0.0]
-    curve = actors / 'HandManipulateBlockRotateXYZ.png'
-    curve.write_bytes(b'of a part')
-    assert ship_actor([str(runs[2]), '--episodes', '2', '--actors', str(actors)]) == 0
-    assert curve.read_bytes() == b'of a part'
-    report = json.loads(curve.with_suffix('.json').read_text())
-    assert len(report['init_from']['mean_of']) == 2
-
-
-def test_no_mean_of_networks_that_differ_in_kind(block_run: Path) -> None:
-    with pytest.raises(ValueError, match='goal_features relative and symmetric'):
-        read_initial_networks(f'{block_run},HandManipulateEggFull')
-    with pytest.raises(ValueError, match=r'BlockFull: hidden_sizes \(256, 256, 256\)'):
-        read_initial_networks('HandManipulateBlockRotateZ,HandManipulateBlockFull')
-    reach, push = 'FetchReach', 'FetchPush'
-    with pytest.raises(ValueError, match=f'{reach} and {push}: observation 10 and 25'):
-        read_initial_networks(f'{reach},{push}')
-    blocks, eggs = 'HandManipulateBlockRotateXYZ', read_initial_networks('HandManipulateEggRotate')
-    cubes = replace(eggs, origin=eggs.origin | {'task': blocks})
-    cubes = replace(cubes, shape=network_shape(tiny(blocks, goal_features='symmetric')))
-    with pytest.raises(ValueError, match='object_symmetry revolution and cube'):
-        mean_of([eggs, cubes])
-    blocks = read_initial_networks('HandManipulateBlockRotateParallel,HandManipulateBlockRotateZ')
-    assert blocks.origin['task'] == 'HandManipulateBlockRotateParallel'
-    with pytest.raises(ValueError, match='nobody'):
-        read_initial_networks(f'{block_run},nobody')
-
-
 @pytest.mark.parametrize('features', ['relative', 'symmetric'])
 def test_a_position_that_now_counts_has_no_effect_at_first(
     tmp_path: Path, block_run: Path, features: str
@@ -158,7 +82,7 @@ def test_a_position_that_now_counts_has_no_effect_at_first(
     config = tiny('HandManipulateEggFull', goal_features=features)
     networks = read_initial_networks(str(tmp_path))
     after = Trainer(config, tmp_path, Workers(), init_from=networks.fitted(config))
-    episodes = before.collector.collect(before.learner.actor, random=True)[0]
+    episodes = before.collector.collect(before.learner.actor)[0]
     observation = torch.tensor(episodes.observation[0])
     here = torch.tensor(episodes.desired_goal[0]).repeat(len(observation), 1)
     there = here + torch.tensor([0.03, -0.02, 0.05, 0.0, 0.0, 0.0, 0.0])
@@ -213,7 +137,7 @@ def test_a_condition_starts_without_effect_and_is_fixed_for_other_runs(
 
 @pytest.mark.release
 def test_a_second_critic_starts_from_random_weights(tmp_path: Path, block_run: Path) -> None:
-    task, runs = 'HandManipulateBlockRotateXYZ', [tmp_path / 'two', tmp_path / 'mean']
+    task, run = 'HandManipulateBlockRotateXYZ', tmp_path / 'two'
     twins = ['--set=critics=2', '--set=aggregate=min', *SET]
     arguments = ['--task', task, '--steps', '200', *twins, '--init-from', str(block_run)]
     one = read_initial_networks(str(block_run))
@@ -227,21 +151,14 @@ def test_a_second_critic_starts_from_random_weights(tmp_path: Path, block_run: P
     for part in (first, started.learner.target_critic.members[0]):
         assert not same(part.state_dict(), second.state_dict())
     assert same(started.learner.target_critic.members[1].state_dict(), second.state_dict())
-    assert main([*arguments, '--output', str(runs[0])]) == 0
-    two = read_initial_networks(str(runs[0]))
+    assert main([*arguments, '--output', str(run)]) == 0
+    two = read_initial_networks(str(run))
     assert two.critics == 2
     again = Trainer(config, tmp_path, Workers(), init_from=two.fitted(config)).learner
     assert again.critic_first == 0
     assert same(again.critic.state_dict(), part_of(two.tensors, 'critic'))
     alone = Trainer(tiny(task), tmp_path, Workers(), init_from=two.fitted(tiny(task))).learner
     assert same(alone.critic.state_dict(), part_of(two.tensors, 'critic.members.0'))
-    # A mean with one that has a single critic has that one.
-    arguments[-1] = f'{block_run},{runs[0]}'
-    assert main([*arguments, '--output', str(runs[1])]) == 0
-    mean = read_initial_networks(arguments[-1])
-    assert mean.critics == 1
-    alone = Trainer(tiny(task), tmp_path, Workers(), init_from=mean.fitted(tiny(task))).learner
-    assert same(alone.critic.state_dict(), part_of(mean.tensors, 'critic.members.0'))
 
 
 @pytest.mark.release
@@ -259,21 +176,6 @@ def test_a_critic_with_another_norm_starts_from_random_weights(
     assert main([*arguments, '--init-from', str(block_run), '--output', str(run)]) == 0
     on = read_initial_networks(str(run))
     assert on.fitted(config).has_critic and not on.fitted(tiny(task)).has_critic
-    assert not read_initial_networks(f'{block_run},{run}').has_critic
-
-
-@pytest.mark.release
-def test_the_mean_of_batch_norms_counts_no_batches(tmp_path: Path) -> None:
-    task, runs = 'HandManipulateBlockRotateXYZ', [tmp_path / name for name in 'ab']
-    for seed, run in enumerate(runs):
-        given = [*SET, '--set=norm=batch', '--set=target=none', '--seed', str(seed)]
-        assert main(['--task', task, '--steps', '200', *given, '--output', str(run)]) == 0
-    parts = [read_initial_networks(str(run)) for run in runs]
-    networks = read_initial_networks(','.join(map(str, runs)))
-    counts = [name for name in networks.tensors if name.endswith('num_batches_tracked')]
-    assert counts
-    for name in counts:
-        assert torch.equal(networks.tensors[name], parts[0].tensors[name])
 
 
 def test_without_targets_a_run_starts_from_the_networks_themselves(
@@ -291,22 +193,6 @@ def test_without_targets_a_run_starts_from_the_networks_themselves(
     for learner in (started, again.learner):
         assert same(learner.actor.state_dict(), before['actor'])
         assert same(learner.critic.state_dict(), before['critic'])
-
-
-def test_a_run_may_have_wider_networks_than_it_starts_from(tmp_path: Path, block_run: Path) -> None:
-    task, run = 'HandManipulateBlockRotateXYZ', tmp_path / 'run'
-    config = tiny(task, hidden_sizes=(64, 96), critics=2)
-    one = Trainer(tiny(task), tmp_path, Workers(), init_from=read_initial_networks(str(block_run)))
-    networks = read_initial_networks(str(block_run)).fitted(config)
-    wide = Trainer(config, tmp_path, Workers(), init_from=networks)
-    features, action = torch.randn(8, networks.shape.feature_size), torch.rand(8, 20)
-    torch.testing.assert_close(wide.learner.actor(features), one.learner.actor(features))
-    first = wide.learner.critic(features, action)[0]
-    torch.testing.assert_close(first, one.learner.critic(features, action))
-    arguments = ['--task', task, '--steps', '200', *SET, '--set=hidden_sizes=64,96']
-    assert main([*arguments, '--init-from', str(block_run), '--output', str(run)]) == 0
-    with pytest.raises(ValueError, match=r'hidden_sizes \(64, 96\), now \(32, 32\)'):
-        read_initial_networks(str(run)).fitted(tiny(task))
 
 
 @pytest.mark.parametrize('task', ['FetchPush', 'HandManipulateBlockRotateZ'])
@@ -438,7 +324,7 @@ def test_an_actor_alone_acts_from_the_first_cycle_while_its_critic_learns(
     ('start', 'arguments', 'message'),
     [
         ('FetchReach', ['--task', 'HandReach'], 'observation 10, now 63; goal 3, now 15'),
-        ('FetchReach', ['--set', 'hidden_sizes=9'], 'now (9,); allowed hidden_sizes'),
+        ('FetchReach', ['--set', 'hidden_sizes=9'], 'hidden_sizes (256, 256, 256), now (9,)'),
         ('FetchReach', ['--set', 'goal_features=relative'], 'goal_features plain, now relative'),
         ('Nobody', [], "'Nobody'"),
         ('.', [], 'training_state.safetensors is no file'),
@@ -490,8 +376,11 @@ def test_a_critic_of_other_rewards_is_left_out(
         assert torch.equal(value, networks.tensors[f'actor.{name}']), name
 
 
-def test_a_mean_of_networks_of_other_rewards_has_no_critic(block_run: Path) -> None:
-    networks = read_initial_networks(str(block_run))
-    assert mean_of([networks, networks]).has_critic
-    dense = replace(networks, valued_by=networks.valued_by | {'reward_type': 'dense'})
-    assert not mean_of([networks, dense]).has_critic
+def test_each_run_behind_an_actor_counts_once_with_its_latest_actor() -> None:
+    parts = [
+        {'name': 'runs/a/best.safetensors', 'env_steps': 250},
+        {'name': 'runs/a/latest.safetensors', 'env_steps': 300},
+    ]
+    assert steps_behind({'env_steps': 5, 'init_from': {'env_steps': 0, 'mean_of': parts}}) == 305
+    parts.append({'name': './runs/a', 'env_steps': 320})
+    assert steps_behind({'env_steps': 5, 'init_from': {'env_steps': 0, 'mean_of': parts}}) == 325

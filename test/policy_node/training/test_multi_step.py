@@ -9,9 +9,8 @@ import pytest
 
 from fetch_hand_sim.simulation.rewards import GoalMetric
 from msgs_spec.tasks import task_spec
-from policy_node.training.experience.replay import Episodes
+from policy_node.training.experience.replay import Episodes, Transitions
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.experience.transitions import Transitions
 from policy_node.training.research.conditions import ConditionedSampler, Threshold
 from policy_node.training.research.frequent_actions import HoldingSampler, length_of
 from policy_node.training.research.hierarchy import SubgoalSampler

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from policy_node.policies.actor import Normalizer
-from policy_node.training.experience.statistics import RunningStatistics
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.experience.experience import RunningStatistics
+from policy_node.training.machine import Workers
 
 
 def test_statistics_over_parts_are_those_of_everything() -> None:

@@ -48,7 +48,7 @@ def test_columns_of_the_tables_are_explained() -> None:
         ('{}:FAILS', ':FAILS is a int; allowed: a Study'),
         ('{}:OTHER', ":OTHER: AttributeError: module '"),
         ('nowhere_at_all:STUDY', "ModuleNotFoundError: No module named 'nowhere_at_all'"),
-        ('gaols', "'gaols' given; allowed: paper, best, goals, "),
+        ('gaols', "'gaols' given; allowed: paper, goals, "),
         ('gaols', "module:NAME; did you mean 'goals'?"),
     ],
 )

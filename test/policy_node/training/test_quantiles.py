@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from policy_node.training.experience.transitions import Transitions
+from policy_node.training.experience.replay import Transitions
 from policy_node.training.research.critics import levels, quantile_costs, sample_of
 from support.learners import make_learner
 
@@ -56,23 +56,3 @@ def test_the_cost_is_least_at_the_quantiles_of_the_target() -> None:
             moved[0, index] += shift
             assert quantile_costs(moved, sample) > cost
     assert quantile_costs(best.expand(3, 1, 4), sample).shape == (3, 1)
-
-
-@pytest.mark.release
-def test_truncated_critics_promise_less_of_a_lottery() -> None:
-    generator = np.random.default_rng(0)
-    options = {'critics': 2, 'quantiles': 25, 'target_update_interval': 1, 'gamma': 0.95}
-    learner = make_learner(**options, aggregate='truncated')
-    plain = make_learner(**options)
-    one = torch.ones(1, 1)
-    promised = []
-    for each in (learner, plain):
-        for _ in range(600):
-            batch = lottery(128, generator)
-            batch.discount[:] = 0.5
-            each.update(batch)
-        with torch.no_grad():
-            features = each.actor.features(one, one)
-            promised.append(float(each.critic(features, one).mean()))
-    # Rewards are -1.8 in the mean, half of the value follows.
-    assert abs(promised[1] + 3.6) < 0.4 and promised[0] < promised[1] - 0.05

@@ -31,26 +31,10 @@ def test_the_ring_keeps_the_latest_episodes_whole() -> None:
         assert (flat == held.desired_goal[:, :1]).all()
 
 
-def test_stored_episodes_are_copies() -> None:
-    replay = EpisodeReplay(2, 3, 5, 2, 4)
-    episodes = numbered(1, 1)
-    replay.add(episodes)
-    episodes.observation[:] = -1
-    assert (replay.episodes.observation == 1).all()
-
-
 def test_select_keeps_rows_together() -> None:
     chosen = numbered(0, 4).select(np.array([False, True, False, True]))
     assert len(chosen) == 2 and chosen.ticks == 3
     assert chosen.action[:, 0, 0].tolist() == [1, 3] == chosen.observation[:, 2, 1].tolist()
-
-
-def test_it_knows_how_many_came_last() -> None:
-    replay = EpisodeReplay(8, 3, 5, 2, 4)
-    assert replay.last_added == 0
-    for count in (5, 3):
-        replay.add(numbered(0, count))
-        assert replay.last_added == count
 
 
 def test_what_cannot_fit_is_refused() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 import torch
 
 from policy_node.policies.files import write_file
-from policy_node.training.configuration.flat import changed, to_flat
+from policy_node.training.configuration.flat import to_flat
 from policy_node.training.runs.run_folder import STATE_FILE
 from policy_node.training.studies.command import jobs_from_arguments, main, parse_arguments
 from policy_node.training.studies.measures import (
@@ -23,24 +22,21 @@ from policy_node.training.studies.measures import (
     rank_sum_chance,
     sum_up,
 )
-from policy_node.training.studies.paper import PAPER
 from policy_node.training.studies.report import (
     BEGIN,
     END,
+    arms_csv,
     format_study,
     sum_up_arms,
-    to_csv,
     write_study,
 )
 from policy_node.training.studies.research import STUDIES
 from policy_node.training.studies.store import (
     add_run,
-    holds,
     in_order,
     own_fields,
     read_runs,
     require_alike,
-    take_from_other_studies,
 )
 from policy_node.training.studies.study import Job, Study, research_jobs, to_settings
 from support import ROOT
@@ -80,12 +76,12 @@ def test_every_study_has_its_page_and_every_request_its_line() -> None:
     assert {study.request for study in STUDIES.values()} == {None, *range(1, 10)}
 
 
-@pytest.mark.parametrize('study', [*STUDIES.values(), PAPER], ids=lambda study: study.name)
+@pytest.mark.parametrize('study', STUDIES.values(), ids=list(STUDIES))
 def test_tables_of_a_page_are_derived_from_its_runs(study: Study) -> None:
     folder = ROOT / 'docs' / 'research' / study.name
     runs = in_order(read_runs(folder).values(), study)
     arms = sum_up_arms(study, runs)
-    assert to_csv(arms) == (folder / 'arms.csv').read_bytes()
+    assert arms_csv(arms) == (folder / 'arms.csv').read_bytes()
     assert format_study(study, arms) in (folder / 'README.md').read_text()
     assert sum(arm['seeds'] for arm in arms) == len(runs)
     assert len(runs) == (folder / 'runs.jsonl').read_text().count('\n')
@@ -93,7 +89,7 @@ def test_tables_of_a_page_are_derived_from_its_runs(study: Study) -> None:
     assert all(run['machine'] and run['revision'] and run['curve'] for run in runs)
 
 
-@pytest.mark.parametrize('study', [*STUDIES.values(), PAPER], ids=lambda study: study.name)
+@pytest.mark.parametrize('study', STUDIES.values(), ids=list(STUDIES))
 def test_another_seed_can_be_added_to_every_page(study: Study) -> None:
     """The variants are configured today as their stored runs were."""
     folder = ROOT / 'docs' / 'research' / study.name
@@ -301,32 +297,6 @@ def test_time_is_compared_on_machines_of_the_baseline(
     assert lines[4].count(', of 2 | ') == 3 and lines[4].endswith('| no significant difference |')
 
 
-def test_an_equal_run_of_another_study_is_copied(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    there, here = Path('docs/targets'), Path('docs/returns')
-    store(there, jobs_of('targets', '--arms', 'polyak4', 'polyak1', '--seeds', '0', '1'))
-    jobs = jobs_of('returns', '--arms', 'one', 'none3', '--seeds', '1', '2')
-    for _ in range(2):
-        take_from_other_studies(jobs, here)
-    assert capsys.readouterr().out == (
-        'FetchPush/one/seed1 is FetchPush/polyak4/seed1 of docs/targets\n'
-    )
-    runs = read_runs(here)
-    assert [holds(runs, job) for job in jobs] == [True, False, False, False]
-    (run,) = runs.values()
-    assert (run['arm'], run['processor_seconds'], run['revision']) == ('one', 11.0, 'abc')
-    assert run['config']['n_step'] == 1
-    # Measured on other episodes it is another run, likewise with other start networks.
-    (other,) = jobs_of('returns', '--arms', 'one', '--seeds', '0', '--episodes', '20')
-    take_from_other_studies([other], here)
-    (wanted,) = jobs_of('returns', '--arms', 'one', '--seeds', '0')
-    config = changed(wanted.config, init_from='FetchPush')
-    take_from_other_studies([dataclasses.replace(wanted, config=config)], here)
-    assert len(read_runs(here)) == 1
-
-
 def test_of_two_lines_about_a_run_the_later_one_counts(tmp_path: Path) -> None:
     (job,) = jobs_of('returns', '--arms', 'one', '--seeds', '0')
     for machine in ('A', 'B'):
@@ -404,8 +374,7 @@ def test_a_full_disk_leaves_stored_runs_and_page_as_they_were(
             ['--tasks', 'FetchSlide'],
             '--tasks FetchSlide; allowed in unbiased: FetchReach, FetchPush',
         ),
-        (['--set', 'goals=near=1'], '--set goals is not possible: jobs differ in it'),
-        (['--recipe', 'best'], '--recipe belongs to --study paper'),
+        (['--set', 'goals=final=1'], '--set goals is not possible: jobs differ in it'),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_status_2(

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,14 +23,14 @@ import torch
 from fetch_hand_sim.datasets.writing import alone_in
 from policy_node.policies import checkpoint
 from policy_node.policies.actor import Actor
-from policy_node.policies.files import read_tensors, write_tensors
+from policy_node.policies.files import read_tensors
 from policy_node.training.configuration.config import TrainConfig
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.evaluation.episodes import EpisodeOutcomes
-from policy_node.training.experience.replay import EpisodeReplay, Episodes
-from policy_node.training.experience.replay_file import load_replay, save_replay
-from policy_node.training.machine.distributed import Workers
-from policy_node.training.runs.run import _stop_on_signals, lock_run
+from policy_node.training.evaluation import EpisodeOutcomes
+from policy_node.training.experience.episode_files import load_replay, save_replay
+from policy_node.training.experience.replay import EpisodeReplay
+from policy_node.training.machine import Workers
+from policy_node.training.runs.run import lock_run
 from policy_node.training.runs.run_log import read_progress
 from policy_node.training.runs.trainer import Trainer
 from policy_node.training.train_her import main
@@ -108,31 +107,6 @@ def test_a_run_without_its_replay_fills_it_up_before_it_goes_on(
 
 
 @pytest.mark.release
-def test_a_run_that_is_stopped_while_its_replay_fills_has_learnt_nothing_from_a_part(
-    tmp_path: Path,
-) -> None:
-    Trainer(small(total_steps=2_000), tmp_path, Workers()).train()
-    (tmp_path / 'replay.safetensors').unlink()
-    trainer = Trainer(small(total_steps=2_400), tmp_path, Workers())
-    trainer.resume(tmp_path / STATE)
-    collect = trainer.collector.collect
-
-    def stopped(policy: Actor, random: bool = False) -> tuple[Episodes, float]:
-        trainer.stop('interrupted')
-        return collect(policy, random)
-
-    trainer.collector.collect = stopped  # type: ignore[method-assign]
-    log = StopAfter(trainer, 100)
-    assert (trainer.train(log), log.rows) == ('interrupted', [])
-    again = Trainer(small(total_steps=2_400), tmp_path, Workers())
-    again.resume(tmp_path / STATE)
-    assert (again.counters.env_steps, again.counters.updates) == (2_000, 20)
-    assert again.experience.transitions == 400, 'what was collected needs not be collected again'
-    again.train(log)
-    assert [(row['env_steps'], row['updates']) for row in log.rows] == [(2_400, 24)]
-
-
-@pytest.mark.release
 @pytest.mark.parametrize('damaged', [True, False])
 def test_a_replay_that_is_no_multiple_of_an_episode_is_full_with_whole_ones(
     tmp_path: Path, damaged: bool
@@ -165,38 +139,6 @@ def test_a_best_actor_that_is_newer_than_the_checkpoint_stays(tmp_path: Path) ->
     assert trainer.counters.best_success == 1.0
     trainer.train()
     assert best.read_bytes() == saved
-
-
-@pytest.mark.parametrize(
-    'change',
-    [
-        {'evaluation_episodes': 9},
-        pytest.param({'success_rule': 'paper'}, marks=pytest.mark.release),
-    ],
-)
-def test_a_best_actor_that_was_measured_otherwise_is_measured_anew(
-    tmp_path: Path, change: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A few lucky episodes, or a more lenient rule, would stand above all that is to come."""
-    trainer = Trainer(small(total_steps=2_000), tmp_path, Workers())
-    trainer.train()
-    best = tmp_path / 'best.safetensors'
-    actor, info = checkpoint.load(best)
-    lucky = {**info.success, 'last_step': 1.0, 'mean_return': -1.0}
-    checkpoint.save(best, actor, replace(info, success=lucky))
-    trainer.counters.best_success, trainer.counters.best_return = 1.0, -1.0
-    trainer.save()
-    trainer = Trainer(small(total_steps=2_400, **change), tmp_path, Workers())
-    trainer.resume(tmp_path / STATE)
-    assert 'it is evaluated again' in capsys.readouterr().err
-    found = checkpoint.read_info(best)
-    assert trainer.counters.best_success == found.success['last_step'] < 1.0
-    assert trainer.counters.best_return == found.success['mean_return'] < -1.0
-    assert (found.success['episodes'], found.success['rule']) == (
-        trainer.config.run.evaluation_episodes,
-        trainer.config.collect.success_rule,
-    )
-    assert found.env_steps == info.env_steps, 'it is the actor that it was'
 
 
 def test_a_finished_run_is_not_trained_any_further_but_with_more_steps(
@@ -410,30 +352,6 @@ def test_a_closed_terminal_keeps_the_run(
     assert (run / 'replay.safetensors').is_file() and (run / 'curve.png').is_file()
 
 
-def test_signals_ignored_by_nohup_stay_ignored(tmp_path: Path) -> None:
-    trainer = Trainer(small(), tmp_path, Workers())
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with _stop_on_signals(trainer) as received:
-            os.kill(os.getpid(), signal.SIGHUP)
-        assert received == [] and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
-
-
-def test_the_lock_of_a_killed_run_is_stale(
-    tmp_path: Path, start_run: Callable[[], subprocess.Popen[str]]
-) -> None:
-    process = start_run()
-    with pytest.raises(Exception, match='another process'):
-        with lock_run(tmp_path / 'run'):
-            pass
-    process.kill()
-    process.communicate()
-    with lock_run(tmp_path / 'run'):
-        pass
-
-
 def test_a_missing_library_is_reported_before_the_first_step(tmp_path: Path) -> None:
     code = (
         'import importlib.abc, sys\n'
@@ -459,31 +377,6 @@ def test_an_output_that_cannot_be_a_folder_is_one_line(
     assert main(['--task', 'FetchReach', *SET, '--output', str(tmp_path / output)]) == 2
     error = capsys.readouterr().err
     assert 'cannot hold a run: ' in error and error.count('\n') == 1 and error[:-1].isprintable()
-
-
-@pytest.mark.parametrize(
-    ('change', 'message'),
-    [
-        ({'counters': None}, "lacks 'counters' in its metadata"),
-        ({'extra': None}, "lacks 'extra' in its metadata"),
-        ({'extra': '{}'}, "'config'"),
-        ({'counters': '[1]'}, 'has unreadable metadata: '),
-        ({'counters': '{"speed": 1}'}, 'has unreadable metadata: '),
-        ({'extra': '{"config": {"task": ["FetchReach"]}}'}, "task ['FetchReach']"),
-        ({'extra': '{"config": {"task": "FetchReach", "hidden_sizes": [1e999]}}'}, 'hidden_sizes'),
-        ({'extra': '[' * 100_000}, 'has unreadable metadata: '),
-    ],
-)
-def test_a_damaged_state_is_one_line(
-    change: dict[str, str | None], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    Trainer(small(), tmp_path, Workers()).save()
-    tensors, metadata = read_tensors(tmp_path / STATE)
-    metadata = {name: text for name, text in (metadata | change).items() if text is not None}
-    write_tensors(tmp_path / STATE, tensors, metadata)
-    assert main(['--resume', str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count('\n') == 1
 
 
 def test_a_full_disk_leaves_no_partial_file_and_the_checkpoint_before(

@@ -26,21 +26,6 @@ def test_a_resumed_run_goes_on_after_its_checkpoint(tmp_path: Path) -> None:
     assert set(rows[1]) == set(COLUMNS)
 
 
-def test_a_run_from_before_a_column_was_added_goes_on(tmp_path: Path) -> None:
-    old = [name for name in COLUMNS if name in ('seconds', 'env_steps', 'eval_success')]
-    lines = [','.join([*old, 'gone']), '1,100,0.5,7', '2,200,0.6,7']
-    (tmp_path / 'progress.csv').write_text('\n'.join(lines) + '\n')
-    log = RunLog(tmp_path, 1000, 0, resumed_steps=200)
-    log.write({**row(300, 0.7), 'eval_stay': 0.9})
-    log.close()
-    rows = read_progress(tmp_path / 'progress.csv')
-    assert rows[:2] == [
-        {'seconds': 1, 'env_steps': 100, 'eval_success': 0.5},
-        {'seconds': 2, 'env_steps': 200, 'eval_success': 0.6},
-    ]
-    assert rows[2]['env_steps'] == 300 and rows[2]['eval_stay'] == 0.9
-
-
 @pytest.mark.parametrize('cut', ['1,200,1', '1,200,1,,0.5,-', '1,inf,1,,0.5', '1,200,1,,nan'])
 def test_a_line_that_a_killed_run_cut_short_is_dropped(tmp_path: Path, cut: str) -> None:
     log = RunLog(tmp_path, 1000, 0)

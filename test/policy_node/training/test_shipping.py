@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,7 @@ import torch
 
 from policy_node.policies.files import read_tensors, write_tensors
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.machine.distributed import Workers
+from policy_node.training.machine import Workers
 from policy_node.training.runs.run import Caller, train_run
 from policy_node.training.runs.run_log import RunLog
 from policy_node.training.runs.trainer import Trainer
@@ -63,18 +61,6 @@ def test_an_evaluation_of_fewer_episodes_replaces_no_actor(
     assert {file.name: file.read_bytes() for file in actors.iterdir()} == before
 
 
-@pytest.mark.release
-def test_an_actor_is_shipped_with_a_closed_output(run: Path, tmp_path: Path) -> None:
-    reader, writer = os.pipe()
-    os.close(reader)
-    actors = tmp_path / 'actors'
-    command = [sys.executable, '-m', 'policy_node.training.ship_actor', str(run)]
-    command += ['--episodes', '2', '--threads', '1', '--actors', str(actors)]
-    assert subprocess.run(command, stdout=writer, timeout=120, check=False).returncode == 0
-    os.close(writer)
-    assert (actors / 'FetchReach.json').is_file()
-
-
 @pytest.mark.parametrize(
     'content', ['{', '[]', '{"episodes": 1}', '{"success_gymnasium": "x"}', TEXT]
 )
@@ -107,7 +93,7 @@ def test_a_folder_that_takes_no_actor_is_refused_before_any_episode(
 ) -> None:
     actors = tmp_path / 'actors'
     actors.touch()
-    monkeypatch.setattr('policy_node.training.runs.shipping.evaluate', None)
+    monkeypatch.setattr('policy_node.training.ship_actor.evaluate', None)
     assert ship(run, actors, 2) == 2
     error = capsys.readouterr().err
     assert 'FetchReach.safetensors cannot be written: ' in error and error.count('\n') == 1
@@ -147,14 +133,6 @@ def test_an_actor_of_another_rate_replaces_none(
     assert 'acts at 25 Hz, this actor at 50 Hz' in capsys.readouterr().err
     assert {file.name: file.read_bytes() for file in actors.iterdir()} == before
     assert ship(run, tmp_path / 'faster', 2) == 0
-
-
-def test_an_actor_without_a_recipe_is_shipped_with_all_its_files(run: Path, tmp_path: Path) -> None:
-    tensors, metadata = read_tensors(run / 'best.safetensors')
-    write_tensors(run / 'best.safetensors', tensors, metadata | {'config': '{}'})
-    assert ship(run, tmp_path / 'actors', 2) == 0
-    suffixes = {file.name.partition('.')[2] for file in (tmp_path / 'actors').iterdir()}
-    assert suffixes == {'safetensors', 'training.safetensors', 'json', 'png'}
 
 
 def test_the_critic_of_another_actor_does_not_stay_beside_one_that_has_none(

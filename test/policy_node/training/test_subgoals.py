@@ -14,9 +14,14 @@ from policy_node.policies.network_shape import NetworkShape
 from policy_node.training.configuration.flat import from_flat
 from policy_node.training.experience.replay import Episodes
 from policy_node.training.experience.sampling import TransitionSampler
-from policy_node.training.research.hierarchy import SubgoalSampler, with_subgoals
+from policy_node.training.research.hierarchy import (
+    TESTED,
+    GuidedPolicy,
+    Proposer,
+    SubgoalSampler,
+    with_subgoals,
+)
 from policy_node.training.research.registry import make_collector
-from policy_node.training.research.subgoals import TESTED, GuidedPolicy, Proposer
 from policy_node.training.train_her import main
 
 torch.set_num_threads(1)

@@ -132,31 +132,6 @@ def test_an_exception_of_a_callback_is_raised_and_the_run_is_saved(tmp_path):
     assert run.env_steps == 800
 
 
-def test_runs_at_the_same_time_leave_the_programs_random_numbers(tmp_path):
-    torch.manual_seed(3)
-    expected = torch.rand(1)
-    torch.manual_seed(3)
-    first_may_end, second_began = threading.Event(), threading.Event()
-
-    def first(row):
-        second_began.wait(60.0)
-
-    def second(row):
-        second_began.set()
-        first_may_end.wait(60.0)
-
-    def run(name, on_cycle):
-        train('FetchReach', tmp_path / name, total_steps=400, on_cycle=on_cycle, **SMALL)
-
-    threads = [threading.Thread(target=run, args=each) for each in (('a', first), ('b', second))]
-    for thread in threads:
-        thread.start()
-    threads[0].join()
-    first_may_end.set()
-    threads[1].join()
-    assert torch.rand(1) == expected
-
-
 def test_a_second_interrupt_does_not_wait_for_a_collection():
     going = threading.Event()
     began = time.monotonic()
@@ -267,9 +242,3 @@ def test_a_missing_extra_is_named(tmp_path):
     assert result.stderr.rstrip().endswith(
         "ModuleNotFoundError: torch missing: pip install 'fetch_hand_sim[train]'"
     )
-
-
-def test_a_tilde_is_the_home_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv('HOME', str(tmp_path))
-    with pytest.raises(ValueError, match=f'{tmp_path}/runs/none'):
-        train('FetchReach', '~/runs/none', resume=True)

@@ -1,4 +1,4 @@
-"""Deterministic evaluation of a policy on fresh episodes, in the batch."""
+"""Evaluate policies on fresh episodes, without noise: outcomes, summary and table."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
+from policy_node.policies.actor import Actor
 from policy_node.policies.policy import Policy
+from policy_node.training.configuration.config import TrainConfig
 
 # Far from the seeds of training and of its evaluations.
 FIRST_SEED = 2_000_000_000
@@ -26,14 +31,11 @@ class EpisodeOutcomes:
     """Outcomes of evaluated episodes, arrays (episodes,).
 
     Attributes:
-        seed: Seed of the reset.
         success_gymnasium: Success at the last step, rule of the released code.
         success_paper: Success at the last step, rule of the paper's text.
         touched: Success (rule of the simulation) at any step.
-        episode_return: Sum of rewards.
         diverged: The simulation diverged; the episode counts as a failure.
         ticks_reached: Ticks in success (rule of the simulation) that another tick follows.
-        ticks_kept: Those of them that are followed by success.
         long_way: The quaternions of goal and object had opposite signs at the start, so that the
             `gymnasium` rule asks for the turn of more than pi; False where the goal is no pose.
         dropped: The object was below the palm at the end; False where the goal is no pose.
@@ -120,7 +122,6 @@ def run_episodes(simulation: Simulation, policy: Policy, seeds: list[int]) -> Ep
 
     Args:
         simulation: The simulations; both success rules are applied.
-        policy: The policy.
         seeds: One per simulation; an episode depends on its seed alone.
     """
     observation = simulation.reset(seed=seeds)
@@ -180,7 +181,6 @@ def evaluate(
 
     Args:
         simulation: The simulations; the result does not depend on their number.
-        policy: The policy.
         episodes: Number of episodes.
         first_seed: Seed of the first.
         hopeless: Asked after each batch; True ends the evaluation early.
@@ -197,3 +197,99 @@ def evaluate(
     if outcomes is None:
         raise ValueError(f'{episodes} episodes; allowed: 1 or more')
     return outcomes.first(episodes)
+
+
+# Seeds of evaluation episodes start here; those of training runs stay far below.
+EVALUATION_SEED = 1_000_000_000
+
+
+def training_seeds(sequence: np.random.SeedSequence, count: int) -> list[int]:
+    """Return seeds of `count` training episodes; evaluation never uses them."""
+    return [int(seed) % EVALUATION_SEED for seed in sequence.generate_state(count) >> 2]
+
+
+class Evaluator:
+    """Evaluates on the same episodes each time, in simulations of its own.
+
+    Training episodes therefore do not depend on whether there was an evaluation between them.
+
+    Attributes:
+        others: Policies to evaluate beside the actor, by column of `progress.csv`.
+    """
+
+    def __init__(self, simulation: Simulation, config: TrainConfig) -> None:
+        self._simulation = simulation
+        self._config = config
+        self.others: dict[str, Policy] = {}
+
+    def evaluate(self, actor: Actor, best_success: float) -> EpisodeOutcomes:
+        """Runs the episodes, fewer once their success cannot reach `best_success` any more.
+
+        "Cannot" means that it lies above the 95 % interval of the episodes so far.
+        """
+        rule = self._config.collect.success_rule
+
+        def hopeless(outcomes: EpisodeOutcomes) -> bool:
+            count = int(successes(outcomes, rule).sum())
+            return wilson_interval(count, len(outcomes))[1] < best_success
+
+        episodes = self._config.run.evaluation_episodes
+        return evaluate(self._simulation, actor, episodes, EVALUATION_SEED, hopeless)
+
+    def evaluate_others(self) -> dict[str, float]:
+        """Return the success rates of the other policies in all episodes, by column."""
+        episodes, rule = self._config.run.evaluation_episodes, self._config.collect.success_rule
+        found = {}
+        for column, policy in self.others.items():
+            outcomes = evaluate(self._simulation, policy, episodes, EVALUATION_SEED)
+            found[column] = success_rate(outcomes, rule)
+        return found
+
+    def is_complete(self, outcomes: EpisodeOutcomes) -> bool:
+        """Return whether an evaluation ran all its episodes, so that it may select the best."""
+        return len(outcomes) >= self._config.run.evaluation_episodes
+
+
+def successes(outcomes: EpisodeOutcomes, success_rule: str) -> NDArray[np.bool_]:
+    """Success of each episode at the last step, by a rule."""
+    paper = success_rule == 'paper'
+    return outcomes.success_paper if paper else outcomes.success_gymnasium
+
+
+def success_rate(outcomes: EpisodeOutcomes, success_rule: str) -> float:
+    """Share of episodes that succeed at the last step, by a rule."""
+    return float(successes(outcomes, success_rule).mean())
+
+
+_DIAGNOSES = {
+    'stay': 'success at the next tick, given success at this one',
+    'long_way': 'success where the goal is the long way round',
+    'dropped': 'object below the palm at the end',
+    'distance': 'median distance at the end, m',
+    'rotation': 'median rotation at the end, rad',
+}
+
+_NARROWEST = 60
+
+
+def print_table(report: dict[str, Any]) -> None:
+    """Prints rates with their 95 % intervals."""
+    title = f'{report["task"]}: {report["policy"]}, {report["episodes"]} episodes'
+    if 'disturbances' in report:
+        title += ', disturbed'
+    table = Table('measure', 'value', '95 % interval', title=Text(title))
+    names = {
+        'success_gymnasium': 'success at the last step, gymnasium rule',
+        'success_paper': 'success at the last step, paper rule',
+        'touched': 'goal touched at least once',
+    }
+    for name, label in names.items():
+        low, high = report[f'{name}_interval_95']
+        table.add_row(label, f'{report[name]:.4f}', f'{low:.4f} ... {high:.4f}')
+    for name, label in _DIAGNOSES.items():
+        if name in report:
+            table.add_row(label, f'{report[name]:.4f}', '')
+    table.add_row('mean return', f'{report["mean_return"]:.3f}', '')
+    table.add_row('diverged episodes', str(report['diverged']), '')
+    # Numbers are whole in a terminal that has no room for them.
+    Console(width=max(Console().width, _NARROWEST)).print(table)

@@ -1,1 +1,0 @@
-"""Success rate of policies over new episodes."""

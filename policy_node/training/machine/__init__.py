@@ -1,1 +1,0 @@
-"""The machine of a run: processor, device, memory, other workers."""
