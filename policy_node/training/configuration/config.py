@@ -438,8 +438,8 @@ def _contradictions_of_options(
         ('condition threshold needs reward_type sparse'),
     )
     if isinstance(values, Chosen):
-        sources = config.goals.goals or [config.goals.strategy[:6]]
-        yield 'future' not in sources, f'goal_choice {values.goal_choice} needs future goals'
+        chosen_from = config.goals.goals or [config.goals.strategy[:6]]
+        yield 'future' not in chosen_from, f'goal_choice {values.goal_choice} needs future goals'
         yield (
             values.goal_choice == 'uncertain' and critic.critics == 1,
             'goal_choice uncertain needs critics above 1',
