@@ -172,7 +172,7 @@ def test_bad_assignments_are_refused(text: str, match: str) -> None:
         ({'quantiles': 5, 'norm': 'batch', 'target': 'none'}, 'exclude .* norm batch'),
         ({'quantiles': 5, 'init_from': 'FetchReach'}, 'init_from excludes quantiles 5'),
         ({'norm': 'batch'}, 'norm batch needs target none'),
-        ({'goal_choice': 'bellman', 'goals': 'actual=.8'}, 'bellman needs future or near goals'),
+        ({'goal_choice': 'bellman', 'goals': 'actual=.8'}, 'bellman needs future goals'),
         ({'goal_choice': 'uncertain'}, 'goal_choice uncertain needs critics above 1'),
         ({'condition': 'horizon', 'n_step': 3}, 'n_step 3 excludes condition horizon'),
         ({'condition': 'threshold', 'reward_type': 'dense'}, 'needs reward_type sparse'),
