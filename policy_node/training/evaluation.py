@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,12 @@ from rich.text import Text
 from fetch_hand_sim.simulation import Simulation
 from fetch_hand_sim.simulation.tasks.hand_manipulate import PALM_HEIGHT
 from msgs_spec.tasks import GoalKind, TaskSpec
-from policy_node.policies.actor import Actor
 from policy_node.policies.policy import Policy
-from policy_node.training.configuration.config import TrainConfig
+
+if TYPE_CHECKING:
+    # These import torch, which the help of commands does without.
+    from policy_node.policies.actor import Actor
+    from policy_node.training.configuration.config import TrainConfig
 
 # Far from the seeds of training and of its evaluations.
 FIRST_SEED = 2_000_000_000

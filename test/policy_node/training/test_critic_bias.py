@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from policy_node.training.configuration.recipes import recipe_config
-from policy_node.training.critic_bias import discounted, main, measure
+from policy_node.training.critic_bias import main
 from policy_node.training.machine import Workers
 from policy_node.training.runs.trainer import Trainer
+from policy_node.training.values_and_returns import discounted, measure
 
 TINY = {'num_envs': 2, 'evaluation_episodes': 2, 'simulation_threads': 1, 'torch_threads': 1}
 
