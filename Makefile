@@ -63,7 +63,7 @@ endif
 
 # Tests that start nodes mostly wait, so four of them share the machine; tests marked `alone` have it for
 # themselves. Beside the other tests, which compute, some node tests fail now and then on two cores.
-# `--reruns 1`: another process of a shared machine may delay a node by seconds once.
+# `--reruns 1`: another process of a shared machine may delay a test by seconds once.
 NODE_TESTS := test/nodes test/fetch_hand_sim/replay_node \
 	test/fetch_hand_sim/episode_log/test_episode_endings.py \
 	test/fetch_hand_sim/episodes/test_episode_recorder.py
@@ -78,7 +78,7 @@ test-nodes: env
 	$(BIN)/python -m pytest -m 'not alone and not release' --reruns 1 -n 4 --dist worksteal $(NODE_TESTS)
 
 test-others: env
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(addprefix --ignore=,$(NODE_TESTS))
+	$(BIN)/python -m pytest --reruns 1 -n auto --maxprocesses 4 --dist worksteal $(addprefix --ignore=,$(NODE_TESTS))
 
 lint: env
 	$(BIN)/python -m ruff check $(PYTHON_FILES)

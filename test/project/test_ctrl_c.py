@@ -97,7 +97,7 @@ def test_a_module_that_has_hardly_begun(module):
 )
 def test_a_command_at_any_moment(name, words, imports, programs):
     code, said = interrupt_in_time([programs / name, *words], imports)
-    assert code == 130
+    assert code == 130, said
     assert re.fullmatch(rf'{name}( [a-z]+)*: stopping\n', said)
 
 

@@ -134,8 +134,8 @@ def test_no_name_is_the_shipped_actor_of_the_task(monkeypatch: pytest.MonkeyPatc
     assert load_policy('robust', 'FetchReach').description == 'actor FetchReach_robust.safetensors'
     with pytest.raises(ValueError, match=r'HandReach .*FetchReach'):
         load_policy('', 'HandReach')
-    with pytest.raises(ValueError, match=r'robust .*FetchSlide .*FetchReach'):
-        load_policy('robust', 'FetchSlide')
+    with pytest.raises(ValueError, match=r'robust .*HandManipulateEggFull .*FetchReach'):
+        load_policy('robust', 'HandManipulateEggFull')
 
 
 @pytest.mark.parametrize('name', ['random', 'resting', ''])
