@@ -110,7 +110,7 @@ print(abs(reward + far / 0.3) < 1e-12, introduction(task_spec('FetchPushNear'))[
 policy = ['--policy', 'random', '--task', 'FetchPushNear', '--episodes', '2']
 assert main(['episodes', 'generate', *policy, '--output', 'episodes']) == 0
 assert main(['episodes', 'check', 'episodes']) == 0
-training = ['--task', 'FetchPushNear', '--steps', '50', '--num-envs', '1', '--random-steps', '0']
+training = ['--task', 'FetchPushNear', '--steps', '50', '--num-envs', '1']
 fast = ['--batch-size', '8', '--updates-per-cycle', '1', '--evaluation-episodes', '1']
 assert main(['train', *training, *fast, '--output', 'run']) == 0
 """

@@ -79,7 +79,7 @@ def test_python_runs_as_it_stands(page, episodes):
         env=script_environment(),
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=170,
     )
     assert result.returncode == 0, result.stderr
 
