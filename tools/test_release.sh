@@ -74,8 +74,8 @@ grep -v '^pillow==' "$root/constraints.txt" >"$work/film.txt"
     --constraint "$work/film.txt" "$wheel" moviepy pytest pytest-timeout
 # A copy, where no source is: the wheel is what records.
 mkdir "$work/film-test"
-cp "$root/test/fetch_hand_sim/gym_envs/test_vector_env.py" "$work/film-test"
-(cd "$work/film-test" && "$work/film/bin/pytest" -q -p no:cacheprovider --rootdir . -k records_a_film .)
+cp -r "$root/test/fetch_hand_sim/gym_envs/test_vector_env.py" "$root/test/support" "$work/film-test"
+(cd "$work/film-test" && "$work/film/bin/pytest" -q -p no:cacheprovider --rootdir . -k records_a_film test_vector_env.py)
 
 say 'tests and examples of Gymnasium-Robotics, from its repository'
 pip_install base pytest
