@@ -12,19 +12,14 @@ import os
 import re
 import shlex
 import signal
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
-from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
-from msgs_spec.parameters import LARGEST_PICTURE_SIDE
 from msgs_spec.text import did_you_mean, one_line, printable
 from node_runtime.signals import (
     EXIT_INTERRUPTED,
@@ -115,26 +110,6 @@ def whole_number(lower: int, upper: int | None = None) -> Callable[[str], int]:
         return value
 
     return read
-
-
-def two_numbers(largest: int) -> Callable[[str], tuple[int, int]]:
-    """Return a parser of `640x480` for `add_argument(type=...)`; each number is 1 to `largest`."""
-
-    def read(text: str) -> tuple[int, int]:
-        try:
-            first, second = (int(number) for number in text.split('x'))
-        except ValueError:
-            first = second = 0
-        if not (1 <= first <= largest and 1 <= second <= largest):
-            raise argparse.ArgumentTypeError(
-                f'{text[:80]!r} given; allowed: 1x1 ... {largest}x{largest}'
-            )
-        return first, second
-
-    return read
-
-
-picture_size = two_numbers(LARGEST_PICTURE_SIDE)
 
 
 def complain(name: str, text: object) -> None:
@@ -296,35 +271,3 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
             # The work is valid even if the terminal with the bar has closed.
             if is_unread(2):
                 discard_unread_output()
-
-
-# The source revision that episodes and policies record
-
-_PACKAGES = ('msgs_spec', 'node_runtime', 'fetch_hand_sim', 'policy_node')
-
-
-@cache
-def source_revision() -> str:
-    """Return the commit of this source tree, or the installed version outside of a repository."""
-    root = Path(__file__).resolve().parents[1]
-    # Not a parent folder's: an installed copy may lie in a user's repository.
-    if (root / '.git').exists():
-        with suppress(OSError, subprocess.SubprocessError):
-            return revision_of(root)
-    try:
-        return f'fetch_hand_sim {version("fetch_hand_sim")}'
-    except PackageNotFoundError:
-        return 'unknown'
-
-
-def revision_of(root: Path) -> str:
-    """Return the commit of a source tree, with `-dirty` if files of its packages have changed."""
-
-    def git(*arguments: str) -> str:
-        command = ['git', '-C', str(root), *arguments]
-        run = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5.0)
-        return run.stdout.strip()
-
-    commit = git('rev-parse', 'HEAD')
-    changed = git('status', '--porcelain', '--untracked-files=no', '--', *_PACKAGES)
-    return f'{commit}-dirty' if changed else commit

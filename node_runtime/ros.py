@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, MutableMapping
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msgs_spec.topics import QosSpec
@@ -15,9 +17,6 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.publisher import Publisher
     from rclpy.qos import QoSProfile
-import os
-from collections.abc import MutableMapping
-from pathlib import Path
 
 _UNKNOWN = '_NODE_NAME_UNKNOWN_'
 # Seconds to wait at shutdown until subscribers have the last messages.

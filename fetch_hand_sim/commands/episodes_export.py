@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from fetch_hand_sim.commands.episodes_list import add_filter_options, is_wanted
+from fetch_hand_sim.commands.options import add_filter_options, is_wanted, picture_size
 from fetch_hand_sim.datasets import minari
 from fetch_hand_sim.datasets.parquet import export_parquet
 from fetch_hand_sim.datasets.writing import ByTask, why_apart
@@ -30,7 +30,6 @@ from node_runtime.command_line import (
     CommandParser,
     UsageError,
     complain,
-    picture_size,
     progress,
     require_extra,
     run_command,

@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from fetch_hand_sim.commands.options import picture_size, two_numbers
 from msgs_spec.arrays import Picture
 from node_runtime.command_line import (
     EXIT_SUCCESS,
@@ -17,11 +18,9 @@ from node_runtime.command_line import (
     CommandParser,
     UsageError,
     complain,
-    picture_size,
     progress,
     run_command,
     say,
-    two_numbers,
 )
 
 _NAME = 'fetch_hand_sim episodes film'

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from fetch_hand_sim.commands.options import add_filter_options, is_wanted
 from fetch_hand_sim.episode_log import (
     EpisodeLogError,
     EpisodeReadError,
@@ -25,8 +26,7 @@ from fetch_hand_sim.episode_log import (
     read_summary,
 )
 from fetch_hand_sim.episode_log.files import folders_below
-from fetch_hand_sim.episode_log.metadata import HasOutcome, integer_or_none
-from msgs_spec.tasks import TASKS
+from fetch_hand_sim.episode_log.metadata import integer_or_none
 from msgs_spec.text import printable
 from node_runtime.command_line import (
     EXIT_FAILURE,
@@ -54,31 +54,6 @@ _NUMBERS = frozenset({'seed', 'steps', 'return', 'seconds', 'KiB', 'late command
 # Wide enough for every column. A narrow terminal wraps lines, which keeps names whole.
 _WIDEST = 400
 _LONGEST_CELL = 60
-
-
-def add_filter_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--task`, `--success`, `--failure` and `--complete`, which are None by default."""
-    parser.add_argument('--task', choices=list(TASKS), metavar='TASK', help='only this task')
-    success = parser.add_mutually_exclusive_group()
-    success.add_argument('--success', action='store_true', default=None, help='only successes')
-    success.add_argument(
-        '--failure', dest='success', action='store_false', help='only failures', default=None
-    )
-    parser.add_argument(
-        '--complete',
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help='only complete episodes, or only interrupted ones',
-    )
-
-
-def is_wanted(options: argparse.Namespace, task: str | None, episode: HasOutcome) -> bool:
-    """Return whether an episode passes the filters; an unknown outcome fails both of them."""
-    return (
-        options.task in (None, task)
-        and options.success in (None, episode.outcome.is_success)
-        and options.complete in (None, episode.is_complete)
-    )
 
 
 def read_summaries(directory: Path) -> tuple[list[EpisodeSummary], list[EpisodeReadError]]:

@@ -38,7 +38,7 @@ from msgs_spec.schemas import deserialize, type_hash
 from msgs_spec.text import one_line
 from msgs_spec.tick import EpisodeStatus, Tick, TickEncoder
 from msgs_spec.topics import TopicSpec
-from node_runtime.command_line import source_revision
+from node_runtime.source_revision import source_revision
 
 # Characters of a value in a line.
 _LONGEST = 80

@@ -34,7 +34,7 @@ from fetch_hand_sim.episode_log import (
 from fetch_hand_sim.simulation import Simulation
 from msgs_spec.tick import EpisodeStatus, Tick
 from msgs_spec.topics import TopicSpec
-from node_runtime.command_line import source_revision
+from node_runtime.source_revision import source_revision
 
 Messages = Sequence[tuple[TopicSpec, bytes]]
 Task = Callable[[], None]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from node_runtime.command_line import revision_of
+from node_runtime.source_revision import revision_of
 
 
 def git(root: Path, *arguments: str) -> str:

@@ -20,9 +20,9 @@ from node_runtime.command_line import (
     complain,
     complain_from_handler,
     require_extra,
-    source_revision,
 )
 from node_runtime.signals import on_stop_signals
+from node_runtime.source_revision import source_revision
 from policy_node.training.configuration.config import TrainConfig, idle_parts
 from policy_node.training.configuration.flat import config_from_dict, removed_fields, to_flat
 from policy_node.training.configuration.groups import Imitation
