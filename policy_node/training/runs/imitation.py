@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,38 +38,28 @@ class Answers:
 
     Args:
         capacity: Most rows kept.
-        features: Length of an input.
-        action_size: Length of an answer.
+        sizes: Lengths of the parts of a row: an input, an answer and, where a critic judges
+            actions, the features of the true state in which the action arrives.
     """
 
-    def __init__(self, capacity: int, features: int, action_size: int) -> None:
-        sizes = (features, features, action_size)
+    def __init__(self, capacity: int, sizes: Sequence[int]) -> None:
         self._parts = [torch.empty(capacity, size) for size in sizes]
         self._capacity, self._count = capacity, 0
 
-    def add(self, inputs: Tensor, states: Tensor, answers: Tensor) -> None:
-        """Store rows.
+    def add(self, *parts: Tensor) -> None:
+        """Store n rows, given as parts (n, size)."""
+        rows = (self._count + torch.arange(len(parts[0]))) % self._capacity
+        for stored, values in zip(self._parts, parts, strict=True):
+            stored[rows] = values
+        self._count += len(rows)
 
-        Args:
-            inputs: (n, features) of the imitating policy.
-            states: (n, features) of the true state in which the action arrives.
-            answers: (n, action size) of the imitated policy in this state.
-        """
-        rows = (self._count + torch.arange(len(inputs))) % self._capacity
-        for part, values in zip(self._parts, (inputs, states, answers), strict=True):
-            part[rows] = values
-        self._count += len(inputs)
-
-    def draw(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw `count` random rows: inputs, states and answers."""
+    def draw(self, count: int) -> list[Tensor]:
+        """Draw `count` random rows; return their parts."""
         rows = torch.randint(min(self._count, self._capacity), (count,))
-        inputs, states, answers = (part[rows] for part in self._parts)
-        return inputs, states, answers
+        return [part[rows] for part in self._parts]
 
 
 def _scaled(config: TrainConfig, scale: float) -> TrainConfig:
-    if scale == 1.0:
-        return config
     scaled = read_disturbances(config.collect.disturbances).scaled(scale)
     collect = replace(config.collect, disturbances=json.dumps(scaled.as_dict()))
     return replace(config, collect=collect)
@@ -121,9 +112,10 @@ class ImitationTrainer:
         self._critic = self._make_critic(init_from)
         self._optimizer = torch.optim.Adam(self.actor.network.parameters())
         shape, capacity = self.actor.shape, config.replay.replay_transitions
-        self._answers = Answers(
-            min(capacity, config.run.total_steps), shape.feature_size, shape.action_size
-        )
+        sizes = [shape.feature_size, shape.action_size]
+        if self._critic is not None:
+            sizes.append(shape.feature_size)
+        self._answers = Answers(min(capacity, config.run.total_steps), sizes)
         self._stop_reason = ''
 
     def _make_critic(self, init_from: InitialNetworks) -> Critic | None:
@@ -204,7 +196,9 @@ class ImitationTrainer:
         for delay in np.unique(latency):
             rows = np.flatnonzero((latency == delay) & ~diverged)
             # An action takes effect `delay` ticks later; the last ones never do.
-            parts = inputs[: ticks - delay], states[delay:], answers[delay:]
+            parts = [inputs[: ticks - delay], answers[delay:]]
+            if self._critic is not None:
+                parts.append(states[delay:])
             self._answers.add(*(torch.stack(part)[:, rows].flatten(0, 1) for part in parts))
         self.counters.env_steps += count * ticks
         self.counters.episodes += count
@@ -222,11 +216,11 @@ class ImitationTrainer:
         for group in self._optimizer.param_groups:
             group['lr'] = learner.learning_rate * share
         for _ in range(learner.updates_per_cycle):
-            inputs, states, answers = self._answers.draw(learner.batch_size)
+            inputs, answers, *states = self._answers.draw(learner.batch_size)
             actions = self.actor(inputs)
             loss = (actions - answers).square().mean()
             if self._critic is not None:
-                lost = self._critic(states, answers) - self._critic(states, actions)
+                lost = self._critic(*states, answers) - self._critic(*states, actions)
                 # An action of higher value than the imitated one exploits errors of the critic.
                 loss = loss + learner.value_weight * lost.clamp(min=0.0).mean()
             self._optimizer.zero_grad()

@@ -29,7 +29,7 @@ def test_each_input_is_answered_in_the_state_in_which_the_action_arrives(tmp_pat
     trainer = ImitationTrainer(config, tmp_path, Workers(), '', '', networks)
     trainer._collect()
     pairs = 2 * (TASKS[task].episode_ticks - 1)
-    inputs, _, answers = (part[:pairs] for part in trainer._answers._parts)
+    inputs, answers = (part[:pairs] for part in trainer._answers._parts)
     # Without other disturbances, the next input contains the state in which the action arrives.
     imitated, size = load_actor(task, task), config.network.past_actions * 4
     start = trainer.actor.shape.past_start
@@ -56,7 +56,7 @@ def test_the_critic_of_the_imitated_policy_judges_the_actions(tmp_path: Path) ->
     networks = read_initial_networks(task).fitted(config)
     trainer = ImitationTrainer(config, tmp_path, Workers(), '', '', networks)
     trainer._collect()
-    _, states, answers = trainer._answers.draw(64)
+    _, answers, states = trainer._answers.draw(64)
     # The imitated policy was trained to maximise the values of this critic.
     assert trainer._critic is not None
     assert trainer._critic(states, answers).mean() > trainer._critic(states, -answers).mean()
@@ -66,7 +66,7 @@ def test_the_critic_of_the_imitated_policy_judges_the_actions(tmp_path: Path) ->
 
 
 def test_the_newest_answers_are_kept() -> None:
-    answers = Answers(3, 1, 1)
+    answers = Answers(3, (1, 1, 1))
     for value in range(5):
         answers.add(*(torch.full((1, 1), factor * value) for factor in (1.0, 10.0, -1.0)))
     inputs, states, outputs = answers.draw(200)
