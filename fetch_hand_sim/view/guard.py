@@ -228,7 +228,7 @@ def guarded_serve(
 
 
 def _adapt(response: Response, is_read_only: bool) -> None:
-    """Add language and viewport to the page; a page that can only watch says so."""
+    """Add language and viewport to the page; in read-only mode, name its role Watching."""
     content = response.headers.get('Content-Type', '')
     body = bytes(response.body or b'')
     if content.startswith('text/html'):

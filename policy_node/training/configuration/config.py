@@ -218,7 +218,7 @@ MOST_UNITS = 65_536
 _NOISE_ALONE = 10.0
 # Adam moves a weight by at most about the learning rate; float32 loses smaller sums.
 _NO_CHANGE = 1e-7
-# What keeps a larger share of its first value has not moved.
+# A value that keeps a larger share of its first value has not moved.
 _KEPT = 0.99
 
 # Sources of goals. `real` keeps the goal of the episode.

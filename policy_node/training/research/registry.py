@@ -192,7 +192,7 @@ def _extra_actions(config: TrainConfig) -> int:
 
 
 def _weights_of(config: TrainConfig, spec: TaskSpec) -> Weigh:
-    """Return the function that finds episodes with a motion; a landing of a gamble is none."""
+    """Return the function that finds episodes with a motion, the landing of a gamble left out."""
     if not config.collect.gamble:
         return has_moved
     return lambda episodes: has_moved(without_landings(episodes, spec))
