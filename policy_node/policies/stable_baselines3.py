@@ -89,8 +89,9 @@ def load_stable_baselines3(path: Path, task: str) -> LoadedPolicy:
     _check_sizes(path, task_spec(task), model.policy)
     statistics, ending = None, ''
     if file := _statistics_file(path):
-        data += read_file(file)
-        statistics, ending = _statistics(file), f' with {file.name}'
+        content = read_file(file)
+        data += content
+        statistics, ending = _statistics(file, content), f' with {file.name}'
     else:
         logging.getLogger(__name__).warning(
             '%s has no %s beside it: if it was trained under VecNormalize, its actions are wrong',
@@ -116,10 +117,10 @@ def _statistics_file(path: Path) -> Path | None:
     return next((file for file in files if file.is_file() and file.stem != path.stem), None)
 
 
-def _statistics(file: Path) -> Any:
+def _statistics(file: Path, content: bytes) -> Any:
     """Load the `VecNormalize` of a training; this can run code in its file."""
     try:
-        statistics = pickle.loads(read_file(file))
+        statistics = pickle.loads(content)
     except Exception as error:
         # Unpickling a file of another version can raise anything.
         raise ValueError(f'{file} cannot be loaded: {one_line(error)}') from None

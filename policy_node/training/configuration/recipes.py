@@ -174,28 +174,32 @@ def _best(task: str) -> dict[str, Any]:
     return dict(_FETCH) if task.startswith('Fetch') else _object_in_hand(task)
 
 
+# Tasks that need exact actions in a few ticks: their scale of `hardware`, and the scales of these
+# disturbances in turn.
+_EXACT = {'FetchSlide': (0.0, (1.0, 0.5)), 'FetchPickAndPlace': (1.0, (1.0, 1.0, 0.3))}
+
+
 def _robust(task: str) -> dict[str, Any]:
     """Imitate the shipped policy on a robot with half of `hardware` and 0 to 2 ticks of latency.
 
-    FetchSlide learns with latency alone. FetchSlide and FetchPickAndPlace need exact actions in a
-    few ticks, so the critic weighs their errors (docs/robust_policies.md).
+    For exact actions, the critic weighs errors (docs/robust_policies.md).
     """
-    scale = {'FetchSlide': 0.0, 'FetchPickAndPlace': 1.0}.get(task, 0.5)
+    scale, in_turn = _EXACT.get(task, (0.5, (1.0,)))
     scaled = PRESETS['hardware'].scaled(scale)
     action = dataclasses.replace(scaled.action, latency=(0, 2))
     values = _shipped_networks(task) | {
         'algorithm': 'imitation',
         'init_from': task,
         'disturbances': json.dumps(dataclasses.replace(scaled, action=action).as_dict()),
+        'disturbance_scales': in_turn,
         'past_actions': 4,
         'total_steps': 10_000 * task_spec(task).episode_ticks,
         'updates_per_cycle': 150,
         'final_learning_rate': 0.02,
         'evaluate_every': 100_000,
     }
-    if scale != 0.5:
+    if task in _EXACT:
         values |= {'past_actions': 8, 'updates_per_cycle': 100, 'value_weight': 3.0}
-        values['disturbance_scales'] = (1.0, 0.5) if task == 'FetchSlide' else (1.0, 1.0, 0.3)
     return values
 
 
