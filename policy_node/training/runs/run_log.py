@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -103,10 +103,7 @@ class RunLog:
         self._writer.writerow({name: _short(row.get(name)) for name in COLUMNS})
         self._file.flush()
         if self._board is not None:
-            for name, value in row.items():
-                if value is not None and name != 'env_steps':
-                    self._board.add_scalar(name, value, int(row['env_steps'] or 0))
-            self._board.flush()
+            self._board.write(row)
         if not self._quiet:
             self._show(row)
         if self._on_row is not None:
@@ -209,15 +206,48 @@ def _valid_rows(path: str | Path) -> Iterator[tuple[dict[str, str], dict[str, fl
                 yield row, numbers
 
 
-def _tensorboard(output: Path, resumed_steps: int) -> Any:
+class _Board:
+    """A TensorBoard event file, written without the thread of TensorBoard's own writers.
+
+    An error in that thread would print a traceback.
+    """
+
+    def __init__(self, folder: Path, resumed_steps: int) -> None:
+        from tensorboard.compat.proto import event_pb2, summary_pb2
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        self._event, self._summary = event_pb2.Event, summary_pb2.Summary
+        folder.mkdir(exist_ok=True)
+        name = f'events.out.tfevents.{time.time_ns()}.{os.getpid()}'
+        self._records = RecordWriter((folder / name).open('xb'))
+        self._write(file_version='brain.Event:2')
+        start = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
+        # TensorBoard hides earlier values of the steps that a resumed run repeats.
+        self._write(step=resumed_steps + 1, session_log=start)
+
+    def write(self, row: Row) -> None:
+        """Write the values of a cycle."""
+        values = [
+            self._summary.Value(tag=name, simple_value=value)
+            for name, value in row.items()
+            if value is not None and name != 'env_steps'
+        ]
+        self._write(step=int(row['env_steps'] or 0), summary=self._summary(value=values))
+
+    def close(self) -> None:
+        self._records.close()
+
+    def _write(self, **values: Any) -> None:
+        event = self._event(wall_time=time.time(), **values)
+        self._records.write(event.SerializeToString())
+        self._records.flush()
+
+
+def _tensorboard(output: Path, resumed_steps: int) -> _Board | None:
     try:
-        from torch.utils.tensorboard import SummaryWriter
+        return _Board(output / BOARD_FOLDER, resumed_steps)
     except ImportError:
         return None
-    # `RunLog.write` flushes; an error in a thread of TensorBoard would print a traceback.
-    never = threading.TIMEOUT_MAX / 2
-    folder = str(output / BOARD_FOLDER)
-    return SummaryWriter(folder, purge_step=resumed_steps + 1, flush_secs=never)
 
 
 def read_progress(path: str | Path) -> list[dict[str, float]]:

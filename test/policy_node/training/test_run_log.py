@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,18 @@ def test_tensorboard_holds_the_scalars(tmp_path: Path) -> None:
     events.Reload()
     assert [(e.step, e.value) for e in events.Scalars('eval_success')] == [(100, 0.5)]
     assert [e.step for e in events.Scalars('train_success')] == [100, 200]
+
+
+def test_a_removed_folder_prints_no_traceback(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / 'run').mkdir()
+    log = RunLog(tmp_path / 'run', total_steps=1000, time_limit=0, quiet=True)
+    shutil.rmtree(tmp_path / 'run')
+    for step in range(100, 400, 100):
+        log.write(row(step, 0.5))
+    log.close()
+    assert capfd.readouterr().err == ''
 
 
 def test_the_curve_is_a_png_that_shows_the_numbers(tmp_path: Path) -> None:
