@@ -80,7 +80,7 @@ def _find(directory: Path) -> list[Leftover]:
 def _without_messages(leftover: Path) -> str:
     aside = files.aside_path(leftover.parent, files.active_name(leftover) or '')
     what = f'moved to {aside}' if aside.exists() else 'removed'
-    return f'{what}: {leftover} was killed before its first messages were written'
+    return f'{what}: {leftover} has no readable message'
 
 
 def _recover(leftover: Path) -> bool:

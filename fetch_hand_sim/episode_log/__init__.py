@@ -17,7 +17,6 @@ from fetch_hand_sim.episode_log.writer import (
     EpisodeDirectory,
     EpisodeWriter,
     episode_name,
-    log_time,
 )
 
 __all__ = [
@@ -40,7 +39,6 @@ __all__ = [
     'find_episodes',
     'find_leftovers',
     'load_episodes',
-    'log_time',
     'read_episode',
     'read_summary',
     'recover_episode',

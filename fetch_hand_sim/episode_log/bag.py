@@ -7,6 +7,7 @@ all data.
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,12 +17,10 @@ import yaml
 from mcap.writer import CompressionType, IndexType, Writer
 
 from fetch_hand_sim.episode_log.records import (
-    MAX_ATTACHMENTS,
     MAX_CHUNKS,
     MAX_MAP_ENTRIES,
     MAX_MESSAGES,
     MAX_METADATA_BYTES,
-    MAX_TOPICS,
     MAX_UNPACKED_BYTES,
 )
 from msgs_spec.schemas import MAX_MESSAGE_BYTES, schema_text, type_hash
@@ -36,6 +35,10 @@ _ALL_BUT_ATTACHMENTS = IndexType.ALL & ~IndexType.ATTACHMENT
 # Bytes in a chunk beside the data of a message, and at most for the first message of a topic.
 _MESSAGE_BYTES = 1 + 8 + 2 + 4 + 8 + 8
 _TOPIC_BYTES = 2**16
+_TOO_LONG = (
+    f'the episode is too long for a file of {MAX_MESSAGES} messages and '
+    f'{MAX_UNPACKED_BYTES // 2**20} MiB of them'
+)
 # Version of rosbag2's `metadata.yaml` in ROS 2 Jazzy.
 _VERSION, _ROS_DISTRO = 9, 'jazzy'
 # Infinite duration of rmw: no limit is set.
@@ -79,9 +82,6 @@ def offered_qos_text(spec: QosSpec) -> str:
 
 def checked_strings(content: Mapping[str, str]) -> dict[str, str]:
     """Return a copy of a metadata record, or raise ValueError if readers would reject it."""
-    for key, value in content.items():
-        if not isinstance(key, str) or not isinstance(value, str):
-            raise ValueError(f'episode metadata are strings, not {key!r}: {value!r}')
     size = sum(len(text.encode()) for item in content.items() for text in item)
     if size > MAX_METADATA_BYTES:
         raise ValueError(f'{size} bytes of episode metadata; allowed: {MAX_METADATA_BYTES}')
@@ -114,8 +114,6 @@ class BagFile:
         metadata: dict[str, str],
         attachments: Sequence[Attachment],
     ) -> None:
-        if len(attachments) > MAX_ATTACHMENTS:
-            raise ValueError(f'{len(attachments)} attachments; allowed: {MAX_ATTACHMENTS}')
         self._stream = stream
         self._file_name = file_name
         self._metadata = metadata
@@ -131,7 +129,7 @@ class BagFile:
         self._channels: dict[str, _Channel] = {}
         self._start_ns = 0
         self._end_ns = -1
-        self._bytes = self._chunks = self._chunk_bytes = 0
+        self._bytes = self._flushes = 0
         self.message_count = 0
         self.has_unflushed = False
         self._writer.start(profile='ros2')
@@ -150,22 +148,12 @@ class BagFile:
         Sequence numbers count the messages of a topic from 0, so a gap is visible.
 
         Raises:
-            ValueError: If the time does not grow, the topic had another type before, or readers
-                would reject the file; nothing is written then.
+            OSError: If readers would reject the file; all earlier messages are flushed then.
         """
-        if log_time_ns <= self._end_ns:
-            raise ValueError(
-                f'log time {log_time_ns} ns of {name} is not later than the one before it, '
-                f'{self._end_ns} ns'
-            )
-        if exceeded := self._exceeded(len(data)):
-            raise ValueError(f'{name}: no reader takes {exceeded}')
+        if not self.has_room(len(data)):
+            self.flush()
+            raise OSError(errno.EFBIG, _TOO_LONG)
         channel = self._channels.get(name) or self._add_channel(name, topic)
-        if channel.topic.type_name != topic.type_name:
-            raise ValueError(
-                f'topic {topic.name} is {channel.topic.type_name} in this episode, '
-                f'not {topic.type_name}'
-            )
         self._writer.add_message(channel.id, log_time_ns, data, log_time_ns, channel.count)
         if self._end_ns < 0:
             self._start_ns = log_time_ns
@@ -173,20 +161,25 @@ class BagFile:
         channel.count += 1
         self.message_count += 1
         self.has_unflushed = True
-        self._count_bytes(_MESSAGE_BYTES + len(data))
+        self._bytes += _MESSAGE_BYTES + len(data)
 
     @property
     def chunks(self) -> int:
-        """Number of chunks so far, including the one in progress."""
-        return self._chunks + (self._chunk_bytes > 0)
+        """Upper bound of the number of chunks so far, including the one in progress."""
+        return self._flushes + self._bytes // CHUNK_BYTES + 1
 
     def has_room(self, size: int) -> bool:
         """Return whether readers accept the file with one more message of `size` bytes."""
-        return not self._exceeded(size)
+        return (
+            size <= MAX_MESSAGE_BYTES
+            and self.message_count < MAX_MESSAGES
+            and self._bytes + _TOPIC_BYTES + _MESSAGE_BYTES + size <= MAX_UNPACKED_BYTES
+            and self.chunks < MAX_CHUNKS
+        )
 
     def flush(self) -> None:
         """End the chunk in progress and hand everything to the operating system."""
-        self._end_chunk()
+        self._flushes += self.has_unflushed
         self.has_unflushed = False
         self._writer.flush()  # type: ignore[no-untyped-call]
 
@@ -200,38 +193,10 @@ class BagFile:
         self._stream.flush()
         return _dump({'rosbag2_bagfile_information': self._description(custom_data)})
 
-    def _exceeded(self, size: int) -> str:
-        """Return which limit one more message of `size` bytes exceeds; '' for none."""
-        total = self._bytes + _TOPIC_BYTES + _MESSAGE_BYTES + size
-        counts = (
-            (size, MAX_MESSAGE_BYTES, 'bytes in a message'),
-            (self.message_count + 1, MAX_MESSAGES, 'messages in a file'),
-            (total, MAX_UNPACKED_BYTES, 'bytes of messages in a file'),
-            (self.chunks + 1, MAX_CHUNKS, 'chunks in a file'),
-        )
-        for count, limit, what in counts:
-            if count > limit:
-                return f'{count} {what}; allowed: up to {limit}'
-        return ''
-
-    def _count_bytes(self, size: int) -> None:
-        self._bytes += size
-        self._chunk_bytes += size
-        if self._chunk_bytes > CHUNK_BYTES:
-            self._end_chunk()
-
-    def _end_chunk(self) -> None:
-        self._chunks += self._chunk_bytes > 0
-        self._chunk_bytes = 0
-
     def _add_channel(self, name: str, topic: TopicSpec) -> _Channel:
-        if len(self._channels) >= MAX_TOPICS:
-            raise ValueError(f'{name}: no reader takes more than {MAX_TOPICS} topics')
         text, qos = schema_text(topic.type_name), offered_qos_text(topic.qos)
         texts = (name, topic.type_name, text, qos, type_hash(topic.type_name))
-        size = 4 * 64 + sum(len(each.encode()) for each in texts)
-        if size > _TOPIC_BYTES:
-            raise ValueError(f'{name}: schema and channel of {size} bytes; allowed: {_TOPIC_BYTES}')
+        self._bytes += 4 * 64 + sum(len(each.encode()) for each in texts)
         if topic.type_name not in self._schemas:
             self._schemas[topic.type_name] = self._writer.register_schema(
                 topic.type_name, 'ros2msg', text.encode()
@@ -242,9 +207,7 @@ class BagFile:
             self._schemas[topic.type_name],
             {'offered_qos_profiles': qos, 'topic_type_hash': type_hash(topic.type_name)},
         )
-        channel = self._channels[name] = _Channel(name, topic, id)
-        self._count_bytes(size)
-        return channel
+        return self._channels.setdefault(name, _Channel(name, topic, id))
 
     def _rosbag2_record(self, custom_data: Mapping[str, str]) -> dict[str, str]:
         return {'serialized_metadata': _dump(self._description(custom_data))}

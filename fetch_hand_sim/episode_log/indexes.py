@@ -27,6 +27,7 @@ from fetch_hand_sim.episode_log.records import (
 
 # CRC of the summary and magic, bytes.
 _FILE_END = 4 + len(MCAP0_MAGIC)
+_DATA_END, _FOOTER, _SUMMARY_OFFSET = map(struct.Struct, ('<I', '<QQI', '<BQQ'))
 _INDEX_OFFSET = struct.Struct('<HQ')
 _CHUNK_INDEX = struct.Struct('<QQQQI')
 _CHUNK_SIZES = struct.Struct('<QQ')
@@ -109,11 +110,18 @@ def _fields(data: bytes, position: int, end: int) -> Fields:
     return Fields(data[position + RECORD.size : end], kind)
 
 
-def _check_data_crc(data: bytes, position: int, end: int) -> None:
+def _numbers(data: bytes, position: int, end: int, layout: struct.Struct) -> tuple[int, ...]:
+    """Return the fields of a record that contains only numbers."""
     fields = _fields(data, position, end)
-    if fields.number(4) not in (0, zlib.crc32(memoryview(data)[:position])):
-        raise ValueError('damaged: the CRC of the data is wrong')
+    numbers = fields.numbers(layout)
     fields.end()
+    return numbers
+
+
+def _check_data_crc(data: bytes, position: int, end: int) -> None:
+    (crc,) = _numbers(data, position, end, _DATA_END)
+    if crc not in (0, zlib.crc32(memoryview(data)[:position])):
+        raise ValueError('damaged: the CRC of the data is wrong')
 
 
 def _check_footer(data: bytes, summary: Summary, summary_start: int) -> None:
@@ -122,9 +130,7 @@ def _check_footer(data: bytes, summary: Summary, summary_start: int) -> None:
     if len(footers) != 1 or footers[0][1] != len(data) - len(MCAP0_MAGIC):
         raise ValueError('truncated or damaged: the file does not end with one footer')
     position, end = footers[0]
-    fields = _fields(data, position, end)
-    start, offsets_start, crc = fields.number(8), fields.number(8), fields.number(4)
-    fields.end()
+    start, offsets_start, crc = _numbers(data, position, end, _FOOTER)
     is_empty = position == summary_start
     if start != summary_start and not (is_empty and start == 0):
         raise ValueError('ambiguous: the footer does not point at the summary')
@@ -139,9 +145,7 @@ def _check_footer(data: bytes, summary: Summary, summary_start: int) -> None:
 
 def _check_offsets(data: bytes, summary: Summary) -> None:
     for position, end in summary[Opcode.SUMMARY_OFFSET]:
-        fields = _fields(data, position, end)
-        opcode, start, length = fields.number(1), fields.number(8), fields.number(8)
-        fields.end()
+        opcode, start, length = _numbers(data, position, end, _SUMMARY_OFFSET)
         found = summary.get(opcode, [])
         expected = (found[0][0], sum(b - a for a, b in found)) if found else (start, 0)
         if (start, length) != expected:
@@ -150,25 +154,13 @@ def _check_offsets(data: bytes, summary: Summary) -> None:
 
 def _check_record_indexes(data: bytes, summary: Summary, contents: Contents) -> None:
     """Check that the indexes of metadata and attachments contain all records, or none."""
-    indexed = Counter[tuple[int, int, str]]()
-    for position, end in summary[Opcode.METADATA_INDEX]:
-        fields = _fields(data, position, end)
-        indexed[fields.number(8), fields.number(8), fields.text()] += 1
-        fields.end()
-    found = Counter((each.position, each.length, each.name) for each in contents.metadata)
-    if indexed and indexed != found:
-        raise ValueError('ambiguous: the index of the metadata disagrees with the metadata')
-    indexed.clear()
-    for position, end in summary[Opcode.ATTACHMENT_INDEX]:
-        fields = _fields(data, position, end)
-        where = fields.number(8), fields.number(8)
-        fields.bytes(24)
-        indexed[*where, fields.text()] += 1
-        fields.text()
-        fields.end()
-    found = Counter((each.position, each.length, each.name) for each in contents.attachments)
-    if indexed and indexed != found:
-        raise ValueError('ambiguous: the index of the attachments disagrees with the attachments')
+    for what, opcode, expected in (
+        ('metadata', Opcode.METADATA_INDEX, [each.index for each in contents.metadata]),
+        ('attachments', Opcode.ATTACHMENT_INDEX, [each.index for each in contents.attachments]),
+    ):
+        found = [data[position + RECORD.size : end] for position, end in summary[opcode]]
+        if found and sorted(found) != sorted(expected):
+            raise ValueError(f'ambiguous: the index of the {what} disagrees with the {what}')
 
 
 def _check_chunk_indexes(

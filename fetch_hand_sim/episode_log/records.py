@@ -19,7 +19,6 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-from msgs_spec.schemas import MAX_MESSAGE_BYTES
 from msgs_spec.text import one_line
 
 # Limits that writers and readers share: no writer makes a file that readers reject. The largest
@@ -29,8 +28,7 @@ from msgs_spec.text import one_line
 # Messages of a file, and the topics they belong to.
 MAX_MESSAGES = 50_000
 MAX_TOPICS = 64
-# A chunk, and all chunks of a file together, unpacked.
-MAX_CHUNK_BYTES = 16 * 2**20
+# All chunks of a file, unpacked.
 MAX_UNPACKED_BYTES = 16 * 2**20
 # Chunks of a file; each has an entry of some 250 bytes in the summary.
 MAX_CHUNKS = 10_000
@@ -73,24 +71,10 @@ _KNOWN = frozenset(Opcode)
 _CHUNK_HEADER = struct.Struct('<QQQI')
 _INDEX_HEADER = struct.Struct('<HI')
 _INDEX_ENTRY_BYTES = 16
+# Position and length of an indexed record.
+_PLACE = struct.Struct('<QQ')
 MESSAGE_FIELD_BYTES = MESSAGE.itemsize - RECORD.size
 _LATEST_NS = 2**63 - 1
-
-
-class TornError(ValueError):
-    """A file ends in the middle of a record.
-
-    Attributes:
-        opcode: Kind of that record; None if the file ends in its opcode and length.
-        length: Length in the header of that record.
-        bytes_left: Bytes of the file from the beginning of that record.
-    """
-
-    def __init__(self, opcode: int | None, length: int, bytes_left: int) -> None:
-        super().__init__('truncated or damaged: a record is longer than the rest of the file')
-        self.opcode = opcode
-        self.length = length
-        self.bytes_left = bytes_left
 
 
 class Fields:
@@ -157,20 +141,6 @@ def shown(text: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class ReadLimits:
-    """Limits of reading: unpacked bytes of one chunk and of all chunks; length of messages."""
-
-    chunk_bytes: int = MAX_CHUNK_BYTES
-    unpacked_bytes: int = MAX_UNPACKED_BYTES
-    skips_long_messages: bool = False
-
-
-EPISODE_LIMITS = ReadLimits()
-# Version 0.1 logged every message that the robot received, in chunks larger than readers accept.
-RECOVERY_LIMITS = ReadLimits(64 * 2**20, 256 * 2**20, skips_long_messages=True)
-
-
-@dataclass(frozen=True, slots=True)
 class Schema:
     """A type of messages."""
 
@@ -213,20 +183,18 @@ class MessageIndex(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MetadataRecord:
-    """A metadata record and where it is."""
+    """A metadata record; `index` is the content of its index."""
 
-    position: int
-    length: int
+    index: bytes
     name: str
     content: dict[str, str]
 
 
 @dataclass(frozen=True, slots=True)
 class AttachmentRecord:
-    """An attachment and where it is."""
+    """An attachment; `index` is the content of its index."""
 
-    position: int
-    length: int
+    index: bytes
     name: str
     media_type: str
     data: bytes
@@ -240,7 +208,7 @@ class Contents:
     records in order.
     """
 
-    def __init__(self, limits: ReadLimits = EPISODE_LIMITS) -> None:
+    def __init__(self) -> None:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: list[MetadataRecord] = []
@@ -248,9 +216,7 @@ class Contents:
         self.chunks: list[Chunk] = []
         self.message_indexes: list[MessageIndex] = []
         self.messages_outside = 0
-        self._limits = limits
         self._definitions: dict[tuple[int, int], bytes] = {}
-        self._unpacked_bytes = 0
         self._runs: list[bytes] = []
         self._size = 0
         self._starts: list[int] = []
@@ -265,8 +231,7 @@ class Contents:
         elif opcode == Opcode.CHUNK:
             self._take_chunk(data[start:end], position, end - position)
         elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-            self._unpacked_bytes += end - position
-            self._require_room()
+            self._require_room(end - position)
             self._take_run(data[position:end])
             self.messages_outside += opcode == Opcode.MESSAGE
         elif opcode == Opcode.HEADER:
@@ -341,9 +306,9 @@ class Contents:
             )
         return Messages(unpacked, starts[order], headers[order])
 
-    def _require_room(self) -> None:
-        if self._unpacked_bytes > self._limits.unpacked_bytes:
-            raise ValueError(f'more than {self._limits.unpacked_bytes} bytes of messages')
+    def _require_room(self, size: int) -> None:
+        if self._size + size > MAX_UNPACKED_BYTES:
+            raise ValueError(f'more than {MAX_UNPACKED_BYTES} bytes of messages')
 
     def _take_chunk(self, content: bytes, position: int, length: int) -> None:
         if len(self.chunks) == MAX_CHUNKS:
@@ -353,15 +318,10 @@ class Contents:
         compression = fields.text()
         packed = fields.bytes(fields.number(8))
         fields.end()
-        if size > self._limits.chunk_bytes:
-            raise ValueError(f'chunk of {size} bytes; allowed: up to {self._limits.chunk_bytes}')
-        self._unpacked_bytes += size
-        self._require_room()
+        self._require_room(size)
         data = _unpack(packed, compression, size)
         if crc not in (0, zlib.crc32(data)):
             raise ValueError('damaged: the CRC of a chunk is wrong')
-        if self._limits.skips_long_messages:
-            data = _without_long_messages(data)
         base = self._size
         self._take_run(data)
         self.chunks.append(
@@ -372,13 +332,9 @@ class Contents:
         """Take records one after the other: schemas, channels and messages."""
         starts: list[int] = []
         position, end, base = 0, len(data), self._size
-        if base + end > MAX_UNPACKED_BYTES:
-            raise ValueError(f'more than {MAX_UNPACKED_BYTES} bytes of messages')
         read = RECORD.unpack_from
         while position < end:
-            if end - position < RECORD.size:
-                raise ValueError('damaged: a record is longer than its chunk')
-            opcode, size = read(data, position)
+            opcode, size = read(data, position) if end - position >= RECORD.size else (0, end)
             following = position + RECORD.size + size
             if following > end:
                 raise ValueError('damaged: a record is longer than its chunk')
@@ -411,23 +367,30 @@ class Contents:
         if len(self.metadata) == MAX_METADATA_RECORDS:
             raise ValueError(f'more than {MAX_METADATA_RECORDS} metadata records')
         fields = Fields(content, 'metadata')
-        record = MetadataRecord(position, length, fields.text(), fields.strings())
+        name, strings = fields.text(), fields.strings()
         fields.end()
-        self.metadata.append(record)
+        index = _PLACE.pack(position, length) + _text(name)
+        self.metadata.append(MetadataRecord(index, name, strings))
 
     def _take_attachment(self, content: bytes, position: int, length: int) -> None:
         if len(self.attachments) == MAX_ATTACHMENTS:
             raise ValueError(f'more than {MAX_ATTACHMENTS} attachments')
         fields = Fields(content, 'attachment')
-        fields.bytes(16)
-        name, media_type = fields.text(), fields.text()
+        times, name, media_type = fields.bytes(16), fields.text(), fields.text()
         data = fields.bytes(fields.number(8))
         if fields.number(4) not in (0, zlib.crc32(memoryview(content)[:-4])):
             raise ValueError(f'damaged: the CRC of the attachment {shown(name)} is wrong')
         fields.end()
         if sum(len(each.data) for each in self.attachments) + len(data) > MAX_ATTACHMENT_BYTES:
             raise ValueError(f'more than {MAX_ATTACHMENT_BYTES} bytes attached')
-        self.attachments.append(AttachmentRecord(position, length, name, media_type, data))
+        place, size = _PLACE.pack(position, length), len(data).to_bytes(8, 'little')
+        index = place + times + size + _text(name) + _text(media_type)
+        self.attachments.append(AttachmentRecord(index, name, media_type, data))
+
+
+def _text(text: str) -> bytes:
+    """Return a text as MCAP writes it, after its length."""
+    return len(text.encode()).to_bytes(4, 'little') + text.encode()
 
 
 @dataclass(frozen=True, slots=True)
@@ -456,8 +419,7 @@ def split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, position and end of each record of a file, from its header on.
 
     The caller stops at the footer, because the magic at the end is no record. A file that ends
-    within a record raises TornError. Other files, and files with more than `MAX_RECORDS` records,
-    raise ValueError.
+    within a record, or has more than `MAX_RECORDS` records, raises ValueError.
     """
     magic = len(MCAP0_MAGIC)
     if data[:magic] != MCAP0_MAGIC:
@@ -466,12 +428,11 @@ def split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
     for _ in range(MAX_RECORDS):
         if position == size:
             return
-        if size - position < RECORD.size:
-            raise TornError(None, 0, size - position)
-        opcode, length = RECORD.unpack_from(data, position)
+        is_torn = size - position < RECORD.size
+        opcode, length = (0, size) if is_torn else RECORD.unpack_from(data, position)
         end = position + RECORD.size + length
         if end > size:
-            raise TornError(opcode, length, size - position)
+            raise ValueError('truncated or damaged: a record is longer than the rest of the file')
         if position == magic and opcode != Opcode.HEADER:
             raise ValueError('damaged: the first record is no header')
         yield opcode, position, end
@@ -506,18 +467,3 @@ def _decompress(packed: bytes, compression: str, size: int) -> bytes:
             raise ValueError('damaged: a chunk is not one frame of lz4')
         return data
     raise ValueError(f'chunk compression {shown(compression)}; allowed: zstd, lz4, none')
-
-
-def _without_long_messages(data: bytes) -> bytes:
-    kept: list[bytes] = []
-    position, end, kept_bytes = 0, len(data), 0
-    while position <= end - RECORD.size:
-        opcode, size = RECORD.unpack_from(data, position)
-        following = position + RECORD.size + size
-        if opcode != Opcode.MESSAGE or size - MESSAGE_FIELD_BYTES <= MAX_MESSAGE_BYTES:
-            kept.append(data[position:following])
-            kept_bytes += RECORD.size + size
-            if kept_bytes > MAX_UNPACKED_BYTES:
-                raise ValueError(f'more than {MAX_UNPACKED_BYTES} bytes of messages')
-        position = following
-    return b''.join(kept)

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC
 
 from fetch_hand_sim.episode_log import files
 from fetch_hand_sim.episode_log.bag import (
@@ -34,11 +33,7 @@ from fetch_hand_sim.episode_log.metadata import RECOVERED, EpisodeOutcome
 from fetch_hand_sim.episode_log.reader import contract_topics, read_episode, require_contract
 from fetch_hand_sim.episode_log.records import (
     MAX_FILE_BYTES,
-    RECORD,
-    RECOVERY_LIMITS,
     Contents,
-    Fields,
-    TornError,
     split_records,
 )
 from fetch_hand_sim.episode_log.writer import ReceivedAllowance
@@ -48,8 +43,6 @@ from msgs_spec.topics import TopicSpec, relative_name
 
 # Bytes that may be lost without a copy: part of a record, but no message with a tick of data.
 _FEW_BYTES = 64
-# Records that a writer begins a file with; a kill may tear them.
-_AT_THE_START = frozenset({Opcode.METADATA, Opcode.ATTACHMENT})
 _COUNTED = ('reward', 'is_success', 'applied_command')
 
 
@@ -77,16 +70,13 @@ class Leftover:
         )
 
 
-def find_leftovers(directory: Path | str, now_s: float | None = None) -> list[Leftover]:
+def find_leftovers(directory: Path | str) -> list[Leftover]:
     """Return the unfinished episodes in a directory by name, without those in progress.
 
-    Args:
-        directory: Directory of episodes; may be missing. EpisodeLogError if it is unreadable.
-        now_s: Time since the epoch to measure age by; the system clock by default.
+    The directory may be missing. EpisodeLogError if it is unreadable.
     """
-    now = time.time() if now_s is None else now_s
     try:
-        found = [_inspect(path, now) for path in sorted(Path(directory).iterdir())]
+        found = [_inspect(path) for path in sorted(Path(directory).iterdir())]
     except FileNotFoundError:
         return []
     except OSError as error:
@@ -96,7 +86,7 @@ def find_leftovers(directory: Path | str, now_s: float | None = None) -> list[Le
     return [leftover for leftover in found if leftover is not None]
 
 
-def _inspect(path: Path, now_s: float) -> Leftover | None:
+def _inspect(path: Path) -> Leftover | None:
     """Return the leftover in a hidden directory, None if it is in progress or just completed."""
     name = files.active_name(path)
     if name is None:
@@ -113,7 +103,7 @@ def _inspect(path: Path, now_s: float) -> Leftover | None:
         problem = f'{error.filename or path}: {error.strerror}'
         return Leftover(name, path, size_bytes=0, age_s=0.0, problem=problem)
     size = sum(status.st_size for status in statuses)
-    return Leftover(name, path, size, age_s=max(0.0, now_s - written))
+    return Leftover(name, path, size, age_s=max(0.0, time.time() - written))
 
 
 def _entries(path: Path, name: str) -> list[Path]:
@@ -138,8 +128,8 @@ def recover_episode(leftover: Path | str) -> Path | None:
     second is missing. The new file replaces the torn one when it has been read back. If more than a
     few bytes of the torn file are unreadable, it is kept in `.<name>.aside`.
 
-    An episode without messages is moved to `.<name>.aside`. It is removed if its file is empty, or
-    has only a few bytes beyond a good header.
+    An episode without readable messages is moved to `.<name>.aside`. It is removed if its file is
+    empty, or has only a few bytes beyond a good header.
 
     Raises:
         EpisodeInUseError: If another process writes, recovers or has recovered it.
@@ -150,7 +140,7 @@ def recover_episode(leftover: Path | str) -> Path | None:
     name = files.active_name(leftover)
     if name is None:
         raise EpisodeLogError(f'{leftover} is no unfinished episode')
-    found = _inspect(leftover, now_s=0.0)
+    found = _inspect(leftover)
     if found is None:
         raise _in_use(leftover)
     if found.problem:
@@ -190,7 +180,12 @@ def _recover(leftover: Path, name: str) -> Path | None:
             raise _in_use(leftover)
         remains = _read(torn)
         if not remains.contents.message_count:
-            _put_aside(leftover, name, remains)
+            if not remains.is_empty:
+                leftover.rename(files.aside_path(leftover.parent, name))
+                return None
+            for entry in leftover.iterdir():
+                entry.unlink()
+            leftover.rmdir()
             return None
         if final.exists():
             raise EpisodeLogError(
@@ -211,21 +206,6 @@ def _remove_empty(leftover: Path) -> None:
         raise
 
 
-def _put_aside(leftover: Path, name: str, remains: _Remains) -> None:
-    """Remove a leftover without messages if it is empty, else move it to `.<name>.aside`."""
-    if remains.is_empty:
-        for entry in leftover.iterdir():
-            entry.unlink()
-        leftover.rmdir()
-    elif remains.was_killed_at_the_start:
-        leftover.rename(files.aside_path(leftover.parent, name))
-    else:
-        raise EpisodeLogError(
-            f'{leftover} is damaged before its first message: nothing to recover '
-            f'({remains.damage}); it stays as it is'
-        )
-
-
 @dataclass(slots=True)
 class _Remains:
     """The readable part of a file.
@@ -236,7 +216,6 @@ class _Remains:
         is_empty: Whether the file has only a few bytes beyond a good header.
         damage: Reason why reading stopped; '' at the end of the file.
         unread_bytes: Bytes from there to the end of the file.
-        was_killed_at_the_start: Whether the file ends among the records that come before messages.
     """
 
     contents: Contents
@@ -244,14 +223,13 @@ class _Remains:
     is_empty: bool = False
     damage: str = ''
     unread_bytes: int = 0
-    was_killed_at_the_start: bool = True
 
 
 def _read(stream: BinaryIO) -> _Remains:
     data = stream.read(MAX_FILE_BYTES + 1)
     if len(data) > MAX_FILE_BYTES:
         raise ValueError(f'a file of more than {MAX_FILE_BYTES} bytes')
-    remains = _Remains(Contents(RECOVERY_LIMITS))
+    remains = _Remains(Contents())
     header_end = read = 0
     is_data = True
     try:
@@ -265,27 +243,11 @@ def _read(stream: BinaryIO) -> _Remains:
                 remains.contents.take(opcode, data, position, end)
             header_end = header_end or end
             read = end
-    except TornError as error:
-        remains.damage = str(error)
-        # Where the file ends as it should, the length of a record is damaged.
-        is_cut = not data.endswith(MCAP0_MAGIC) or len(data) == len(MCAP0_MAGIC)
-        is_torn = error.bytes_left <= _FEW_BYTES or error.opcode in _AT_THE_START
-        is_torn |= error.opcode == Opcode.CHUNK and _has_length(data[read:], error.length)
-        remains.was_killed_at_the_start = is_cut and is_torn
     except ValueError as error:
         remains.damage = one_line(error)
-        remains.was_killed_at_the_start = False
     remains.unread_bytes = len(data) - read
     remains.is_empty = len(data) - header_end <= _FEW_BYTES
     return remains
-
-
-def _has_length(chunk: bytes, length: int) -> bool:
-    """Return whether the fields of a torn chunk add up to its length: no bit of it has flipped."""
-    fields = Fields(chunk[RECORD.size : RECORD.size + 64], 'chunk')
-    fields.bytes(28)
-    compression = fields.text()
-    return length == 28 + 4 + len(compression) + 8 + fields.number(8)
 
 
 @contextmanager

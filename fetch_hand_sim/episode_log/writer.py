@@ -9,7 +9,6 @@ it was computed from and the state it leads to, and times grow strictly.
 
 from __future__ import annotations
 
-import errno
 import json
 import re
 import shutil
@@ -24,31 +23,18 @@ from fetch_hand_sim.episode_log.files import EpisodeExistsError, EpisodeLogError
 from fetch_hand_sim.episode_log.records import (
     MAX_ATTACHMENT_BYTES,
     MAX_CHUNKS,
-    MAX_MESSAGES,
     MAX_RECEIVED_BYTES,
     MAX_RECEIVED_MESSAGES,
-    MAX_UNPACKED_BYTES,
 )
 from msgs_spec.schemas import MAX_MESSAGE_BYTES
 from msgs_spec.topics import TopicSpec
 
-_TOO_LONG = (
-    f'the episode is too long for a file of {MAX_MESSAGES} messages and '
-    f'{MAX_UNPACKED_BYTES // 2**20} MiB of them'
-)
 # Simulated time after which messages are handed to the operating system. The next tick does that,
 # so a killed process loses up to a tick more: less than a quarter of a second at 12.5 Hz.
 FLUSH_PERIOD_NS = 150_000_000
 # No episode is begun with less free space on the disk.
 MINIMUM_FREE_BYTES = 64 * 2**20
 _NAME = re.compile(r'\.?(?P<task>.+)_(?P<index>\d+)_seed(?P<seed>\d+)(\.active|\.aside)?')
-
-
-def log_time(stamp_ns: int, rank: int) -> int:
-    """Return the log time, ns, of message number `rank` of a tick; both must not be negative."""
-    if stamp_ns < 0 or rank < 0:
-        raise ValueError(f'stamp {stamp_ns} ns and rank {rank} must not be negative')
-    return stamp_ns + rank
 
 
 class ReceivedAllowance:
@@ -85,11 +71,11 @@ class ReceivedAllowance:
 class EpisodeWriter:
     """A rosbag2 bag that appears in a directory under its name when it is complete.
 
-    It is written in the hidden directory `.<name>.active`, from which `finish` or `abort` makes a
-    valid bag. A killed process leaves the hidden directory behind, see `find_leftovers`.
+    It is written in the hidden directory `.<name>.active`, from which `finish` makes a valid bag. A
+    killed process leaves the hidden directory behind, see `find_leftovers`.
 
     The simulation can continue after every error of the disk. Such an error is raised once. Then
-    `write` returns False and `finish` returns None. Not thread-safe, and not for use in signal
+    `write_tick` returns False and `finish` returns None. Not thread-safe, and not for use in signal
     handlers.
 
     Files stay within the limits of readers. Received messages have an allowance; the record
@@ -140,32 +126,18 @@ class EpisodeWriter:
                 raise
             raise EpisodeLogError(f'cannot log episode {self._final}: {_reason(error)}') from error
 
-    def write(self, topic: TopicSpec, data: bytes, log_time_ns: int) -> bool:
-        """Append a message with CDR bytes `data`; return False after the end or an error.
-
-        Raises:
-            EpisodeLogError: At the first error of the disk.
-            ValueError: If the time does not grow, the topic had another type before, or readers
-                would reject the message.
-        """
-        if self._is_open and self._is_flush_due(log_time_ns):
-            self._flush(log_time_ns)
-        return self._append(topic, data, log_time_ns)
-
     def write_tick(self, stamp_ns: int, messages: Iterable[tuple[TopicSpec, bytes]]) -> bool:
-        """Append all messages of the tick stamped `stamp_ns`, in their order; see `write`.
+        """Append the messages (topic, CDR bytes) of a tick; return False after the end or an error.
 
-        An episode beyond the limits of readers raises EpisodeLogError; the part before can be
-        recovered.
+        The first error of the disk, and an episode beyond the limits of readers, raise
+        EpisodeLogError. The part before can be recovered.
         """
         self._tick_ns, self._rank = stamp_ns, 0
         for topic, data in messages:
-            if self._is_open and not self._bag.has_room(len(data)):
-                self.flush()
-                raise self._fail(OSError(errno.EFBIG, _TOO_LONG))
-            self._append_next(topic, data)
-        if self._is_open and self._is_flush_due(stamp_ns):
-            self._flush(stamp_ns)
+            self._append(topic, data)
+        self._flushed_ns = stamp_ns if self._flushed_ns is None else self._flushed_ns
+        if stamp_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
+            self.flush()
         return self._is_open
 
     def write_received(self, topic: TopicSpec, data: bytes, *, is_refused: bool = False) -> bool:
@@ -181,35 +153,35 @@ class EpisodeWriter:
         has_room = self._bag.has_room(len(data)) and self._bag.chunks <= MAX_CHUNKS // 2
         if not self._received.accepts(topic.name, len(data), has_room, is_refused=is_refused):
             return False
-        return self._append_next(topic, data)
+        return self._append(topic, data)
 
     def flush(self) -> None:
         """Hand all messages to the operating system now; the disk may raise EpisodeLogError."""
-        if self._is_open and self._tick_ns is not None:
-            self._flush(log_time(self._tick_ns, self._rank))
+        if self._is_open:
+            try:
+                self._bag.flush()
+            except OSError as error:
+                raise self._fail(error) from error
+            self._flushed_ns = self._tick_ns
 
     @property
     def has_unflushed(self) -> bool:
         """True if the operating system does not have all messages yet."""
         return self._is_open and self._bag.has_unflushed
 
-    def finish(self, result: Mapping[str, str]) -> Path | None:
-        """Complete the bag of an episode that ran to its end, and return its directory.
+    def finish(self, result: Mapping[str, str], reason: str | None = None) -> Path | None:
+        """Complete the bag and return its directory.
 
-        `result` is the record `episode_result`; `complete` is added. Returns None, without a bag,
+        `result` is the record `episode_result`; `complete` is added. A reason marks an episode that
+        was cut short. Returns None, without a bag,
         if writing failed before or there is no message. If the bag cannot be completed,
         EpisodeLogError is raised and the hidden directory stays.
         """
-        self.end(result)
-        return self.store()
-
-    def abort(self, reason: str, result: Mapping[str, str] | None = None) -> Path | None:
-        """Complete the bag of an episode that was cut short, marked as such; see `finish`."""
-        self.end(result or {}, reason)
+        self.end(result, reason)
         return self.store()
 
     def end(self, result: Mapping[str, str], reason: str | None = None) -> bool:
-        """Do the first half of `finish`, or of `abort` if a reason is given: write everything.
+        """Do the first half of `finish`: write everything.
 
         If the process is killed after this, recovery finds the whole episode. Returns whether there
         is a bag to `store`.
@@ -252,34 +224,18 @@ class EpisodeWriter:
             self._stop()
             shutil.rmtree(self._active, ignore_errors=True)
 
-    def _append(self, topic: TopicSpec, data: bytes, log_time_ns: int) -> bool:
+    def _append(self, topic: TopicSpec, data: bytes) -> bool:
         if not self._is_open:
             return False
-        name = topic.name if topic.name.startswith('/') else self._namespace + topic.name
-        try:
-            self._bag.write(name, topic, data, log_time_ns)
-        except OSError as error:
-            raise self._fail(error) from error
-        return True
-
-    def _append_next(self, topic: TopicSpec, data: bytes) -> bool:
         if self._tick_ns is None:
             raise ValueError(f'{topic.name} was written before the first tick of the episode')
-        time_ns = log_time(self._tick_ns, self._rank)
-        self._rank += 1
-        return self._append(topic, data, time_ns)
-
-    def _flush(self, log_time_ns: int) -> None:
+        name = topic.name if topic.name.startswith('/') else self._namespace + topic.name
         try:
-            self._bag.flush()
+            self._bag.write(name, topic, data, self._tick_ns + self._rank)
         except OSError as error:
             raise self._fail(error) from error
-        self._flushed_ns = log_time_ns
-
-    def _is_flush_due(self, log_time_ns: int) -> bool:
-        if self._flushed_ns is None:
-            self._flushed_ns = log_time_ns
-        return log_time_ns - self._flushed_ns >= FLUSH_PERIOD_NS
+        self._rank += 1
+        return True
 
     def _fail(self, error: OSError) -> EpisodeLogError:
         self._description = None

@@ -202,20 +202,20 @@ def test_one_bad_leftover_stops_no_other_and_loses_no_byte(directory, finished, 
     whole = (finished / f'{NAME}_0.mcap').read_bytes()[:-2000]
     start = chunks(whole)[0]
     bad = {
-        'another type': cut_with({}, 'std_msgs/msg/Empty'),
-        'flipped length of the first chunk': flipped(whole, start + 4),
-        'flipped length of the header': flipped(whole, 8 + 4),
+        'another type': ('active', cut_with({}, 'std_msgs/msg/Empty')),
+        'flipped length of the first chunk': ('aside', flipped(whole, start + 4)),
+        'flipped length of the header': ('aside', flipped(whole, 8 + 4)),
     }
-    for name, data in bad.items():
+    for name, (_, data) in bad.items():
         leave(directory, name, data)
     began = time.process_time()
     assert episodes_recover.main([str(directory)]) == 1
     assert time.process_time() - began < 5.0
     output = capsys.readouterr()
     assert 'recovered' in output.out and read_episode(directory / 'cut')
-    assert_one_line_each(output.err, len(bad))
-    for name, data in bad.items():
-        assert (directory / f'.{name}.active' / f'{name}_0.mcap').read_bytes() == data
+    assert_one_line_each(output.err, 1)
+    for name, (end, data) in bad.items():
+        assert (directory / f'.{name}.{end}' / f'{name}_0.mcap').read_bytes() == data
 
 
 def test_recovery_keeps_unreadable_files_aside(directory, finished):

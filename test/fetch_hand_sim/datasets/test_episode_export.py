@@ -228,7 +228,7 @@ def test_of_a_folder_only_what_is_asked_for_is_exported(episodes, tmp_path, monk
     recorder = Recorder(TASK)
     writer = EpisodeDirectory(folder).begin(TASK, 0, recorder.metadata())
     recorder.write(writer, recorder.ticks()[:5])
-    writer.abort('the robot stopped')
+    writer.finish({}, 'the robot stopped')
     arguments = [str(folder), '--to', 'minari', '--output', str(tmp_path / 'minari')]
     assert episodes_export.main([*arguments, '--name', 'all']) == 0
     assert f'3 episodes, 1 of them interrupted, of {TASK}' in capsys.readouterr().out

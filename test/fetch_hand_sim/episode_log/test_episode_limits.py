@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
 from fetch_hand_sim.episode_log import (
     Attachment,
@@ -19,11 +19,10 @@ from fetch_hand_sim.episode_log import (
     recover_episode,
 )
 from fetch_hand_sim.episode_log import records as limits
-from fetch_hand_sim.episode_log.bag import offered_qos_text
 from fetch_hand_sim.episodes.checker import EpisodeChecker
 from fetch_hand_sim.replay_node.schedule import ReplaySchedule
-from msgs_spec.schemas import MAX_MESSAGE_BYTES, schema_text, type_hash
-from msgs_spec.topics import topic, topics
+from msgs_spec.schemas import MAX_MESSAGE_BYTES
+from msgs_spec.topics import topic
 from support.episode_recorder import Recorder
 
 LOG = 'fetch_hand_sim.episode_log'
@@ -135,7 +134,6 @@ def test_an_episode_that_is_too_long_is_one_line_and_can_be_recovered(tmp_path, 
 
 
 def test_the_smallest_chunks_read_too(tmp_path, recorder, ticks, monkeypatch):
-    monkeypatch.setattr(f'{LOG}.bag.CHUNK_BYTES', 1)
     monkeypatch.setattr(f'{LOG}.writer.FLUSH_PERIOD_NS', 1)
     assert load_episodes(write(tmp_path, recorder, ticks, FLOODS['all topics']))
 
@@ -148,8 +146,6 @@ def test_what_a_program_gives_is_refused_at_once(tmp_path, recorder, ticks):
     with pytest.raises(ValueError, match='bytes attached; allowed'):
         EpisodeWriter(tmp_path, 'episode', {}, [attachment])
     writer = EpisodeWriter(tmp_path, 'episode', {})
-    with pytest.raises(ValueError, match='no reader takes 65537 bytes in a message'):
-        writer.write(ticks[0].messages[0][0], bytes(MAX_MESSAGE_BYTES + 1), 1)
     with pytest.raises(ValueError, match='bytes of episode metadata'):
         writer.finish(long)
 
@@ -162,54 +158,6 @@ def test_metadata_as_long_as_allowed_read_back(tmp_path, ticks):
     path = writer.finish({})
     assert read_summary(path).metadata['note'] == metadata['note']
     assert read_episode(path).metadata['note'] == metadata['note']
-
-
-# Files of earlier versions
-
-
-def write_as_before(stream, recorder, ticks, flood):
-    """Write a flood as version 0.1 did: everything, in chunks of 128 KiB and a message."""
-    writer = Writer(stream, chunk_size=128 * 1024, compression=CompressionType.LZ4)
-    writer.start(profile='ros2')
-    writer.add_metadata('episode', {'episode_id': 'episode', **recorder.metadata()})
-    channels = {}
-    for spec in topics(recorder.spec):
-        schema = writer.register_schema(
-            spec.type_name, 'ros2msg', schema_text(spec.type_name).encode()
-        )
-        metadata = {
-            'offered_qos_profiles': offered_qos_text(spec.qos),
-            'topic_type_hash': type_hash(spec.type_name),
-        }
-        name = '/' + spec.name.lstrip('/')
-        channels[spec.name] = writer.register_channel(name, 'cdr', schema, metadata)
-    for number, tick in enumerate(ticks):
-        messages = [(spec.name, data) for spec, data in tick.messages]
-        if number == 3:
-            messages += [(name, bytes(size)) for name, size in flood]
-        for rank, (name, data) in enumerate(messages):
-            time_ns = tick.stamp_ns + rank
-            writer.add_message(channels[name], time_ns, data, time_ns)
-    writer.flush()
-
-
-@pytest.mark.parametrize('name', ['one of 17.6 MB', 'eight of 10 MB', 'very many empty'])
-def test_an_episode_cut_off_by_a_flood_is_recovered_but_for_the_flood(
-    tmp_path, recorder, ticks, name
-):
-    """Earlier versions logged all of it, and then no reader took the file."""
-    leftover = tmp_path / '.episode.active'
-    leftover.mkdir()
-    with (leftover / 'episode_0.mcap').open('wb') as stream:
-        write_as_before(stream, recorder, ticks, FLOODS[name])
-    path = recover_episode(leftover)
-    episode = read_episode(path)
-    if name != 'very many empty':
-        steps = [len(logged.messages) for logged in episode.topics.values()]
-        assert sum(steps) == sum(len(tick.messages) for tick in ticks)
-        assert episode.result['steps'] == '50'
-    assert len(episode.topics['/clock'].messages) >= 4
-    assert EpisodeChecker().check(path).difference is None
 
 
 def bag_of(path, messages, size=0):

@@ -22,7 +22,6 @@ from fetch_hand_sim.episode_log import (
     EpisodeWriter,
     files,
     find_leftovers,
-    log_time,
     read_episode,
 )
 from fetch_hand_sim.episode_log.bag import CHUNK_BYTES, offered_qos_text
@@ -381,7 +380,7 @@ def test_relative_names_are_resolved_in_the_namespace(reach, tmp_path):
 def test_an_aborted_episode_is_a_valid_bag_marked_incomplete(reach, tmp_path):
     writer = EpisodeWriter(tmp_path, 'episode', reach.metadata)
     reach.recorder.write(writer, reach.ticks[:20])
-    path = writer.abort('SIGTERM', {'return': '-19.0'})
+    path = writer.finish({'return': '-19.0'}, 'SIGTERM')
     episode = read_episode(path)
     assert not episode.is_complete
     assert episode.result == {'return': '-19.0', 'complete': 'false', 'reason': 'SIGTERM'}
@@ -394,7 +393,7 @@ def test_an_aborted_episode_is_a_valid_bag_marked_incomplete(reach, tmp_path):
 
 def test_an_episode_without_messages_leaves_nothing(reach, tmp_path):
     writer = EpisodeWriter(tmp_path, 'episode', reach.metadata)
-    assert writer.abort('SIGINT') is None
+    assert writer.finish({}, 'SIGINT') is None
     assert list(tmp_path.iterdir()) == []
 
 
@@ -403,9 +402,8 @@ def test_a_completed_writer_takes_no_more(reach, tmp_path):
     reach.recorder.write(writer, reach.ticks)
     path = writer.finish({})
     before = (path / 'episode_0.mcap').read_bytes()
-    topic, data = reach.ticks[0].messages[0]
-    assert writer.write(topic, data, 10**12) is False
-    assert writer.finish({'success': 'true'}) == writer.abort('late') == path
+    assert writer.write_tick(10**12, reach.ticks[0].messages) is False
+    assert writer.finish({'success': 'true'}) == writer.finish({}, 'late') == path
     assert (path / 'episode_0.mcap').read_bytes() == before
 
 
@@ -417,46 +415,11 @@ def test_an_episode_is_hidden_until_it_is_complete(reach, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ['episode']
 
 
-def test_times_must_grow(reach, tmp_path):
-    writer = EpisodeWriter(tmp_path, 'episode', {})
-    topic, data = reach.ticks[0].messages[0]
-    assert writer.write(topic, data, 1000)
-    for time_ns in (1000, 999):
-        with pytest.raises(ValueError, match=f'log time {time_ns} ns of /clock is not later'):
-            writer.write(topic, data, time_ns)
-    assert writer.write(topic, data, 1001)
-    (clock,) = read_episode(writer.finish({})).topics.values()
-    assert [message.log_time_ns for message in clock.messages] == [1000, 1001]
-
-
 def test_a_command_needs_a_tick_before_it(reach, tmp_path):
     writer = EpisodeWriter(tmp_path, 'episode', {})
     with pytest.raises(ValueError, match='commands was written before the first tick'):
         writer.write_received(reach.recorder.commands, reach.ticks[0].command)
-    writer.abort('test')
-
-
-@pytest.mark.parametrize(('stamp_ns', 'rank'), [(-1, 0), (0, -1)])
-def test_log_times_are_unsigned(stamp_ns, rank):
-    assert log_time(10**9, 7) == 1_000_000_007
-    with pytest.raises(ValueError, match='must not be negative'):
-        log_time(stamp_ns, rank)
-
-
-def test_a_topic_has_one_type(reach, tmp_path):
-    writer = EpisodeWriter(tmp_path, 'episode', {})
-    topic, data = reach.ticks[0].messages[1]
-    other = type(topic)(topic.name, 'std_msgs/msg/Bool', topic.qos, '', (), (), 'published', '')
-    writer.write(topic, data, 1)
-    with pytest.raises(ValueError, match='joint_states is sensor_msgs/msg/JointState'):
-        writer.write(other, data, 2)
-    writer.abort('test')
-
-
-def test_metadata_must_be_strings(tmp_path):
-    with pytest.raises(ValueError, match="not 'seed': 3"):
-        EpisodeWriter(tmp_path, 'episode', {'seed': 3})
-    assert list(tmp_path.iterdir()) == []
+    writer.finish({}, 'test')
 
 
 @pytest.mark.parametrize('task', ['Fetch-Near', 'fetch.near v2', 'Näher_000001_seed1'])

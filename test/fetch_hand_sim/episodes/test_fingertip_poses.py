@@ -60,7 +60,7 @@ def record(simulation, directory, version):
             tick = dataclasses.replace(tick, readings=readings)
         writer.write_tick(tick.stamp_ns, encoder.encode(tick, latched=number == 0))
         tick = runner.advance(runner.resting_command())
-    return writer.abort('enough')
+    return writer.finish({}, 'enough')
 
 
 def test_episodes_without_orientations_are_checked_and_loaded_as_the_others(tmp_path):

@@ -43,7 +43,7 @@ def record(simulation, directory, prefix):
         messages = encoder.encode(tick, latched=number == 0)
         writer.write_tick(tick.stamp_ns, messages)
         tick = runner.advance(runner.resting_command())
-    return writer.abort('enough'), messages
+    return writer.finish({}, 'enough'), messages
 
 
 @pytest.mark.parametrize('task', ['FetchPush', 'HandReach'])
